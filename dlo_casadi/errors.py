@@ -1,0 +1,87 @@
+"""Errors that the package raises: what happened, with numbers, and what to try."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class DloError(Exception):
+    """Base class of all errors raised on purpose by dlo_casadi.
+
+    Parameters
+    ----------
+    message : str
+        What happened, with numbers and units, and what to try.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+        self.message = message
+
+
+class ConfigError(DloError):
+    """A configuration or parameter file that cannot be used.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what to try.
+    file : Path, optional
+        The YAML file.
+    line : int, optional
+        Line in that file, counted from 1.
+    """
+
+    def __init__(self, message: str, file: Path | None = None, line: int | None = None) -> None:
+        place = "" if file is None else f"{file}" + ("" if line is None else f", line {line}") + ": "
+        super().__init__(place + message)
+        self.file = file
+        self.line = line
+
+
+class MeasurementError(DloError):
+    """A photograph or a centre-line file from which no centre-line can be had.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what to try.
+    pose : str, optional
+        File name of the pose.
+    """
+
+    def __init__(self, message: str, pose: str | None = None) -> None:
+        super().__init__(message if pose is None else f"{pose}: {message}")
+        self.pose = pose
+
+
+class VisionError(MeasurementError):
+    """A photograph in which the board or the cable cannot be found."""
+
+
+class EquilibriumError(DloError):
+    """A pose without a (stable) equilibrium.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what to try.
+    pose : str, optional
+        Name of the pose.
+    p_des : tuple of float, optional
+        Where the end was asked to be [m].
+    """
+
+    def __init__(
+        self,
+        message: str,
+        pose: str | None = None,
+        p_des: tuple[float, float] | None = None,
+    ) -> None:
+        super().__init__(message if pose is None else f"{pose}: {message}")
+        self.pose = pose
+        self.p_des = p_des
+
+
+class EstimationError(DloError):
+    """An estimate that cannot be made from the poses at hand."""
