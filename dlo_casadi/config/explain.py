@@ -1,0 +1,170 @@
+"""The words for what pydantic finds: place, reason, and what to try."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from typing import Any, get_args
+
+from pydantic_core import ErrorDetails
+
+from dlo_casadi.config.problems import Contradiction, Place, Problem, did_you_mean, kind_of, show
+from dlo_casadi.config.sections import File, Section
+
+
+_NUMBER = r"[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?"
+
+
+def _label(place: Place, data: Any) -> str:
+    """Name a place in words: cable.length, pose 4 (pose_04.jpg) end."""
+    words: list[str] = []
+    for part in place:
+        if isinstance(data, dict) and part in data:
+            data = data[part]
+            words.append(str(part))
+        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
+            data = data[part]
+            if words == ["experiment", "poses"]:
+                file = data.get("file") if isinstance(data, dict) else None
+                words = [f"pose {part + 1}" + (f" ({file})" if isinstance(file, str) else "")]
+            else:
+                words[-1] += f"[{part}]"
+    return ".".join(words) or "the file"
+
+
+def _sections(annotation: Any) -> list[type[Section]]:
+    """Find the sections that an annotation names."""
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return [annotation]
+    return [section for part in get_args(annotation) for section in _sections(part)]
+
+
+def _section_at(place: Place) -> type[Section]:
+    """Find the section at a place; what is no key of it (index, kind) is passed over."""
+    found: list[type[Section]] = [File]
+    for part in place:
+        inner = [
+            section
+            for outer in found
+            if part in outer.model_fields
+            for section in _sections(outer.model_fields[str(part)].annotation)
+        ]
+        kinds = [s for s in found if part in get_args(_annotation(s, "kind"))]
+        found = inner or kinds or found
+    return found[0]
+
+
+def _annotation(section: type[Section], key: str) -> Any:
+    return section.model_fields[key].annotation if key in section.model_fields else None
+
+
+def _homes(key: str, section: type[Section] = File, at: str = "") -> list[str]:
+    """List the sections that know a key."""
+    homes = [at or "the top"] if key in section.model_fields else []
+    for name, field in section.model_fields.items():
+        for inner in _sections(field.annotation):
+            kind = get_args(_annotation(inner, "kind"))
+            homes += _homes(
+                key, inner, f"{at}.{name}".lstrip(".") + "".join(f" (kind: {k})" for k in kind)
+            )
+    return homes
+
+
+def _help(section: type[Section], key: str) -> str:
+    text = section.model_fields[key].description if key in section.model_fields else None
+    return f": {text.rstrip('.')}" if text else ""
+
+
+def _about_number(value: object) -> str:
+    """Guess why text stands where a number belongs."""
+    text = str(value).strip()
+    if isinstance(value, str) and re.fullmatch(_NUMBER, text):
+        return "; write it without quotes"
+    if re.fullmatch(r"[-+]?[0-9]+,[0-9]+", text):
+        return f"; the decimal sign is a point: {text.replace(',', '.')}"
+    if found := re.fullmatch(rf"({_NUMBER})\s*[a-zA-Z/^*0-9]+", text):
+        return f"; write it in SI units without the unit, such as {found[1]}"
+    return ""
+
+
+_MESSAGES: dict[str, str] = {
+    "float_type": "a number belongs here, found {input}{number}",
+    "float_parsing": "a number belongs here, found {input}{number}",
+    "finite_number": "a finite number belongs here, found {input}",
+    "int_type": "a whole number belongs here, found {input}",
+    "int_parsing": "a whole number belongs here, found {input}",
+    "int_from_float": "a whole number belongs here, found {input}",
+    "bool_type": "true or false belongs here, found {input}",
+    "string_type": "text belongs here, found {input}",
+    "greater_than": "must be larger than {gt:g}, found {input}",
+    "greater_than_equal": "must not be smaller than {ge:g}, found {input}",
+    "less_than": "must be smaller than {lt:g}, found {input}",
+    "less_than_equal": "must not be larger than {le:g}, found {input}",
+    "literal_error": "allowed are {expected}, found {input}",
+    "model_type": "a mapping of keys and values belongs here, found {kind}",
+    "model_attributes_type": "a mapping of keys and values belongs here, found {kind}",
+    "dict_type": "a mapping of keys and values belongs here, found {kind}",
+    "tuple_type": "a list belongs here, found {kind}",
+    "too_short": "at least {min_length} belongs here, found {actual_length}",
+    "too_long": "at most {max_length} belong here, found {actual_length}",
+    "invalid_key": "a key must be text, found {input}",
+}
+
+
+def explain(errors: Sequence[ErrorDetails], data: Any) -> list[Problem]:
+    """Say what pydantic found in the words of the file."""
+    problems: list[Problem] = []
+    suggested: set[Place] = set()
+    for error in errors:
+        if error["type"] == "extra_forbidden":
+            *above, key = error["loc"]
+            known = list(_section_at(tuple(above)).model_fields)
+            near = difflib.get_close_matches(str(key), known, 1, cutoff=0.6)
+            suggested.update((*above, name) for name in near)
+    for error in errors:
+        place, context = error["loc"], error.get("ctx", {})
+        section, label = _section_at(place[:-1]), _label(place, data)
+        kind = error["type"]
+        if kind == "missing":
+            if place in suggested:
+                continue
+            key = place[-1]
+            text = (
+                f"{label} has only {key} values"
+                if isinstance(key, int)
+                else f"{key!r} is missing in {label}{_help(section, key)}"
+            )
+        elif kind == "extra_forbidden":
+            key = str(place[-1])
+            homes = _homes(key)
+            hint = did_you_mean(key, section.model_fields)
+            if homes and "did you mean" not in hint:
+                hint = f"; it belongs into {' or '.join(homes)}"
+            text = f"unknown key {key!r} in {_label(place[:-1], data)}{hint}"
+        elif kind in ("union_tag_invalid", "union_tag_not_found"):
+            place = (*place, "kind")
+            found = context.get("tag")
+            text = f"{label}: kind must be images or centerlines, found {show(found)}"
+        elif kind == "value_error" and isinstance(context["error"], Contradiction):
+            for inner in context["error"].problems:
+                at = (*place, *inner.place)
+                problems.append(Problem(at, f"{_label(at, data)}: {inner.message}"))
+            continue
+        elif kind == "value_error":
+            text = f"{label}: {context['error']}"
+        elif kind in _MESSAGES:
+            words = {
+                "input": show(error["input"]),
+                "kind": kind_of(error["input"]),
+                "number": _about_number(error["input"]),
+            }
+            text = f"{label}: {_MESSAGES[kind].format(**(context | words))}"
+            if place[-1] == "start" and error["input"] == "free":
+                text += "; only the end can be free"
+            if "tolerances" in place and error["input"] == 0:
+                text += "; for a value that is known exactly write a small one, such as 1.0e-6"
+        else:
+            text = f"{label}: {error['msg']}"
+        problems.append(Problem(place, text))
+    return problems

@@ -1,0 +1,207 @@
+"""A YAML file -> a checked configuration; checks that concern several sections."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from dlo_casadi.config.document import Document
+from dlo_casadi.config.explain import explain
+from dlo_casadi.config.problems import Problem, kind_of
+from dlo_casadi.config.sections import (
+    Cable,
+    Config,
+    Experiment,
+    File,
+    Pose,
+    SkippedPose,
+    Tolerances,
+)
+from dlo_casadi.errors import ConfigError
+
+
+def load_config(path: str | Path) -> Config:
+    """Read and check a configuration.
+
+    Parameters
+    ----------
+    path : str or Path
+        The YAML file.
+
+    Returns
+    -------
+    Config
+        Frozen, with the files of the poses as absolute paths.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be used; the message lists every problem with its line. A pose that
+        cannot be reached or has no file is left out and noted in `Config.skipped`; that is an
+        error only if no pose to fit remains.
+    """
+    source = Path(path)
+    document = Document.read(source)
+    if not isinstance(document.data, dict):
+        raise ConfigError(
+            f"a mapping with cable: and experiment: belongs at the top, "
+            f"found {kind_of(document.data)}",
+            file=source,
+        )
+    try:
+        file = File.model_validate(
+            document.data, context={"folder": source.absolute().resolve().parent}
+        )
+    except ValidationError as error:
+        raise document.error(explain(error.errors(), document.data)) from None
+
+    if problems := _contradictions(file.experiment):
+        raise document.error(problems)
+
+    poses = file.experiment.poses
+    unreachable = _unreachable(poses, file.cable, file.experiment.tolerances)
+    reachable = tuple(pose for pose in poses if pose.name not in unreachable)
+    problems_by_pose = unreachable | _missing(reachable)
+    skipped = {
+        pose.name: problems_by_pose[pose.name] for pose in poses if pose.name in problems_by_pose
+    }
+    n_fit = sum(pose.role == "fit" and pose.name not in skipped for pose in poses)
+    if n_fit == 0:
+        raise document.error(_no_fit_pose(poses, skipped))
+    warnings = _oddities(file)
+    if n_fit == 1:
+        warnings.append("only one pose to fit: what it tells cannot be checked on another one")
+    return Config(
+        path=source.absolute().resolve(),
+        cable=file.cable,
+        experiment=file.experiment.model_copy(update={"poses": reachable}),
+        model=file.model,
+        estimation=file.estimation,
+        diagnosis=file.diagnosis,
+        warnings=tuple(warnings),
+        skipped=tuple(SkippedPose(name, reason) for name, reason in skipped.items()),
+    )
+
+
+_IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
+
+
+def _contradictions(experiment: Experiment) -> list[Problem]:
+    """Find poses that do not fit the boundary, the kind of measurement, or each other."""
+    problems: list[Problem] = []
+    held = experiment.boundary
+    names: dict[str, int] = {}
+    for i, pose in enumerate(experiment.poses):
+
+        def wrong(message: str, i: int = i, pose: Pose = pose) -> None:
+            at = ("experiment", "poses", i)
+            problems.append(Problem(at, f"pose {i + 1} ({pose.file.name}): {message}"))
+
+        if pose.name in names:
+            wrong(
+                f"pose {names[pose.name] + 1} is called {pose.name!r} too; results are named after "
+                "the file without its ending, give each its own"
+            )
+        names.setdefault(pose.name, i)
+        if held.start == "clamped" and pose.start_heading is None:
+            wrong("a clamped start needs a start_heading [rad]")
+        if held.end == "clamped" and pose.end_heading is None:
+            wrong("a clamped end needs an end_heading [rad], continuous along the cable")
+        if held.end != "free" and pose.end is None:
+            wrong(f"a {held.end} end needs its position: end: [x, y]")
+        if held.end == "free":
+            for key in ("end", "end_heading"):
+                if getattr(pose, key) is not None:
+                    wrong(f"a free end has no {key}; boundary.end: pinned or clamped?")
+        ending = pose.file.suffix.lower()
+        if experiment.measurement.kind == "images" and ending == ".csv":
+            wrong("a CSV is not a photograph; measurement kind: centerlines?")
+        if experiment.measurement.kind == "centerlines" and ending in _IMAGE_ENDINGS:
+            wrong("a photograph is not a CSV; measurement kind: images?")
+    if not any(pose.role == "fit" for pose in experiment.poses):
+        at = ("experiment", "poses")
+        problems.append(Problem(at, "no pose has role: fit, there is nothing to fit to"))
+    return problems
+
+
+def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) -> dict[str, str]:
+    """Find poses whose ends are farther apart than the cable is long, beyond three tolerances."""
+    slack = 3.0 * math.hypot(tolerances.length, tolerances.end)
+    reasons: dict[str, str] = {}
+    for pose in poses:
+        if pose.end is None:
+            continue
+        distance = math.dist(pose.start, pose.end)
+        if distance > cable.length + slack:
+            unit = "in metres" if distance > 10.0 * cable.length else "and the cable's length right"
+            reasons[pose.name] = (
+                f"end ({pose.end[0]:g}, {pose.end[1]:g}) m is {distance:.4g} m from the start; "
+                f"the cable is {cable.length:.4g} m long. Is the end {unit}?"
+            )
+    return reasons
+
+
+def _missing(poses: Iterable[Pose]) -> dict[str, str]:
+    """Find poses whose file does not exist."""
+    reasons: dict[str, str] = {}
+    for pose in poses:
+        if pose.file.is_file():
+            continue
+        folder = pose.file.parent
+        names = [p.name for p in folder.iterdir()] if folder.is_dir() else []
+        near = difflib.get_close_matches(pose.file.name, names, 1, cutoff=0.8)
+        hint = f"did you mean {near[0]}?" if near else "files are found relative to the YAML"
+        reasons[pose.name] = f"{pose.file} does not exist; {hint}"
+    return reasons
+
+
+def _no_fit_pose(poses: Sequence[Pose], skipped: Mapping[str, str]) -> list[Problem]:
+    return [
+        Problem(
+            ("experiment", "poses", i),
+            f"no pose to fit is left; pose {i + 1} ({pose.file.name}): {skipped[pose.name]}",
+        )
+        for i, pose in enumerate(poses)
+        if pose.role == "fit" and pose.name in skipped
+    ]
+
+
+def _oddities(file: File) -> list[str]:
+    """Find what can be computed with but is probably not meant."""
+    cable, experiment = file.cable, file.experiment
+    held, poses = experiment.boundary, experiment.poses
+    warnings = []
+    if cable.youngs_modulus is not None and cable.youngs_modulus < 1.0e4:
+        warnings.append(
+            f"youngs_modulus {cable.youngs_modulus:g} Pa is softer than any cable: in pascal?"
+        )
+    density = cable.mass / (cable.length * math.pi * cable.diameter**2 / 4.0)
+    if density > 1.0e6:
+        warnings.append(
+            f"the cable is {density / 1000:.3g} times as dense as water: "
+            "mass in kg, diameter and length in m?"
+        )
+    spans = [math.dist(pose.start, pose.end) for pose in poses if pose.end is not None]
+    if spans and 0.0 < 50.0 * max(spans) < cable.length:
+        warnings.append(
+            f"the cable is {cable.length:g} m long, but its ends are never more than "
+            f"{max(spans):g} m apart: all in metres?"
+        )
+    if math.hypot(*experiment.gravity) > 100.0:
+        warnings.append(f"gravity is {math.hypot(*experiment.gravity):g} m/s^2: in m/s^2?")
+    std = experiment.measurement.std
+    if std is not None and std > 0.02 * cable.length:
+        warnings.append(f"std {std:g} m is large for a cable of {cable.length:g} m: in metres?")
+    for end in ("start", "end"):
+        headings = {pose.name: getattr(pose, f"{end}_heading") for pose in poses}
+        given = {name: value for name, value in headings.items() if value is not None}
+        if given and getattr(held, end) == "pinned":
+            warnings.append(f"{end}_heading is not used, the {end} is pinned: {', '.join(given)}")
+        large = [f"{name} {value:g}" for name, value in given.items() if abs(value) > 25.0]
+        if large and getattr(held, end) == "clamped":
+            warnings.append(f"{end}_heading turns around often, in radians? {', '.join(large)}")
+    return warnings

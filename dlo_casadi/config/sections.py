@@ -1,0 +1,419 @@
+"""The checked objects: one class for each section of a configuration. All units are SI."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean, show
+
+
+def _pair(value: object) -> object:
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise ValueError(f"two numbers [x, y] belong here, found {show(value)}")
+    return value
+
+
+def _empty_section(value: object) -> object:
+    """Read `model:` with nothing behind it as an empty section."""
+    return {} if value is None else value
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
+NonNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Switch = Annotated[bool, Field(strict=True)]
+Vector = Annotated[tuple[Number, Number], BeforeValidator(_pair)]
+Row = tuple[Number, Number, Number]
+
+
+class Section(BaseModel):
+    """A frozen mapping of the file: unknown keys are errors, the docstring of a key is its help."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class Cable(Section):
+    """The cable between its two fixtures."""
+
+    name: Annotated[str, Field(coerce_numbers_to_str=True)] = "cable"
+    """What to call the cable."""
+    length: Positive
+    """Length along the cable between its two fixtures [m]."""
+    mass: Positive
+    """Mass of that length [kg]."""
+    diameter: Positive
+    """Outer diameter [m]."""
+    youngs_modulus: Positive | None = None
+    """Young's modulus E of a solid round rod [Pa], a crude prior; or give bending_stiffness."""
+    bending_stiffness: Positive | None = None
+    """Bending stiffness EI [N m^2], a crude prior; or give youngs_modulus."""
+    rest_shape: Literal["straight", "curved"] = "curved"
+    """Shape without load: straight (no rest curvature is fitted) or curved."""
+
+    @property
+    def prior_bending_stiffness(self) -> float:
+        """First guess of EI [N m^2]: as declared, or E pi d^4 / 64."""
+        if self.bending_stiffness is not None:
+            return self.bending_stiffness
+        assert self.youngs_modulus is not None  # checked when the object was made
+        return self.youngs_modulus * math.pi * self.diameter**4 / 64.0
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Cable:
+        length, mass, diameter = self.length, self.mass, self.diameter
+        problems = []
+        if self.youngs_modulus is None and self.bending_stiffness is None:
+            problems.append(
+                Problem((), "give youngs_modulus [Pa] or bending_stiffness [N m^2], found neither")
+            )
+        if self.youngs_modulus is not None and self.bending_stiffness is not None:
+            problems.append(
+                Problem(
+                    ("bending_stiffness",), "give youngs_modulus or bending_stiffness, found both"
+                )
+            )
+        if length > 100.0:
+            text = f"{length:g} m: units are SI, did you mean {length / 1e3:g}?"
+            problems.append(Problem(("length",), text))
+        elif diameter > length:
+            text = (
+                f"{diameter:g} m is larger than the length {length:g} m: units are SI, "
+                f"did you mean {diameter / 1e3:g}?"
+            )
+            problems.append(Problem(("diameter",), text))
+        if mass > min(1000.0, 100.0 * length):
+            text = f"{mass:g} kg for {length:g} m: units are SI, did you mean {mass / 1e3:g}?"
+            problems.append(Problem(("mass",), text))
+        if problems:
+            raise Contradiction(*problems)
+        return self
+
+
+class Boundary(Section):
+    """How the two ends are held."""
+
+    start: Literal["pinned", "clamped"]
+    """Start of the cable: pinned (free to turn) or clamped (its heading is held)."""
+    end: Literal["pinned", "clamped", "free"]
+    """End of the cable: pinned, clamped or free."""
+
+
+class Camera(Section):
+    """A pinhole camera with lens distortion, in OpenCV's convention."""
+
+    matrix: tuple[Row, Row, Row]
+    """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel]."""
+    distortion: tuple[Number, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """Distortion coefficients k1, k2, p1, p2, k3."""
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Camera:
+        (fx, _, _), (below, fy, _), last = self.matrix
+        if fx <= 0.0 or fy <= 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
+            text = "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
+            raise Contradiction(Problem(("matrix",), text))
+        if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
+            text = (
+                f"found {len(self.distortion)} numbers; OpenCV knows 4, 5 "
+                "[k1, k2, p1, p2, k3], 8, 12 or 14"
+            )
+            raise Contradiction(Problem(("distortion",), text))
+        return self
+
+
+ARUCO_DICTIONARIES = (
+    *(f"DICT_{k}X{k}_{count}" for k in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_ARUCO_MIP_36h12",
+    *(f"DICT_APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
+)
+"""Names of OpenCV's predefined marker dictionaries."""
+
+
+class Board(Section):
+    """A plane board with ArUco markers; it defines the frame in which everything is measured."""
+
+    dictionary: str
+    """OpenCV's name of the marker dictionary, such as DICT_4X4_50."""
+    marker_size: Positive
+    """Side of the black square of a marker [m]."""
+    standoff: NonNegative = 0.0
+    """Distance of the cable's axis in front of the board [m]; other than 0 needs a camera."""
+    marker_centers: Annotated[dict[Annotated[int, Field(ge=0)], Vector], Field(min_length=1)]
+    """Centre of each marker by its id: {0: [x, y], 1: [x, y], ...} [m]."""
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Board:
+        if self.dictionary not in ARUCO_DICTIONARIES:
+            hint = did_you_mean(self.dictionary, ARUCO_DICTIONARIES)
+            text = f"OpenCV has no dictionary {self.dictionary!r}{hint}"
+            raise Contradiction(Problem(("dictionary",), text))
+        size = self.dictionary.rsplit("_", 1)[1]
+        too_large = [i for i in self.marker_centers if size.isdigit() and i >= int(size)]
+        if too_large:
+            text = f"{self.dictionary} has no marker {too_large[0]}: its ids end at {int(size) - 1}"
+            raise Contradiction(Problem(("marker_centers",), text))
+        for (i, a), (j, b) in itertools.combinations(self.marker_centers.items(), 2):
+            if math.dist(a, b) < self.marker_size:
+                text = (
+                    f"markers {i} and {j} are {math.dist(a, b):g} m apart, closer than their "
+                    f"size of {self.marker_size:g} m: all in metres?"
+                )
+                raise Contradiction(Problem(("marker_centers",), text))
+        return self
+
+
+class Reference(Section):
+    """Two known points in the photograph: scale, rotation and origin of a similarity transform."""
+
+    pixels: tuple[Vector, Vector]
+    """The two points in the photograph [[u, v], [u, v]], u to the right, v down [pixel]."""
+    points: tuple[Vector, Vector]
+    """The same two points in the board frame [[x, y], [x, y]] [m]."""
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Reference:
+        for name, (a, b) in (("pixels", self.pixels), ("points", self.points)):
+            if a == b:
+                raise Contradiction(Problem((name,), f"the two points are the same: {list(a)}"))
+        return self
+
+
+class Images(Section):
+    """Photographs of the cable, with a board or two known points."""
+
+    kind: Literal["images"]
+    """images."""
+    std: Positive | None = None
+    """Standard deviation of one centre-line coordinate [m]; estimated when absent."""
+    camera: Camera | None = None
+    """The camera; without it the board's plane is mapped by a homography."""
+    board: Board | None = None
+    """The board with its markers; or give reference."""
+    reference: Reference | None = None
+    """Two known points; or give board."""
+
+    @model_validator(mode="after")
+    def _one_frame(self) -> Images:
+        if (self.board is None) == (self.reference is None):
+            found = "neither" if self.board is None else "both"
+            text = f"kind: images needs either a board or a reference, found {found}"
+            raise Contradiction(Problem((), text))
+        if self.board is not None and self.camera is None and self.board.standoff != 0.0:
+            text = (
+                f"{self.board.standoff:g} m need a camera: without one only the plane of the "
+                "board itself can be measured"
+            )
+            raise Contradiction(Problem(("board", "standoff"), text))
+        return self
+
+
+class Centerlines(Section):
+    """Centre-lines that were measured elsewhere, one CSV file a pose."""
+
+    kind: Literal["centerlines"]
+    """centerlines."""
+    std: Positive | None = None
+    """Standard deviation of one centre-line coordinate [m]; estimated when absent."""
+
+
+class Tolerances(Section):
+    """How well the declared values are known: one standard deviation each."""
+
+    length: Positive = 5.0e-4
+    """Of the cable's length [m]."""
+    end: Positive = 2.0e-4
+    """Of a coordinate of a fixture [m]."""
+    heading: Positive = 1.0e-2
+    """Of a clamp's heading [rad]."""
+    scale: Positive = 3.0e-4
+    """Of the scale of the measurement, relative."""
+
+
+class Pose(Section):
+    """One measured shape: where the ends were held, and the file that shows it."""
+
+    file: Path
+    """Photograph or CSV, found relative to the YAML; an absolute path once loaded."""
+    start: Vector
+    """Where the start is held [x, y] [m]."""
+    end: Vector | None = None
+    """Where the end is held [x, y] [m]; a free end has none."""
+    start_heading: Number | None = None
+    """Direction of the cable in a clamped start, counter-clockwise from +x [rad]."""
+    end_heading: Number | None = None
+    """Direction of the cable in a clamped end, continuous along the cable [rad]."""
+    role: Literal["fit", "held_out"] = "fit"
+    """fit, or held_out to check the prediction."""
+    branch: Literal["ccw", "cw"] | None = None
+    """Which way the cable turns from start to end, where several equilibria exist."""
+
+    @property
+    def name(self) -> str:
+        """Name of the pose: its file without folder and ending."""
+        return self.file.stem
+
+    @field_validator("file", mode="before")
+    @classmethod
+    def _absolute(cls, value: object, info: ValidationInfo) -> object:
+        if not isinstance(value, str | Path) or not str(value).strip():
+            raise ValueError(f"a file name belongs here, found {show(value)}")
+        folder = (info.context or {}).get("folder", Path())
+        return (folder / value).absolute()
+
+
+class Experiment(Section):
+    """What was measured, and under which conditions."""
+
+    gravity: Vector
+    """Gravity in the board frame, such as [0.0, -9.81] [m/s^2]."""
+    boundary: Boundary
+    """How the two ends are held: {start: pinned | clamped, end: pinned | clamped | free}."""
+    measurement: Annotated[Images | Centerlines, Field(discriminator="kind")]
+    """What the files of the poses are: kind: images or kind: centerlines."""
+    tolerances: Annotated[Tolerances, BeforeValidator(_empty_section)] = Tolerances()
+    """How well the declared values are known."""
+    poses: Annotated[tuple[Pose, ...], Field(min_length=1)]
+    """The poses, in the order in which they were taken."""
+
+
+class EffectParameter(Section):
+    """The declared value of an effect's parameter: an initial guess, or kept when fixed."""
+
+    value: Number
+    """Value in the parameter's own unit."""
+    fixed: Switch = False
+    """Whether the value is kept; otherwise it is where the fit starts."""
+
+
+def _as_parameter(value: object) -> object:
+    return {"value": value} if not isinstance(value, Mapping | EffectParameter) else value
+
+
+def _as_effect(value: object) -> object:
+    return {"name": value} if isinstance(value, str) else value
+
+
+class DeclaredEffect(Section):
+    """An effect that is part of the model from the start."""
+
+    name: str
+    """Name of the effect, such as lumped_mass."""
+    parameters: dict[str, Annotated[EffectParameter, BeforeValidator(_as_parameter)]] = {}
+    """Initial guess of each parameter by its name; {value: ..., fixed: true} keeps a value."""
+
+
+class ModelOptions(Section):
+    """The declared model."""
+
+    n: Annotated[int, Field(strict=True, ge=2, le=2000)] | None = None
+    """Number of elements; chosen from the data when absent."""
+    element: Literal["arc", "link"] = "arc"
+    """arc (heading varies linearly in an element) or link (straight, as in the paper)."""
+    effects: tuple[Annotated[DeclaredEffect, BeforeValidator(_as_effect)], ...] = ()
+    """Effects beside bending and weight."""
+
+
+class EstimationOptions(Section):
+    """How the parameters are estimated."""
+
+    algorithm1: Switch = True
+    """Whether the paper's loop runs as a baseline."""
+    algorithm1_n: Annotated[int, Field(strict=True, ge=2, le=200)] = 10
+    """Number of links in the paper's loop."""
+    algorithm1_inner: Literal["ipopt", "cobyla"] = "ipopt"
+    """Its inner minimisation: ipopt, or cobyla as in the paper (about 1 s a pose)."""
+    robust: Switch = False
+    """Whether outlying points weigh less."""
+    rest_curvature_coefficients: Count | None = None
+    """Number of coefficients of the rest curvature; chosen from the data when absent."""
+
+
+class DiagnosisOptions(Section):
+    """The search for missing effects."""
+
+    enabled: Switch = True
+    """Whether missing effects are searched for."""
+    exclude: tuple[str, ...] = ()
+    """Names of effects that are not tried."""
+    significance: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)] = 0.005
+    """Largest p-value with which an effect is added."""
+    max_effects: Annotated[int, Field(strict=True, ge=0)] = 4
+    """Largest number of effects that are added."""
+
+
+class SkippedPose(NamedTuple):
+    """A pose that cannot be used, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Config:
+    """A checked configuration.
+
+    Parameters
+    ----------
+    path : Path
+        The YAML file, absolute.
+    cable, experiment, model, estimation, diagnosis
+        Its sections.
+    warnings : tuple of str
+        What looks odd but does not stop the fit.
+    skipped : tuple of SkippedPose
+        Poses that cannot be used. Those without an equilibrium (farther apart than the cable is
+        long) are not in `experiment.poses`; those whose file is missing stay there, because their
+        end conditions are part of the cable's history, but not in `measured_poses`.
+    """
+
+    path: Path
+    cable: Cable
+    experiment: Experiment
+    model: ModelOptions
+    estimation: EstimationOptions
+    diagnosis: DiagnosisOptions
+    warnings: tuple[str, ...] = ()
+    skipped: tuple[SkippedPose, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the configuration: its file without folder and ending."""
+        return self.path.stem
+
+    @property
+    def measured_poses(self) -> tuple[Pose, ...]:
+        """Poses with a file to read, in the order in which they were taken."""
+        skipped = {pose.name for pose in self.skipped}
+        return tuple(pose for pose in self.experiment.poses if pose.name not in skipped)
+
+
+class File(Section):
+    """What may stand at the top of a configuration."""
+
+    cable: Cable
+    """The cable: length, mass, diameter, youngs_modulus or bending_stiffness."""
+    experiment: Experiment
+    """The experiment: gravity, boundary, measurement, poses."""
+    model: Annotated[ModelOptions, BeforeValidator(_empty_section)] = ModelOptions()
+    """The declared model."""
+    estimation: Annotated[EstimationOptions, BeforeValidator(_empty_section)] = EstimationOptions()
+    """How the parameters are estimated."""
+    diagnosis: Annotated[DiagnosisOptions, BeforeValidator(_empty_section)] = DiagnosisOptions()
+    """The search for missing effects."""
