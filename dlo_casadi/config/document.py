@@ -178,15 +178,18 @@ class Document:
                 break
         return line
 
-    def error(self, problems: Iterable[Problem], most: int = 12) -> ConfigError:
+    def error(self, problems: Iterable[Problem], heading: str = "") -> ConfigError:
         """All problems as one error, in the order of their lines."""
+        most = 12
         lines = sorted({(self.line(problem.place), problem.message) for problem in problems})
         if len(lines) == 1:
-            return ConfigError(lines[0][1], file=self.source, line=lines[0][0])
+            line, message = lines[0]
+            return ConfigError(": ".join(filter(None, (heading, message))), self.source, line)
         listed = [f"  line {line}: {message}" for line, message in lines[:most]]
         if len(lines) > most:
             listed.append(f"  ... and {len(lines) - most} more")
-        return ConfigError("\n".join([f"{len(lines)} problems", *listed]), file=self.source)
+        heading = heading or f"{len(lines)} problems"
+        return ConfigError("\n".join([heading, *listed]), self.source)
 
 
 def _refuse_repeated_keys(root: yaml.Node, source: Path) -> None:

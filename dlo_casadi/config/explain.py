@@ -12,7 +12,6 @@ from pydantic_core import ErrorDetails
 from dlo_casadi.config.problems import Contradiction, Place, Problem, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import File, Section
 
-
 _NUMBER = r"[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?"
 
 
@@ -30,7 +29,7 @@ def _label(place: Place, data: Any) -> str:
                 words = [f"pose {part + 1}" + (f" ({file})" if isinstance(file, str) else "")]
             else:
                 words[-1] += f"[{part}]"
-    return ".".join(words) or "the file"
+    return ".".join(words) or "the top of the file"
 
 
 def _sections(annotation: Any) -> list[type[Section]]:
@@ -131,7 +130,7 @@ def explain(errors: Sequence[ErrorDetails], data: Any) -> list[Problem]:
                 continue
             key = place[-1]
             text = (
-                f"{label} has only {key} values"
+                f"{label} has only {key} of its values"
                 if isinstance(key, int)
                 else f"{key!r} is missing in {label}{_help(section, key)}"
             )
@@ -144,8 +143,7 @@ def explain(errors: Sequence[ErrorDetails], data: Any) -> list[Problem]:
             text = f"unknown key {key!r} in {_label(place[:-1], data)}{hint}"
         elif kind in ("union_tag_invalid", "union_tag_not_found"):
             place = (*place, "kind")
-            found = context.get("tag")
-            text = f"{label}: kind must be images or centerlines, found {show(found)}"
+            text = f"{label}: kind must be images or centerlines, found {show(context.get('tag'))}"
         elif kind == "value_error" and isinstance(context["error"], Contradiction):
             for inner in context["error"].problems:
                 at = (*place, *inner.place)

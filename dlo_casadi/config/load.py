@@ -71,7 +71,7 @@ def load_config(path: str | Path) -> Config:
     }
     n_fit = sum(pose.role == "fit" and pose.name not in skipped for pose in poses)
     if n_fit == 0:
-        raise document.error(_no_fit_pose(poses, skipped))
+        raise document.error(_no_fit_pose(poses, skipped), "no pose to fit is left")
     warnings = _oddities(file)
     if n_fit == 1:
         warnings.append("only one pose to fit: what it tells cannot be checked on another one")
@@ -137,10 +137,9 @@ def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) ->
             continue
         distance = math.dist(pose.start, pose.end)
         if distance > cable.length + slack:
-            unit = "in metres" if distance > 10.0 * cable.length else "and the cable's length right"
             reasons[pose.name] = (
                 f"end ({pose.end[0]:g}, {pose.end[1]:g}) m is {distance:.4g} m from the start; "
-                f"the cable is {cable.length:.4g} m long. Is the end {unit}?"
+                f"the cable is {cable.length:.4g} m long. Are end and cable.length right, in metres?"
             )
     return reasons
 
@@ -163,7 +162,7 @@ def _no_fit_pose(poses: Sequence[Pose], skipped: Mapping[str, str]) -> list[Prob
     return [
         Problem(
             ("experiment", "poses", i),
-            f"no pose to fit is left; pose {i + 1} ({pose.file.name}): {skipped[pose.name]}",
+            f"pose {i + 1} ({pose.file.name}): {skipped[pose.name]}",
         )
         for i, pose in enumerate(poses)
         if pose.role == "fit" and pose.name in skipped

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -198,7 +198,7 @@ class Reference(Section):
 class Images(Section):
     """Photographs of the cable, with a board or two known points."""
 
-    kind: Literal["images"]
+    kind: Literal["images"] = "images"
     """images."""
     std: Positive | None = None
     """Standard deviation of one centre-line coordinate [m]; estimated when absent."""
@@ -227,7 +227,7 @@ class Images(Section):
 class Centerlines(Section):
     """Centre-lines that were measured elsewhere, one CSV file a pose."""
 
-    kind: Literal["centerlines"]
+    kind: Literal["centerlines"] = "centerlines"
     """centerlines."""
     std: Positive | None = None
     """Standard deviation of one centre-line coordinate [m]; estimated when absent."""
@@ -289,7 +289,7 @@ class Experiment(Section):
     """What the files of the poses are: kind: images or kind: centerlines."""
     tolerances: Annotated[Tolerances, BeforeValidator(_empty_section)] = Tolerances()
     """How well the declared values are known."""
-    poses: Annotated[tuple[Pose, ...], Field(min_length=1)]
+    poses: tuple[Pose, ...]
     """The poses, in the order in which they were taken."""
 
 
@@ -386,9 +386,9 @@ class Config:
     path: Path
     cable: Cable
     experiment: Experiment
-    model: ModelOptions
-    estimation: EstimationOptions
-    diagnosis: DiagnosisOptions
+    model: ModelOptions = field(default_factory=ModelOptions)
+    estimation: EstimationOptions = field(default_factory=EstimationOptions)
+    diagnosis: DiagnosisOptions = field(default_factory=DiagnosisOptions)
     warnings: tuple[str, ...] = ()
     skipped: tuple[SkippedPose, ...] = ()
 
