@@ -1,0 +1,264 @@
+"""Kinematics of a planar chain: coordinates -> curve. No mechanics in here.
+
+The solvers' coordinates are absolute headings `phi`; the paper's relative joint angles are
+`theta = diff(phi)`. In headings the energy of bending and of every dead load is a sum of terms of
+neighbours, so that its Hessian is banded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.errors import DloError
+
+Element = Literal["arc", "link"]
+
+# Gauss-Legendre on [0, 1]: three points integrate cos and sin of a heading that turns by d in
+# one element with an error below d^6 / 2e6.
+GAUSS_NODES = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
+GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+
+
+def link_transform(theta: ca.SX, length: float) -> ca.SX:
+    """Homogeneous transform T_a^(a-1) of one link: translate by `length` along x, then turn.
+
+    Source: Eq. 4 of Quartaro et al. 2025.
+    """
+    c, s = ca.cos(theta), ca.sin(theta)
+    return ca.blockcat([[c, -s, 0, length], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def se3_nodes(theta: ca.SX, length: float) -> ca.SX:
+    """Node positions of a straight-link chain by the SE(3) product of the paper.
+
+        T_i^0 = T_1^0(theta_1) prod_{a=2..i} T_a^(a-1)(theta_a)             (Eq. 4)
+
+    Reference for the recurrence in headings that the solvers use.
+
+    Parameters
+    ----------
+    theta : (n,) [rad]
+        theta_1 is the heading of link 1, the others are relative joint angles.
+    length : float [m]
+        Length of the cable; each link is length / n long.
+
+    Returns
+    -------
+    (n + 1, 2) [m]
+        Nodes from the start, which is the origin.
+    """
+    n = theta.numel()
+    h = length / n
+    transform = link_transform(theta[0], 0.0)
+    nodes = [ca.SX.zeros(1, 2)]
+    for i in range(1, n):
+        transform = transform @ link_transform(theta[i], h)
+        nodes.append(transform[:2, 3].T)
+    end = transform @ ca.vertcat(h, 0, 0, 1)
+    nodes.append(end[:2].T)
+    return ca.vertcat(*nodes)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A cable cut into n equal elements.
+
+    Parameters
+    ----------
+    length : float [m]
+        Declared length along the cable.
+    n : int
+        Number of elements, >= 2.
+    element : "arc" or "link"
+        "arc": the heading varies linearly in an element (n + 1 nodal headings).
+        "link": straight links joined by hinges (n headings), the paper's chain.
+    start_clamped, end_clamped : bool
+        A clamp bends the half cell between itself and the middle of a link; an arc's nodal
+        heading is prescribed by a constraint instead and needs no cell of its own.
+    """
+
+    length: float
+    n: int
+    element: Element = "arc"
+    start_clamped: bool = False
+    end_clamped: bool = False
+
+    def __post_init__(self) -> None:
+        if self.n < 2:
+            raise DloError(f"a chain needs at least 2 elements, got n = {self.n}")
+        if self.element not in ("arc", "link"):
+            raise DloError(f"element {self.element!r} is not known; use 'arc' or 'link'")
+
+    @property
+    def h(self) -> float:
+        """Length of one element [m]."""
+        return self.length / self.n
+
+    @property
+    def n_headings(self) -> int:
+        """Number of absolute headings among the coordinates."""
+        return self.n + 1 if self.element == "arc" else self.n
+
+    @property
+    def cells(self) -> NDArray[np.float64]:
+        """Bending cells (n_cells, 2) [m]: where each discrete curvature acts, from s0 to s1."""
+        if self.element == "arc":
+            edges = np.linspace(0.0, self.length, self.n + 1)
+        else:
+            middles = (np.arange(self.n) + 0.5) * self.h
+            head = [0.0] if self.start_clamped else []
+            tail = [self.length] if self.end_clamped else []
+            edges = np.concatenate([head, middles, tail])
+        return np.stack([edges[:-1], edges[1:]], axis=1)
+
+    @property
+    def n_cells(self) -> int:
+        """Number of bending cells."""
+        return len(self.cells)
+
+    @property
+    def heading_places(self) -> NDArray[np.float64]:
+        """Arc lengths (n_headings,) [m] at which the headings are the cable's direction."""
+        if self.element == "arc":
+            return np.linspace(0.0, self.length, self.n + 1)
+        return (np.arange(self.n) + 0.5) * self.h
+
+    def curve(
+        self,
+        phi: ca.SX,
+        start: ca.SX,
+        start_heading: ca.SX | float = 0.0,
+        end_heading: ca.SX | float = 0.0,
+        stretch: ca.SX | float = 1.0,
+        ratio: ca.SX | None = None,
+    ) -> Curve:
+        """Build the curve of the headings `phi`.
+
+        Parameters
+        ----------
+        phi : (n_headings,) [rad]
+        start : (2,) [m]
+            Position of the start fixture.
+        start_heading, end_heading : scalar [rad]
+            Directions of clamps; used by links only.
+        stretch : scalar
+            True length over declared length, the same everywhere.
+        ratio : (n,), optional
+            Length of each element over its declared length; `stretch` everywhere by default.
+        """
+        bent = phi
+        if self.element == "link":
+            if self.start_clamped:
+                bent = ca.vertcat(start_heading, bent)
+            if self.end_clamped:
+                bent = ca.vertcat(bent, end_heading)
+        if ratio is None:
+            ratio = ca.SX.ones(self.n) * stretch
+        return Curve(self, phi, bent, ratio, stretch, start)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A planar curve, seen by effects through position, heading and strain at an arc length.
+
+    Arc lengths `s` are material coordinates in [0, declared length].
+    """
+
+    chain: Chain
+    phi: ca.SX
+    bent: ca.SX
+    ratio: ca.SX
+    stretch: ca.SX | float
+    start: ca.SX
+
+    def _heading_in(self, e: int, u: ca.SX | float) -> ca.SX:
+        """Heading in element e at the fraction u of its length."""
+        if self.chain.element == "link":
+            return self.phi[e]
+        return self.phi[e] + u * (self.phi[e + 1] - self.phi[e])
+
+    def _advance(self, e: int, u: ca.SX | float) -> ca.SX:
+        """Vector from the start of element e to the fraction u of its length [m]."""
+        if self.chain.element == "link":
+            t = ca.vertcat(ca.cos(self.phi[e]), ca.sin(self.phi[e]))
+            return self.chain.h * self.ratio[e] * u * t
+        total = ca.SX.zeros(2)
+        for node, weight in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
+            heading = self._heading_in(e, u * node)
+            total += weight * ca.vertcat(ca.cos(heading), ca.sin(heading))
+        return self.chain.h * self.ratio[e] * u * total
+
+    @property
+    def strain(self) -> ca.SX:
+        """Curvature in each bending cell (n_cells,) [1/m]."""
+        width = np.diff(self.chain.cells, axis=1).ravel()
+        return (self.bent[1:] - self.bent[:-1]) / (ca.DM(width) * self.stretch)
+
+    @property
+    def nodes(self) -> ca.SX:
+        """Positions of the element boundaries (n + 1, 2) [m]."""
+        points = [self.start]
+        for e in range(self.chain.n):
+            points.append(points[-1] + self._advance(e, 1.0))
+        return ca.horzcat(*points).T
+
+    @property
+    def node_slopes(self) -> ca.SX:
+        """Derivative of position by s at the nodes of a chain of arcs (n + 1, 2) [1]."""
+        ratio = ca.vertcat(
+            self.ratio[0], (self.ratio[1:] + self.ratio[:-1]) / 2, self.ratio[self.chain.n - 1]
+        )
+        return ca.horzcat(ca.cos(self.phi) * ratio, ca.sin(self.phi) * ratio)
+
+    def position(self, s: ca.SX | float) -> ca.SX:
+        """Position at the arc length s (2,) [m], once differentiable in s."""
+        total = self.start
+        for e in range(self.chain.n):
+            u = ca.fmin(ca.fmax(s / self.chain.h - e, 0), 1)
+            total = total + self._advance(e, u)
+        return total
+
+    def heading(self, s: ca.SX | float) -> ca.SX:
+        """Direction of the cable at the arc length s [rad], continuous in s."""
+        places = self.chain.heading_places
+        total = self.phi[0]
+        for i in range(self.chain.n_headings - 1):
+            u = ca.fmin(ca.fmax((s - places[i]) / self.chain.h, 0), 1)
+            total = total + u * (self.phi[i + 1] - self.phi[i])
+        return total
+
+    @property
+    def start_direction(self) -> ca.SX:
+        """Heading at the start [rad]: nodal for arcs, of the first link for links."""
+        return self.phi[0]
+
+    @property
+    def end_direction(self) -> ca.SX:
+        """Heading at the end [rad]: nodal for arcs, of the last link for links."""
+        return self.phi[self.chain.n_headings - 1]
+
+    @property
+    def first_moment(self) -> ca.SX:
+        """Integral of position over the material length (2,) [m^2].
+
+        By parts: int r ds = L r(0) + int (L - s) dr/ds ds, a sum of terms of single elements.
+        """
+        h, n = self.chain.h, self.chain.n
+        total = self.chain.length * self.start
+        for e in range(n):
+            if self.chain.element == "link":
+                weight = h * (n - e - 0.5)
+                t = ca.vertcat(ca.cos(self.phi[e]), ca.sin(self.phi[e]))
+                total = total + weight * h * self.ratio[e] * t
+                continue
+            for node, gauss in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
+                heading = self._heading_in(e, node)
+                weight = gauss * h * (n - e - node)
+                t = ca.vertcat(ca.cos(heading), ca.sin(heading))
+                total = total + weight * h * self.ratio[e] * t
+        return total

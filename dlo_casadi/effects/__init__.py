@@ -1,0 +1,79 @@
+"""Effects: the explicit list of what a configuration or the diagnosis may name."""
+
+from dlo_casadi.effects.axial_stretch import AxialStretch
+from dlo_casadi.effects.bending_softening import BendingSoftening
+from dlo_casadi.effects.clamp_angle import ClampAngle
+from dlo_casadi.effects.effect import (
+    BoundaryEffect,
+    Cable,
+    Effect,
+    EndConditions,
+    Kinematics,
+    Load,
+    MeasurementEffect,
+    SectionLaw,
+    StateEffect,
+)
+from dlo_casadi.effects.end_offset import EndOffset
+from dlo_casadi.effects.end_spring import EndSpring, StartSpring
+from dlo_casadi.effects.gravity_tilt import GravityTilt
+from dlo_casadi.effects.image_distortion import ImageDistortion
+from dlo_casadi.effects.image_scale import ImageScale
+from dlo_casadi.effects.length_error import LengthError
+from dlo_casadi.effects.lumped_mass import LumpedMass
+from dlo_casadi.effects.point_force import PointForce
+from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
+from dlo_casadi.effects.side_load import SideLoad
+from dlo_casadi.effects.stiff_section import StiffSection
+from dlo_casadi.effects.stiffness_gradient import StiffnessGradient
+
+EFFECTS: dict[str, type[Effect]] = {
+    effect.name: effect
+    for effect in (
+        LumpedMass,
+        PointForce,
+        SideLoad,
+        GravityTilt,
+        StiffnessGradient,
+        StiffSection,
+        BendingSoftening,
+        AxialStretch,
+        LengthError,
+        StartSpring,
+        EndSpring,
+        ClampAngle,
+        EndOffset,
+        RestCurvatureDrift,
+        ImageScale,
+        ImageDistortion,
+    )
+}
+
+__all__ = [
+    "EFFECTS",
+    "AxialStretch",
+    "BendingSoftening",
+    "BoundaryEffect",
+    "Cable",
+    "ClampAngle",
+    "Effect",
+    "EndConditions",
+    "EndOffset",
+    "EndSpring",
+    "GravityTilt",
+    "ImageDistortion",
+    "ImageScale",
+    "Kinematics",
+    "LengthError",
+    "Load",
+    "LumpedMass",
+    "MeasurementEffect",
+    "PointForce",
+    "RestCurvatureDrift",
+    "SectionLaw",
+    "SideLoad",
+    "StartSpring",
+    "StateEffect",
+    "StiffSection",
+    "StiffnessGradient",
+]

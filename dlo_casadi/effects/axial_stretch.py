@@ -1,0 +1,32 @@
+"""A cable that stretches."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, Kinematics, Params
+from dlo_casadi.parameters import Parameter
+
+
+class AxialStretch(Kinematics):
+    """Axial strain N / EA under the tension N(s).
+
+        V = int N^2 / (2 EA) ds                                         [J]
+
+    Estimated as `compliance` = 1/EA, which vanishes at 0, where the cable is inextensible.
+
+    Parameters
+    ----------
+    compliance : scalar [1/N], >= 0
+    """
+
+    name = "axial_stretch"
+    extensible = True
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the compliance."""
+        return (Parameter("compliance", "1/N", scale=1e-3, lower=0.0, upper=1.0),)
+
+    def compliance(self, params: Params) -> ca.SX:
+        """Return 1/EA [1/N]."""
+        return params["compliance"]

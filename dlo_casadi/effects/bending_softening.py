@@ -1,0 +1,51 @@
+"""A section that yields as it is bent: strands that slip."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.effects.effect import Cable, Params, SectionLaw
+from dlo_casadi.parameters import Parameter
+
+# Gauss-Legendre on [0, 1]; ten points integrate the law to 1e-9 for |k|/c up to 5.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
+_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+# |k| is rounded to sqrt(k^2 + d^2) - d over this share of one turn per length.
+_ROUNDING = 1e-3
+
+
+class BendingSoftening(SectionLaw):
+    """The moment grows less than the bend: strands slip, insulation yields.
+
+        M = EI k / (1 + |k| / c),   W = int_0^k M dk                     [N m], [N]
+
+    with k = curvature - rest curvature. Estimated as `softness` = 1/c, which vanishes at 0.
+
+    Parameters
+    ----------
+    softness : scalar [m], >= 0
+        Inverse of the curvature scale c.
+
+    References
+    ----------
+    Slip of strands lowers the bending stiffness with curvature, e.g. Papailiou, IEEE Trans.
+    Power Delivery 12 (1997); the hyperbolic law is the simplest that keeps M monotone.
+    """
+
+    name = "bending_softening"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the softness."""
+        return (Parameter("softness", "m", scale=0.1 * cable.length, lower=0.0, upper=1e3),)
+
+    def factor(
+        self, bend: ca.SX, cells: NDArray[np.float64], cable: Cable, params: Params
+    ) -> ca.SX:
+        """Energy over EI k^2 / 2: 2 int_0^1 t / (1 + t |k|/c) dt, by quadrature in t."""
+        delta = _ROUNDING * cable.curvature_scale
+        ratio = params["softness"] * (ca.sqrt(bend * bend + delta**2) - delta)
+        return sum(
+            2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)
+        )

@@ -1,0 +1,44 @@
+"""A clamp that holds the cable in another direction than declared."""
+
+from __future__ import annotations
+
+from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params
+from dlo_casadi.parameters import Parameter
+
+
+class ClampAngle(BoundaryEffect):
+    """True minus declared heading of the clamps, the same in all poses.
+
+        heading' = heading + heading_error
+
+    Parameters
+    ----------
+    start_heading_error, end_heading_error : scalar [rad]
+        Counter-clockwise; vanish at 0. Only those of clamped ends are declared.
+    """
+
+    name = "clamp_angle"
+    start: bool = True
+    end: bool = True
+
+    def __init__(self, start: bool = True, end: bool = True, label: str = "") -> None:
+        super().__init__(label)
+        object.__setattr__(self, "start", start)
+        object.__setattr__(self, "end", end)
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the errors of the clamped ends."""
+        held = [side for side, used in (("start", self.start), ("end", self.end)) if used]
+        return tuple(
+            Parameter(f"{side}_heading_error", "rad", scale=0.05, lower=-0.9, upper=0.9)
+            for side in held
+        )
+
+    def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
+        """Turn the clamps."""
+        turned = {}
+        if self.start:
+            turned["start_heading"] = ends.start_heading + params["start_heading_error"]
+        if self.end:
+            turned["end_heading"] = ends.end_heading + params["end_heading_error"]
+        return ends.changed(**turned)

@@ -1,0 +1,34 @@
+"""An end fixture that is not where it is declared to be."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params
+from dlo_casadi.parameters import Parameter
+
+
+class EndOffset(BoundaryEffect):
+    """True minus declared position of the end fixture, the same in all poses.
+
+        end' = end + (dx, dy)
+
+    Parameters
+    ----------
+    dx, dy : scalar [m]
+        Vanish at 0.
+    """
+
+    name = "end_offset"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the offset."""
+        bound = 0.3 * cable.length
+        scale = 0.002 * cable.length
+        return tuple(
+            Parameter(axis, "m", scale=scale, lower=-bound, upper=bound) for axis in ("dx", "dy")
+        )
+
+    def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
+        """Move the end fixture."""
+        return ends.changed(end=ends.end + ca.vertcat(params["dx"], params["dy"]))

@@ -1,0 +1,45 @@
+"""A lens that is not quite as calibrated."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params
+from dlo_casadi.parameters import Parameter
+
+
+class ImageDistortion(MeasurementEffect):
+    """Radial distortion about the image centre, in the cable's plane.
+
+        measured = c + (1 + k |true - c|^2) (true - c)
+
+    Parameters
+    ----------
+    coefficient : scalar k [1/m^2]
+        Vanishes at 0.
+
+    Fields
+    ------
+    center : (float, float) [m]
+        The image centre c in the board frame.
+
+    References
+    ----------
+    First radial term of Brown, Photogrammetric Engineering 37 (1971).
+    """
+
+    name = "image_distortion"
+    center: tuple[float, float]
+
+    def __init__(self, center: tuple[float, float] = (0.0, 0.0), label: str = "") -> None:
+        super().__init__(label)
+        object.__setattr__(self, "center", center)
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the coefficient."""
+        return (Parameter("coefficient", "1/m^2", scale=0.005 / cable.length**2),)
+
+    def observe(self, point: ca.SX, start: ca.SX, params: Params) -> ca.SX:
+        """Move the point along its radius."""
+        arm = point - ca.DM(self.center)
+        return ca.DM(self.center) + (1 + params["coefficient"] * ca.sumsqr(arm)) * arm

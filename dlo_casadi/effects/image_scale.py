@@ -1,0 +1,30 @@
+"""A ruler that is off."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params
+from dlo_casadi.parameters import Parameter
+
+
+class ImageScale(MeasurementEffect):
+    """Measured lengths are true lengths times a factor, about the start fixture.
+
+        measured = start + factor (true - start)
+
+    Parameters
+    ----------
+    factor : scalar, > 0
+        Vanishes at 1.
+    """
+
+    name = "image_scale"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the factor."""
+        return (Parameter("factor", nominal=1.0, scale=0.002, lower=0.7, upper=1.4),)
+
+    def observe(self, point: ca.SX, start: ca.SX, params: Params) -> ca.SX:
+        """Scale about the start fixture."""
+        return start + params["factor"] * (point - start)

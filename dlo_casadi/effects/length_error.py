@@ -1,0 +1,35 @@
+"""A cable that is longer or shorter than declared."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, Kinematics, Params
+from dlo_casadi.parameters import Parameter
+
+
+class LengthError(Kinematics):
+    """The length between the fixtures is not the declared one; the mass stays.
+
+        true length = L + length_difference
+
+    Parameters
+    ----------
+    length_difference : scalar [m]
+        True minus declared; vanishes at 0.
+    """
+
+    name = "length_error"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the difference."""
+        bound = 0.3 * cable.length
+        return (
+            Parameter(
+                "length_difference", "m", scale=0.002 * cable.length, lower=-bound, upper=bound
+            ),
+        )
+
+    def stretch(self, cable: Cable, params: Params) -> ca.SX:
+        """Return true over declared length."""
+        return 1 + params["length_difference"] / cable.length

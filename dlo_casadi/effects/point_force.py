@@ -1,0 +1,47 @@
+"""A constant force at one place of the cable."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.chain import Curve
+from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.parameters import Parameter
+
+
+class PointForce(Load):
+    """A dead force on the cable, the same in every pose: a string over a pulley, a jet.
+
+        V = - f . r(s)                                                [J]
+
+    Parameters
+    ----------
+    fx, fy : scalar [N]
+        In the board frame; vanishes at 0.
+    position : scalar [m], in [0, L]
+        Arc length from the start fixture.
+    """
+
+    name = "point_force"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the force and its place."""
+        scale = 0.1 * 9.81 * cable.mass
+        return (
+            Parameter("fx", "N", scale=scale),
+            Parameter("fy", "N", scale=scale),
+            Parameter(
+                "position",
+                "m",
+                nominal=cable.length / 2,
+                scale=0.1 * cable.length,
+                lower=0.0,
+                upper=cable.length,
+                scan=True,
+            ),
+        )
+
+    def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
+        """Potential energy of the force [J]."""
+        force = ca.vertcat(params["fx"], params["fy"])
+        return -ca.dot(force, curve.position(params["position"]))

@@ -1,0 +1,30 @@
+"""A cable that takes a set."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, Params, StateEffect
+from dlo_casadi.parameters import Parameter
+
+
+class RestCurvatureDrift(StateEffect):
+    """After each pose the rest curvature has moved towards the curvature held.
+
+        kappa_0 <- kappa_0 + rate (kappa - kappa_0)
+
+    Parameters
+    ----------
+    rate : scalar, in [0, 1)
+        Share of the bend that a pose leaves behind; vanishes at 0.
+    """
+
+    name = "rest_curvature_drift"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the rate."""
+        return (Parameter("rate", scale=0.05, lower=0.0, upper=0.95),)
+
+    def next_rest(self, rest: ca.SX, curvature: ca.SX, params: Params) -> ca.SX:
+        """Rest curvature after the pose [1/m]."""
+        return rest + params["rate"] * (curvature - rest)

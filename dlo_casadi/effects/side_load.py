@@ -1,0 +1,33 @@
+"""A uniform load along +x."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.chain import Curve
+from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.parameters import Parameter
+
+
+class SideLoad(Load):
+    """A force per length along +x of the board: a draught, a fan, a tilted camera.
+
+        V = - q int x(s) ds                                           [J]
+
+    Parameters
+    ----------
+    force_per_length : scalar [N/m]
+        Vanishes at 0.
+    """
+
+    name = "side_load"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the force per length."""
+        return (
+            Parameter("force_per_length", "N/m", scale=0.1 * 9.81 * cable.mass / cable.length),
+        )
+
+    def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
+        """Potential energy of the load [J]."""
+        return -params["force_per_length"] * curve.first_moment[0]

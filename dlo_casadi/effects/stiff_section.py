@@ -1,0 +1,53 @@
+"""A stretch of cable that is stiffer than the rest."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.effects.effect import Cable, Params, SectionLaw
+from dlo_casadi.parameters import Parameter
+
+
+class StiffSection(SectionLaw):
+    """A splice, a heat-shrink sleeve, a tape: `factor` times as stiff between two places.
+
+        EI(s) = EI factor     for start <= s <= end,   EI elsewhere
+
+    A cell that the section covers by the share c has the compliance (1 - c + c / factor) / EI:
+    the moment is continuous, so compliances are averaged, not stiffnesses. The edges of c are
+    rounded over a quarter of a cell, which keeps it smooth in start and end.
+
+    Parameters
+    ----------
+    start, end : scalar [m], in [0, L]
+    factor : scalar, > 0
+        Vanishes at 1; below 1 the section is softer, e.g. a worn place.
+    """
+
+    name = "stiff_section"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the section's ends and its factor."""
+        place = {"scale": 0.05 * cable.length, "lower": 0.0, "upper": cable.length}
+        return (
+            Parameter("start", "m", nominal=0.45 * cable.length, scan=True, **place),
+            Parameter("end", "m", nominal=0.55 * cable.length, scan=True, **place),
+            Parameter("factor", nominal=1.0, scale=0.5, lower=0.02, upper=100.0),
+        )
+
+    def factor(
+        self, bend: ca.SX, cells: NDArray[np.float64], cable: Cable, params: Params
+    ) -> ca.SX:
+        """Harmonic mean of the stiffness over each cell."""
+        low, high = ca.DM(cells[:, 0]), ca.DM(cells[:, 1])
+        rounding = 0.25 * float((cells[:, 1] - cells[:, 0]).max())
+
+        def ramp(x: ca.SX) -> ca.SX:
+            return (x + ca.sqrt(x * x + rounding**2)) / 2
+
+        start, end = params["start"], params["end"]
+        covered = ramp(high - start) - ramp(low - start) - ramp(high - end) + ramp(low - end)
+        share = covered / (high - low)
+        return 1 / (1 + share * (1 / params["factor"] - 1))

@@ -1,0 +1,34 @@
+"""A stiffness that changes evenly along the cable."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.effects.effect import Cable, Params, SectionLaw
+from dlo_casadi.parameters import Parameter
+
+
+class StiffnessGradient(SectionLaw):
+    """A taper: the bending stiffness grows linearly from start to end.
+
+        EI(s) = EI (1 + slope (2 s / L - 1))
+
+    Parameters
+    ----------
+    slope : scalar, in (-1, 1)
+        Vanishes at 0; EI stays positive everywhere.
+    """
+
+    name = "stiffness_gradient"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the slope."""
+        return (Parameter("slope", scale=0.2, lower=-0.95, upper=0.95),)
+
+    def factor(
+        self, bend: ca.SX, cells: NDArray[np.float64], cable: Cable, params: Params
+    ) -> ca.SX:
+        """Mean of the linear stiffness over each cell."""
+        return 1 + params["slope"] * ca.DM(cells.mean(axis=1) * 2 / cable.length - 1)

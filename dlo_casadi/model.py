@@ -1,0 +1,437 @@
+"""CableModel: a chain and its effects, composed slot by slot into one Lagrangian.
+
+Every stage differentiates the same expression
+
+    Lagrangian(phi, lam) = V(phi) + lam^T c(phi) - sum_e h C N_e^2 / 2
+
+with the energy V of bending, weight and loads, the end conditions c = 0, and, for a cable of axial
+compliance C, the tension N_e = -(1/h) dL/d(length ratio of element e), which is exact for dead
+loads. An equilibrium is a stationary point; the chain's coordinates stay the headings alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.chain import Chain, Curve, Element
+from dlo_casadi.effects import (
+    BoundaryEffect,
+    Cable,
+    Effect,
+    EndConditions,
+    Kinematics,
+    Load,
+    MeasurementEffect,
+    SectionLaw,
+    StateEffect,
+)
+from dlo_casadi.errors import DloError
+from dlo_casadi.parameters import Parameter
+from dlo_casadi.rest import RestCurvature
+
+StartKind = Literal["pinned", "clamped"]
+EndKind = Literal["pinned", "clamped", "free"]
+FloatArray = NDArray[np.float64]
+
+# ln(1000): a prior of the stiffness may be off by three decades.
+STIFFNESS_PRIOR_STD = float(np.log(1e3))
+# Where the ends of a pose may deviate from what is declared, in the order of `deviation`.
+DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading")
+
+
+@dataclass(frozen=True)
+class CableModel:
+    """An elastic cable between two fixtures in a plane.
+
+    Parameters
+    ----------
+    cable : Cable
+    n : int
+        Number of elements.
+    element : "arc" or "link"
+    start : "pinned" or "clamped"
+    end : "pinned", "clamped" or "free"
+    gravity : (float, float) [m/s^2]
+        In the board frame.
+    effects : tuple of Effect
+        In the order in which those of one slot are applied.
+    n_rest : int
+        Number of spline coefficients of the rest curvature; 0 = straight at rest.
+    priors : dict
+        Standard deviations of Gaussian priors on effect parameters by qualified name: what is
+        within a declared tolerance is a nuisance, not an effect.
+
+    Notes
+    -----
+    Immutable: `model.with_effect(effect)` returns another model.
+    """
+
+    cable: Cable
+    n: int = 40
+    element: Element = "arc"
+    start: StartKind = "pinned"
+    end: EndKind = "pinned"
+    gravity: tuple[float, float] = (0.0, -9.81)
+    effects: tuple[Effect, ...] = ()
+    n_rest: int = 9
+    priors: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        labels = [effect.label for effect in self.effects]
+        for effect in self.effects:
+            if labels.count(effect.label) > 1:
+                raise DloError(
+                    f"two effects are both labelled {effect.label!r}; give one another label, "
+                    f"e.g. {type(effect).__name__}(label='{effect.label}_2')"
+                )
+
+    # ---- composition -------------------------------------------------------------------------
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The chain of n elements."""
+        return Chain(
+            self.cable.length, self.n, self.element, self.start == "clamped", self.end == "clamped"
+        )
+
+    @cached_property
+    def rest(self) -> RestCurvature:
+        """Basis of the rest curvature."""
+        return RestCurvature(self.cable.length, 0 if self.cable.straight else self.n_rest)
+
+    @cached_property
+    def rest_basis(self) -> FloatArray:
+        """Rest curvature per coefficient (n_cells, n_rest): kappa_0 = rest_basis @ c."""
+        return self.rest.cell_means(self.chain.cells)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Bending stiffness, then the parameters of the effects with qualified names."""
+        stiffness = Parameter(
+            "bending_stiffness",
+            "N m^2",
+            nominal=self.cable.bending_stiffness,
+            lower=1e-12,
+            upper=1e9,
+            prior_std=STIFFNESS_PRIOR_STD,
+            log=True,
+        )
+        listed = [stiffness]
+        for effect in self.effects:
+            for parameter in effect.parameters(self.cable):
+                name = f"{effect.label}.{parameter.name}"
+                std = self.priors.get(name, parameter.prior_std)
+                listed.append(replace(parameter, name=name, prior_std=std))
+        return tuple(listed)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Qualified names of the parameters, in the order of the vector `p`."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @cached_property
+    def nominal(self) -> FloatArray:
+        """Parameter vector `p` at the nominal values."""
+        return np.array([parameter.nominal for parameter in self.parameters])
+
+    def with_effect(self, effect: Effect, priors: dict[str, float] | None = None) -> CableModel:
+        """Return this model with one more effect."""
+        return replace(
+            self, effects=(*self.effects, effect), priors={**self.priors, **(priors or {})}
+        )
+
+    def without_effect(self, label: str) -> CableModel:
+        """Return this model without the effect of that label."""
+        kept = tuple(effect for effect in self.effects if effect.label != label)
+        priors = {k: v for k, v in self.priors.items() if not k.startswith(f"{label}.")}
+        return replace(self, effects=kept, priors=priors)
+
+    def with_mesh(self, n: int, element: Element | None = None) -> CableModel:
+        """Return the same model on another mesh."""
+        return replace(self, n=n, element=element or self.element)
+
+    def _slot(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
+        """Effects of one slot with their own parameters."""
+        picked = []
+        for effect in self.effects:
+            if isinstance(effect, base):
+                local = {
+                    parameter.name: self._p[self.names.index(f"{effect.label}.{parameter.name}")]
+                    for parameter in effect.parameters(self.cable)
+                }
+                picked.append((effect, local))
+        return picked
+
+    # ---- symbols -----------------------------------------------------------------------------
+
+    @cached_property
+    def _phi(self) -> ca.SX:
+        return ca.SX.sym("phi", self.chain.n_headings)
+
+    @cached_property
+    def _p(self) -> ca.SX:
+        return ca.SX.sym("p", len(self.parameters))
+
+    @cached_property
+    def _rest(self) -> ca.SX:
+        return ca.SX.sym("kappa_0", self.chain.n_cells)
+
+    @cached_property
+    def _ends(self) -> ca.SX:
+        """Start (2), end (2), start heading, end heading as declared."""
+        return ca.SX.sym("ends", 6)
+
+    @cached_property
+    def _deviation(self) -> ca.SX:
+        """Deviation of one pose from its declared ends: see DEVIATIONS."""
+        return ca.SX.sym("deviation", len(DEVIATIONS))
+
+    @cached_property
+    def _lam(self) -> ca.SX:
+        return ca.SX.sym("lam", self.n_conditions)
+
+    @cached_property
+    def n_conditions(self) -> int:
+        """Number of end conditions: end position, then headings of clamped arcs."""
+        position = 0 if self.end == "free" else 2
+        headings = 0
+        if self.element == "arc":
+            headings = (self.start == "clamped") + (self.end == "clamped")
+        return position + headings
+
+    @cached_property
+    def condition_names(self) -> tuple[str, ...]:
+        """Names of the end conditions, for messages."""
+        names = [] if self.end == "free" else ["end_position_x", "end_position_y"]
+        if self.element == "arc":
+            names += ["start_heading"] if self.start == "clamped" else []
+            names += ["end_heading"] if self.end == "clamped" else []
+        return tuple(names)
+
+    @cached_property
+    def deviations(self) -> tuple[str, ...]:
+        """Which deviations of a pose can matter for these boundaries."""
+        used = [] if self.end == "free" else ["end_x", "end_y"]
+        used += ["start_heading"] if self.start == "clamped" else []
+        used += ["end_heading"] if self.end == "clamped" else []
+        return tuple(used)
+
+    # ---- mechanics ---------------------------------------------------------------------------
+
+    @cached_property
+    def _held(self) -> EndConditions:
+        """Where the ends really are: declared, deviation of the pose, boundary effects."""
+        ends = EndConditions(
+            start=self._ends[:2],
+            end=self._ends[2:4] + self._deviation[:2],
+            start_heading=self._ends[4] + self._deviation[2],
+            end_heading=self._ends[5] + self._deviation[3],
+        )
+        for effect, local in self._slot(BoundaryEffect):
+            ends = effect.conditions(ends, local)
+        return ends
+
+    @cached_property
+    def _stretch(self) -> ca.SX:
+        factor = ca.SX(1)
+        for effect, local in self._slot(Kinematics):
+            factor = factor * effect.stretch(self.cable, local)
+        return factor
+
+    @cached_property
+    def _compliance(self) -> ca.SX:
+        return sum(
+            (effect.compliance(local) for effect, local in self._slot(Kinematics)), start=ca.SX(0)
+        )
+
+    @property
+    def extensible(self) -> bool:
+        """Whether some effect lets the cable stretch under tension."""
+        return any(effect.extensible for effect, _ in self._slot(Kinematics))
+
+    def _curve(self, ratio: ca.SX | None = None) -> Curve:
+        held = self._held
+        return self.chain.curve(
+            self._phi, held.start, held.start_heading, held.end_heading, self._stretch, ratio
+        )
+
+    def _energy(self, curve: Curve) -> ca.SX:
+        """Energy of bending, weight, loads and holders [J], without stretching."""
+        cells = self.chain.cells
+        bend = curve.strain - self._rest
+        density = self._p[0] / 2 * bend**2
+        for effect, local in self._slot(SectionLaw):
+            density = density * effect.factor(bend, cells, self.cable, local)
+        width = ca.DM(np.diff(cells, axis=1).ravel())
+        energy = ca.dot(width, density) * self._stretch
+
+        gravity = ca.SX(ca.DM(self.gravity))
+        loads = self._slot(Load)
+        for effect, local in loads:
+            gravity = effect.gravity(gravity, local)
+        energy -= self.cable.mass / self.cable.length * ca.dot(gravity, curve.first_moment)
+        for effect, local in loads:
+            energy += effect.energy(curve, gravity, local)
+        for effect, local in self._slot(BoundaryEffect):
+            energy += effect.energy(curve, local)
+        return energy
+
+    def _conditions(self, curve: Curve) -> ca.SX:
+        """End conditions c(phi) = 0: [m], [rad]."""
+        held = self._held
+        rows = []
+        if self.end != "free":
+            rows.append(curve.nodes[self.n, :].T - held.end)
+        if self.element == "arc":
+            if self.start == "clamped":
+                rows.append(curve.start_direction - held.start_heading)
+            if self.end == "clamped":
+                rows.append(curve.end_direction - held.end_heading)
+        return ca.vertcat(*rows) if rows else ca.SX.zeros(0)
+
+    @cached_property
+    def _lagrangian(self) -> tuple[ca.SX, Curve]:
+        """Lagrangian and the stretched curve, functions of headings and multipliers."""
+        if not self.extensible:
+            curve = self._curve()
+            return self._energy(curve) + ca.dot(self._lam, self._conditions(curve)), curve
+        ratio = ca.SX.sym("ratio", self.n)
+        curve = self._curve(ratio)
+        plain = self._energy(curve) + ca.dot(self._lam, self._conditions(curve))
+        uniform = ca.SX.ones(self.n) * self._stretch
+        tension = ca.substitute(-ca.gradient(plain, ratio) / self.chain.h, ratio, uniform)
+        stored = self._compliance * self.chain.h * ca.sumsqr(tension) / 2
+        lagrangian = ca.substitute(plain, ratio, uniform) - stored
+        return lagrangian, self._curve(uniform + self._compliance * tension)
+
+    @cached_property
+    def potential(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Symbols (coordinates, parameters), energy [J] and end conditions of the minimisation.
+
+        min V(coordinates) s.t. conditions = 0. The coordinates are the headings and, for an
+        extensible cable, one a_e per element with the axial strain sqrt(C) a_e and the energy
+        h a_e^2 / 2. The parameters stack p, rest, ends, deviation.
+        """
+        parameters = ca.vertcat(self._p, self._rest, self._ends, self._deviation)
+        if not self.extensible:
+            curve = self._curve()
+            return self._phi, parameters, self._energy(curve), self._conditions(curve)
+        axial = ca.SX.sym("axial", self.n)
+        curve = self._curve(self._stretch + ca.sqrt(self._compliance) * axial)
+        energy = self._energy(curve) + self.chain.h * ca.sumsqr(axial) / 2
+        return ca.vertcat(self._phi, axial), parameters, energy, self._conditions(curve)
+
+    # ---- numerical functions -----------------------------------------------------------------
+
+    @property
+    def _arguments(self) -> list[ca.SX]:
+        return [self._phi, self._lam, self._p, self._rest, self._ends, self._deviation]
+
+    @cached_property
+    def _stationarity(self) -> ca.SX:
+        """Gradient of the Lagrangian by (phi, lam): force balance, then end conditions."""
+        lagrangian, _ = self._lagrangian
+        return ca.gradient(lagrangian, ca.vertcat(self._phi, self._lam))
+
+    @cached_property
+    def kkt(self) -> ca.Function:
+        """(phi, lam, p, rest, ends, deviation) -> stationarity (N,), its Jacobian (N, N)."""
+        unknowns = ca.vertcat(self._phi, self._lam)
+        matrix = ca.jacobian(self._stationarity, unknowns)
+        return ca.Function("kkt", self._arguments, [self._stationarity, ca.densify(matrix)])
+
+    @cached_property
+    def sensitivity(self) -> ca.Function:
+        """Same arguments -> derivatives of the stationarity by p, rest and deviation."""
+        blocks = [
+            ca.densify(ca.jacobian(self._stationarity, symbol))
+            for symbol in (self._p, self._rest, self._deviation)
+        ]
+        return ca.Function("sensitivity", self._arguments, blocks)
+
+    @cached_property
+    def _observed(self) -> ca.SX:
+        """Measured image of the curve: see `observation`."""
+        _, curve = self._lagrangian
+        nodes = curve.nodes
+        maps = self._slot(MeasurementEffect)
+        rows = []
+        point, slope = ca.SX.sym("point", 2), ca.SX.sym("slope", 2)
+        image = point
+        for effect, local in maps:
+            image = effect.observe(image, self._ends[:2], local)
+        pushed = ca.jtimes(image, point, slope) if maps else slope
+        move = ca.Function("move", [point, slope, self._p, self._ends], [image, pushed])
+        slopes = curve.node_slopes if self.element == "arc" else ca.SX.zeros(self.n + 1, 2)
+        for i in range(self.n + 1):
+            position, direction = move(nodes[i, :].T, slopes[i, :].T, self._p, self._ends)
+            rows.append(ca.horzcat(position.T, direction.T))
+        table = ca.vertcat(*rows)
+        return ca.vec(table if self.element == "arc" else table[:, :2])
+
+    @cached_property
+    def observation(self) -> ca.Function:
+        """Same arguments -> measured curve z and its derivatives by phi+lam, p, deviation.
+
+        z stacks the columns x, y of the nodes and, for arcs, dx/ds, dy/ds: with cubic Hermite
+        interpolation every measured point is a fixed linear function of z.
+        """
+        z = self._observed
+        unknowns = ca.vertcat(self._phi, self._lam)
+        blocks = [
+            ca.densify(ca.jacobian(z, symbol)) for symbol in (unknowns, self._p, self._deviation)
+        ]
+        return ca.Function("observation", self._arguments, [z, *blocks])
+
+    @cached_property
+    def shape(self) -> ca.Function:
+        """Same arguments -> measured curve z only."""
+        return ca.Function("shape", self._arguments, [self._observed])
+
+    @cached_property
+    def strain(self) -> ca.Function:
+        """(phi, ends, deviation, p) -> curvature per cell (n_cells,) [1/m]."""
+        curve = self._curve()
+        return ca.Function(
+            "strain", [self._phi, self._ends, self._deviation, self._p], [curve.strain]
+        )
+
+    @property
+    def has_state(self) -> bool:
+        """Whether a pose changes the rest curvature of the next one."""
+        return any(isinstance(effect, StateEffect) for effect in self.effects)
+
+    @cached_property
+    def next_rest(self) -> ca.Function:
+        """Same arguments -> rest curvature after the pose, its derivatives by phi, rest, p."""
+        curvature = self._curve().strain
+        rest = self._rest
+        for effect, local in self._slot(StateEffect):
+            rest = effect.next_rest(rest, curvature, local)
+        blocks = [
+            ca.densify(ca.jacobian(rest, symbol)) for symbol in (self._phi, self._rest, self._p)
+        ]
+        return ca.Function("next_rest", self._arguments, [rest, *blocks])
+
+    @cached_property
+    def energy(self) -> ca.Function:
+        """Same arguments -> potential energy [J], stretching included, and true nodes (n+1, 2)."""
+        lagrangian, curve = self._lagrangian
+        work = ca.dot(self._lam, self._conditions(curve))
+        return ca.Function("energy", self._arguments, [lagrangian - work, curve.nodes])
+
+    @cached_property
+    def dead_load(self) -> ca.Function:
+        """P -> sum of the dead loads on the cable (2,) [N]: minus the energy's slope by a shift."""
+        shift = ca.SX.sym("shift", 2)
+        curve = replace(self._curve(), start=shift)
+        slope = ca.gradient(self._energy(curve), shift)
+        unused = [symbol for symbol in ca.symvar(slope) if not ca.depends_on(self._p, symbol)]
+        zeros = [ca.SX(0)] * len(unused)
+        return ca.Function("dead_load", [self._p], ca.substitute([-slope], unused, zeros))

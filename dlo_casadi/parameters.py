@@ -1,0 +1,59 @@
+"""Parameters of a cable model: name, unit, bounds, scale and Gaussian prior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf, isfinite
+
+from dlo_casadi.errors import DloError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One scalar parameter of a model.
+
+    Parameters
+    ----------
+    name : str
+        Name within its effect; the model prefixes it with the effect's label.
+    unit : str
+        SI unit, "" for a pure number.
+    nominal : float
+        Value at which the effect vanishes, or the prior mean [unit].
+    scale : float
+        Typical size of a change [unit], > 0; solvers work in value / scale.
+    lower, upper : float
+        Physical bounds [unit].
+    prior_std : float
+        Standard deviation of a Gaussian prior about `nominal`; inf = flat [unit, or
+        natural logarithm if `log`].
+    log : bool
+        Estimated as its natural logarithm (positive, uncertain by decades).
+    scan : bool
+        A place along the cable, tried on a grid before it is refined.
+    """
+
+    name: str
+    unit: str = ""
+    nominal: float = 0.0
+    scale: float = 1.0
+    lower: float = -inf
+    upper: float = inf
+    prior_std: float = inf
+    log: bool = False
+    scan: bool = False
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.scale) and self.scale > 0):
+            raise DloError(f"parameter {self.name}: scale {self.scale} must be positive")
+        if not self.lower <= self.nominal <= self.upper:
+            raise DloError(
+                f"parameter {self.name}: nominal {self.nominal} {self.unit} lies outside its "
+                f"bounds [{self.lower}, {self.upper}]"
+            )
+        if self.log and self.nominal <= 0:
+            raise DloError(f"parameter {self.name}: a logarithmic parameter must be positive")
+
+    def with_prior(self, std: float) -> Parameter:
+        """Return the same parameter with a prior of this standard deviation."""
+        return replace(self, prior_std=std)

@@ -1,0 +1,53 @@
+"""Rest curvature on a basis of cubic B-splines: its number of unknowns does not grow with n."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class RestCurvature:
+    """kappa_0(s) = sum_k c_k B_k(s), clamped uniform cubic B-splines on [0, L].
+
+    Parameters
+    ----------
+    length : float [m]
+    n_coefficients : int
+        0 = straight at rest; otherwise >= 4.
+    """
+
+    length: float
+    n_coefficients: int
+
+    @property
+    def _knots(self) -> NDArray[np.float64]:
+        inner = np.linspace(0.0, self.length, self.n_coefficients - _DEGREE + 1)
+        return np.concatenate([[0.0] * _DEGREE, inner, [self.length] * _DEGREE])
+
+    def basis(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values (len(s), n_coefficients) of the basis functions at arc lengths s [m]."""
+        if self.n_coefficients == 0:
+            return np.zeros((len(s), 0))
+        return BSpline(self._knots, np.eye(self.n_coefficients), _DEGREE)(s)
+
+    def cell_means(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Means (n_cells, n_coefficients) of the basis functions over cells (n_cells, 2) [m].
+
+        The mean, not the value in the middle, makes int (kappa - kappa_0)^2 ds of a curve of
+        constant curvature per cell exact up to a constant.
+        """
+        if self.n_coefficients == 0:
+            return np.zeros((len(cells), 0))
+        primitive = BSpline(self._knots, np.eye(self.n_coefficients), _DEGREE).antiderivative()
+        return (primitive(cells[:, 1]) - primitive(cells[:, 0])) / np.diff(cells, axis=1)
+
+    @property
+    def roughness(self) -> NDArray[np.float64]:
+        """Second differences (n_coefficients - 2, n_coefficients) of the coefficients."""
+        return np.diff(np.eye(self.n_coefficients), n=2, axis=0)
