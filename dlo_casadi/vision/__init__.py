@@ -1,0 +1,18 @@
+"""Photographs to centre-lines: arrays in, arrays out."""
+
+from dlo_casadi.vision.board import Board, locate_board
+from dlo_casadi.vision.centerline import Centerline, extract_centerline
+from dlo_casadi.vision.image import read_image
+from dlo_casadi.vision.view import Camera, Reference, View, from_reference
+
+__all__ = [
+    "Board",
+    "Camera",
+    "Centerline",
+    "Reference",
+    "View",
+    "extract_centerline",
+    "from_reference",
+    "locate_board",
+    "read_image",
+]

@@ -1,0 +1,204 @@
+"""The board's ArUco markers: where the camera stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.errors import VisionError
+from dlo_casadi.vision.view import Array, Camera, View
+
+_MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board with ArUco markers, whose sides are parallel to the board's axes.
+
+    Parameters
+    ----------
+    dictionary : str
+        Name of OpenCV's predefined dictionary, e.g. DICT_4X4_50.
+    marker_size : scalar [m]
+        Side of the black square.
+    standoff : scalar [m]
+        Distance of the cable's axis in front of the board, towards the camera.
+    marker_centers : dict of int to (x, y) [m]
+        Centre of each marker in the board frame, by its number.
+    """
+
+    dictionary: str
+    marker_size: float
+    standoff: float
+    marker_centers: Mapping[int, tuple[float, float]]
+
+    def corners(self, marker: int) -> Array:
+        """Corners (4, 2) [m] in the order in which ArUco reports them: clockwise from top left."""
+        half = self.marker_size / 2
+        square = np.array([[-half, half], [half, half], [half, -half], [-half, -half]])
+        return np.asarray(self.marker_centers[marker], float) + square
+
+
+def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None = None) -> View:
+    """Find the board and return the view of the cable's plane.
+
+    With a camera, the pose (R, t) of the board minimises the reprojection error of all corners
+    of all its visible markers; the cable's plane z = standoff is then seen through
+
+        H = [r_1, r_2, t + standoff r_3]
+
+    Without one, H is the homography of the board's own plane to pixels.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8
+        The photograph.
+    board : Board
+        Markers and standoff.
+    camera : Camera, optional
+        Intrinsic matrix and distortion.
+
+    Raises
+    ------
+    VisionError
+        If no marker of the board is found, if the markers found contradict their declared
+        places, or if a standoff is asked for without a camera.
+    """
+    if camera is None and board.standoff != 0.0:
+        raise VisionError(
+            f"a standoff of {board.standoff:g} m needs a camera: without one only the board's own "
+            "plane can be measured. Try: give camera.matrix, or standoff: 0."
+        )
+    found = _detect(image, board)
+    places = {marker: board.corners(marker) for marker in found}
+    homography, errors = _fit(found, places, board.standoff, camera)
+    while max(errors.values()) > _MAX_ERROR_PX and len(found) > 2:
+        found, homography, errors = _without_worst(found, places, board.standoff, camera)
+    rms = float(np.sqrt(np.mean(np.square(list(errors.values())))))
+    if rms > _MAX_ERROR_PX:
+        raise VisionError(
+            f"the markers {sorted(found)} are {rms:.1f} px RMS off their declared places. "
+            "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
+            f"The picture is {image.shape[1]} x {image.shape[0]} px."
+        )
+    height, width = image.shape[:2]
+    return View(homography, (height, width), camera, rms, np.array(list(found.values())))
+
+
+def _detect(image: NDArray[np.uint8], board: Board) -> dict[int, Array]:
+    """Corners (4, 2) [px] of the board's markers, refined to sub-pixel."""
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if not board.dictionary.startswith("DICT_") or number is None:
+        known = ", ".join(sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_"))[:6])
+        raise VisionError(f"unknown ArUco dictionary {board.dictionary!r}. Try: {known}, ...")
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
+    quads, numbers, _ = detector.detectMarkers(grey)
+    seen = [] if numbers is None else [int(n) for n in numbers.ravel()]
+    found = {n: q.reshape(4, 2) for n, q in zip(seen, quads, strict=True)}
+    ours = {n: _refine(grey, q) for n, q in found.items() if n in board.marker_centers}
+    if not ours:
+        other = f"only markers {sorted(found)}" if found else "no marker at all"
+        raise VisionError(
+            f"board not found: {other} of {board.dictionary} in the picture, but the board has "
+            f"{sorted(board.marker_centers)}. Try: the right dictionary; markers flat, in focus, "
+            f"inside the picture, with a white margin (mean brightness {grey.mean():.0f} of 255)."
+        )
+    return ours
+
+
+def _refine(grey: NDArray[np.uint8], quad: Array) -> Array:
+    """Corners of a black square on white as the intersections of its four straight sides.
+
+    Corner detectors look for saddles; on the L of a blurred square they are pulled inwards by
+    about 0.2 px. A side is the median place at which the brightness steps from black to white.
+    """
+    corners = np.asarray(quad, float)
+    for _ in range(2):
+        lines = [_side(grey, corners[i], corners[(i + 1) % 4]) for i in range(4)]
+        corners = np.array([_meet(lines[i - 1], lines[i]) for i in range(4)])
+    jump = np.linalg.norm(corners - quad, axis=1).max()
+    size = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).min()
+    return corners if jump < 0.1 * size else np.asarray(quad, float)
+
+
+def _side(grey: NDArray[np.uint8], a: Array, b: Array) -> tuple[Array, Array]:
+    """Line (point, direction) along the step from black (right of a -> b) to white (left)."""
+    length = float(np.linalg.norm(b - a))
+    along = (b - a) / length
+    outwards = np.array([along[1], -along[0]])
+    reach = max(length / 12, 1.5)  # half a cell of the pattern
+    share = np.linspace(0.1, 0.9, max(12, int(2 * length)))
+    offset = np.linspace(-reach, reach, 25)
+    at = a + share[:, None, None] * (b - a) + offset[None, :, None] * outwards
+    profile = cv2.remap(grey, at.astype(np.float32), None, cv2.INTER_LINEAR).astype(float)
+    black, white = profile[:, :3].mean(), profile[:, -3:].mean()
+    if white - black < 10.0:
+        return a, along
+    dark_share = np.clip((white - profile) / (white - black), -0.1, 1.1).mean(axis=1)
+    edge = (2 * dark_share - 1) * reach
+    keep = np.abs(edge - np.median(edge)) < 0.5
+    slope, middle = np.polyfit(share[keep] - 0.5, edge[keep], 1)
+    direction = along * length + outwards * slope
+    return (a + b) / 2 + outwards * middle, direction / np.linalg.norm(direction)
+
+
+def _meet(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
+    """Intersection of two lines (point, direction)."""
+    steps = np.linalg.solve(np.column_stack([one[1], -other[1]]), other[0] - one[0])
+    return one[0] + steps[0] * one[1]
+
+
+def _fit(
+    found: dict[int, Array], places: dict[int, Array], standoff: float, camera: Camera | None
+) -> tuple[Array, dict[int, float]]:
+    """Homography of the cable's plane and, per marker, the RMS error [px]."""
+    pixels = np.vstack(list(found.values()))
+    points = np.vstack([places[marker] for marker in found])
+    if camera is None:
+        homography, _ = cv2.findHomography(points, pixels)
+        projected = View(homography, (1, 1)).to_pixels(points)
+    else:
+        solid = np.column_stack([points, np.zeros(len(points))])
+        _, rotation, shift = _pose(solid, pixels, camera)
+        projected = cv2.projectPoints(solid, rotation, shift, camera.matrix, camera.distortion)[0]
+        axes = cv2.Rodrigues(rotation)[0]
+        homography = np.column_stack([axes[:, :2], shift.ravel() + standoff * axes[:, 2]])
+    miss = np.sum((projected.reshape(-1, 4, 2) - pixels.reshape(-1, 4, 2)) ** 2, axis=2)
+    return homography, dict(zip(found, np.sqrt(miss.mean(axis=1)), strict=True))
+
+
+def _pose(solid: Array, pixels: Array, camera: Camera) -> tuple[float, Array, Array]:
+    """Pose of least reprojection error among the two that a plane allows."""
+    _, rotations, shifts, _ = cv2.solvePnPGeneric(
+        solid, pixels, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE
+    )
+    best: tuple[float, Array, Array] | None = None
+    for rotation, shift in zip(rotations, shifts, strict=True):
+        polished = cv2.solvePnPRefineLM(
+            solid, pixels, camera.matrix, camera.distortion, rotation.copy(), shift.copy()
+        )
+        seen = cv2.projectPoints(solid, *polished, camera.matrix, camera.distortion)[0]
+        error = float(np.mean((seen.reshape(-1, 2) - pixels) ** 2))
+        if best is None or error < best[0]:
+            best = (error, *polished)
+    if best is None:
+        raise VisionError("the pose of the board cannot be solved from its markers.")
+    return best
+
+
+def _without_worst(
+    found: dict[int, Array], places: dict[int, Array], standoff: float, camera: Camera | None
+) -> tuple[dict[int, Array], Array, dict[int, float]]:
+    """Leave out the marker without which the others agree best."""
+    trials = []
+    for marker in found:
+        rest = {n: q for n, q in found.items() if n != marker}
+        homography, errors = _fit(rest, places, standoff, camera)
+        trials.append((max(errors.values()), rest, homography, errors))
+    _, rest, homography, errors = min(trials, key=lambda trial: trial[0])
+    return rest, homography, errors

@@ -1,0 +1,96 @@
+"""Smooth planar curves through scattered points: penalised B-splines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import solveh_banded
+
+from dlo_casadi.vision.view import Array
+
+_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class SmoothCurve:
+    """A cubic B-spline r(t), with t close to arc length.
+
+    Parameters
+    ----------
+    spline : BSpline
+        Vector-valued spline, t [m] -> (x, y) [m].
+    """
+
+    spline: BSpline
+
+    def position(self, t: Array) -> Array:
+        """Points (K, 2) [m] at t (K,) [m]."""
+        return np.asarray(self.spline(t))
+
+    def normal(self, t: Array) -> Array:
+        """Unit normals (K, 2), to the left of the direction of travel."""
+        slope = np.asarray(self.spline(t, 1))
+        slope /= np.linalg.norm(slope, axis=1, keepdims=True)
+        return np.column_stack([-slope[:, 1], slope[:, 0]])
+
+
+def chord_length(points: Array) -> Array:
+    """Distance travelled (K,) [m] along points (K, 2) [m]."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: float) -> SmoothCurve:
+    """Fit a spline that bends no more than the points ask for.
+
+        minimise  sum_k w_k |r(t_k) - p_k|^2  +  (mean w) (smooth / knot)^4 n sum_i |D^2 c_i|^2 / n_c
+
+    with knots every `knot` metres and second differences D^2 of the coefficients c. Gaps need no
+    special case: there the curve is the one of least bending.
+
+    Parameters
+    ----------
+    t : (K,) [m]
+        Increasing parameter of the points.
+    points : (K, 2) [m]
+        What to pass near.
+    weights : (K,)
+        Inverse variances up to a factor; zero leaves a point out.
+    knot : scalar [m]
+        Spacing of the knots.
+    smooth : scalar [m]
+        Wavelengths (over 2 pi) well below it are smoothed away.
+    """
+    lower, upper = float(t[0]), float(t[-1])
+    count = max(1, round((upper - lower) / knot))
+    step = (upper - lower) / count
+    knots = lower + step * np.arange(-_DEGREE, count + _DEGREE + 1)
+    inside = np.clip(t, lower, upper - 1e-12 * (upper - lower))
+    basis = BSpline.design_matrix(inside, knots, _DEGREE)
+    size = basis.shape[1]
+    weighted = basis.multiply(weights[:, None]).tocsr()
+    normal = (basis.T @ weighted).todia()
+    banded = np.zeros((_DEGREE + 1, size))
+    for offset, row in zip(normal.offsets, normal.data, strict=True):
+        if 0 <= offset <= _DEGREE:
+            banded[_DEGREE - offset, offset:] = row[offset:size]
+    penalty = (smooth / step) ** 4 * max(float(weights.sum()), 1e-12) / size
+    for offset, row in enumerate(_second_differences(size)):
+        banded[_DEGREE - offset, offset:] += penalty * row
+    banded[_DEGREE] += 1e-12 * banded[_DEGREE].max()
+    coefficients = solveh_banded(banded, weighted.T @ points)
+    return SmoothCurve(BSpline(knots, coefficients, _DEGREE))
+
+
+def _second_differences(size: int) -> list[Array]:
+    """Diagonals 0, 1, 2 of D^T D for second differences of `size` coefficients."""
+    if size < 3:
+        return [np.zeros(size)]
+    main, first = np.zeros(size), np.zeros(size - 1)
+    for shift, value in enumerate((1.0, -2.0, 1.0)):
+        main[shift : size - 2 + shift] += value**2
+    first[: size - 2] += -2.0
+    first[1:] += -2.0
+    return [main, first, np.ones(size - 2)]

@@ -1,0 +1,106 @@
+"""Photographs from disk: whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.errors import VisionError
+
+_JPEG_START = b"\xff\xd8"
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+
+
+def read_image(path: Path | str) -> NDArray[np.uint8]:
+    """Read a photograph, turned upright as its EXIF tag asks.
+
+    Parameters
+    ----------
+    path : Path or str
+        A file in any format that OpenCV decodes (JPEG, PNG, TIFF, WebP, ...).
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        Blue, green, red.
+
+    Raises
+    ------
+    VisionError
+        If the file is missing, not an image, or cut short. Decoders fill the missing part of a
+        JPEG with grey and say nothing; its end is therefore looked for here.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise VisionError(
+            f"no such image: {path}. Try: is the file name right, relative to the configuration?",
+            pose=path.name,
+        ) from None
+    except OSError as error:
+        raise VisionError(
+            f"cannot read the image {path}: {error.strerror or error}. Try: is it a file that you "
+            "are allowed to read?",
+            pose=path.name,
+        ) from None
+    if not data:
+        raise VisionError("the file is empty. Try: copy the photograph again.", pose=path.name)
+    if _is_truncated(data):
+        raise VisionError(
+            f"the image is truncated: it ends after {len(data)} bytes, before its end marker. "
+            "Try: copy the photograph again.",
+            pose=path.name,
+        )
+    image = _decode(data)
+    if image is None:
+        raise VisionError(
+            f"the file is not an image that can be decoded ({len(data)} bytes). "
+            "Try: JPEG or PNG; is it the photograph?",
+            pose=path.name,
+        )
+    return image
+
+
+def _decode(data: bytes) -> NDArray[np.uint8] | None:
+    """Decode quietly; None when no decoder takes it."""
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    return None if image is None else np.asarray(image, np.uint8)
+
+
+def _is_truncated(data: bytes) -> bool:
+    """Whether a JPEG lacks its end-of-image marker or a PNG its last chunk."""
+    if data.startswith(_JPEG_START):
+        return not _jpeg_ends(data)
+    if data.startswith(_PNG_START):
+        return b"IEND" not in data[-64:] and b"IEND\xaeB`\x82" not in data
+    return False
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """Walk the segments of a JPEG to its end-of-image marker.
+
+    A search for the marker's two bytes alone would stop at the thumbnail in the header.
+    """
+    at = 2
+    while True:
+        at = data.find(b"\xff", at)
+        if at < 0 or at + 1 >= len(data):
+            return False
+        marker = data[at + 1]
+        if marker == 0xD9:
+            return True
+        if marker == 0xFF:  # a fill byte
+            at += 1
+        elif marker in (0x00, 0x01) or 0xD0 <= marker <= 0xD8:  # no length follows
+            at += 2
+        else:
+            if at + 3 >= len(data):
+                return False
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")

@@ -1,0 +1,137 @@
+"""Which strands make up the cable, and in which order: from fixture to fixture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.vision.view import Array
+
+_BEAM = 40
+_LENGTH_TOLERANCE = 0.05  # relative; two clicked reference points are no better than this
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Strands in the order in which the cable runs through them.
+
+    Parameters
+    ----------
+    strands : tuple of (K, 2) [m]
+        Lines, each directed from start to end.
+    used : tuple of int
+        Their places in the list that was searched.
+    supported : scalar [m]
+        Length that was seen.
+    total : scalar [m]
+        Length including straight gaps.
+    cost : scalar [m]
+        Lower is better; about -length for a cable that is seen without a gap.
+    """
+
+    strands: tuple[Array, ...]
+    used: tuple[int, ...]
+    supported: float
+    total: float
+    cost: float
+
+
+def order_strands(
+    strands: list[Array], *, start: Array, end: Array | None, diameter: float, length: float
+) -> Chain | None:
+    """Find the chain of strands that explains a cable of known length best.
+
+    The cost of a chain, in metres,
+
+        J = -seen + gaps + sum_links d (4 a^2 + 2 b^2) + 10 L max(0, |total / L - 1| - 0.02)^2 / 0.05
+
+    prefers long seen stretches, short gaps, and links that go on in the direction of the strand:
+    a is the difference of the turns into and out of the gap (0 on a circle), b the whole turn.
+
+    Parameters
+    ----------
+    strands : list of (K, 2) [m]
+        Unbranched lines.
+    start, end : (2,) [m]
+        The fixtures; `end` is None for a free end.
+    diameter, length : scalar [m]
+        Of the cable.
+    """
+    if not strands:
+        return None
+    ways = [way for strand in strands for way in (strand, strand[::-1])]
+    seen = np.array([np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways])
+    first = np.array([way[0] for way in ways])
+    last = np.array([way[-1] for way in ways])
+    inwards = np.array([_tangent(way, diameter) for way in ways])
+    outwards = np.array([-_tangent(way[::-1], diameter) for way in ways])
+    gap, link = _links(last, outwards, first, inwards, diameter)
+
+    to_first = np.linalg.norm(first - start, axis=1)
+    to_end = np.zeros(len(ways)) if end is None else np.linalg.norm(last - end, axis=1)
+    states = [
+        (float(to_first[w] - seen[w]), (w,), float(seen[w]), float(seen[w] + to_first[w]))
+        for w in range(len(ways))
+        if to_first[w] < 0.6 * length
+    ]
+    best: tuple[float, tuple[int, ...], float, float] | None = None
+    for _ in range(len(strands)):
+        states.sort(key=lambda state: state[0])
+        following = []
+        for cost, path, supported, total in states[:_BEAM]:
+            tip = path[-1]
+            whole = total + to_end[tip]
+            misfit = max(0.0, abs(whole / length - 1.0) - 0.02) / _LENGTH_TOLERANCE
+            closed = cost + to_end[tip] + 0.5 * length * misfit**2
+            if best is None or closed < best[0]:
+                best = (closed, path, supported, whole)
+            reach = total + gap[tip] + seen
+            usable = np.isfinite(link[tip]) & (reach < 1.15 * length + 2 * diameter)
+            for w in np.nonzero(usable)[0]:
+                if any(w // 2 == p // 2 for p in path):
+                    continue
+                step = float(link[tip, w] - seen[w])
+                following.append(
+                    (cost + step, (*path, int(w)), supported + float(seen[w]), float(reach[w]))
+                )
+        if not following:
+            break
+        states = following
+    if best is None:
+        return None
+    cost, path, supported, total = best
+    return Chain(tuple(ways[w] for w in path), tuple(w // 2 for w in path), supported, total, cost)
+
+
+def _tangent(line: Array, diameter: float) -> Array:
+    """Unit direction at the first point of a line, over its first two diameters."""
+    away = np.linalg.norm(line - line[0], axis=1)
+    far = int(np.argmax(away > 2 * diameter)) or len(line) - 1
+    step = line[far] - line[min(1, far - 1)]
+    return step / max(float(np.linalg.norm(step)), 1e-12)
+
+
+def _links(
+    last: Array, outwards: Array, first: Array, inwards: Array, diameter: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gap [m] and cost [m] of going from the last point of way i to the first of way j."""
+    across = first[None, :, :] - last[:, None, :]
+    gap = np.linalg.norm(across, axis=2)
+    heading_out = np.arctan2(outwards[:, 1], outwards[:, 0])[:, None]
+    heading_in = np.arctan2(inwards[:, 1], inwards[:, 0])[None, :]
+    heading = np.arctan2(across[..., 1], across[..., 0])
+    turn = _wrap(heading_in - heading_out)
+    before = _wrap(heading - heading_out)
+    after = _wrap(heading_in - heading)
+    short = gap < 1.5 * diameter
+    uneven = np.where(short, 0.0, before - after)
+    cost = gap + diameter * (4 * uneven**2 + 2 * turn**2)
+    cost[(np.abs(turn) > 2.5) | (short & (np.abs(turn) > 1.0))] = np.inf
+    cost[~short & ((np.abs(before) > 1.4) | (np.abs(after) > 1.4))] = np.inf
+    return gap, cost
+
+
+def _wrap(angle: Array) -> Array:
+    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -1,0 +1,112 @@
+"""From a mask to strands: thin lines of the right width, cut wherever they branch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.vision.view import Array
+
+_MAX_STRANDS = 60
+_NARROWEST, _WIDEST = 0.4, 1.8  # of the cable's width
+
+
+@dataclass(frozen=True)
+class Strand:
+    """One unbranched line of the skeleton.
+
+    Parameters
+    ----------
+    points : (K, 2) [px]
+        Column and row of neighbouring pixels, in order.
+    width : scalar [px]
+        Median width of the mask about it.
+    """
+
+    points: Array
+    width: float
+
+    @property
+    def length(self) -> float:
+        """Length along the line [px]."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+
+def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[Strand]:
+    """Thin a mask (Zhang and Suen) and cut it into strands, longest first.
+
+    A highlight along the cable is closed first. Parts of the wrong width, junctions and spurs
+    shorter than the cable is wide are left out: whether the strands on both sides of a cut
+    continue each other is decided by their directions, not by the pixels between them.
+    """
+    core = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+    filled = cv2.morphologyEx(mask.astype(np.uint8) * 255, cv2.MORPH_CLOSE, core)
+    thick = _thick(filled, width_px)
+    filled[thick > 0] = 0
+    depth = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
+    lines = cv2.ximgproc.thinning(filled, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN) > 0
+    lines &= depth < _WIDEST / 2 * width_px + 0.5
+    lines &= ~_junctions(lines)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        lines.astype(np.uint8), connectivity=8
+    )
+    large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= width_px]
+    large.sort(key=lambda i: -stats[i, cv2.CC_STAT_AREA])
+    strands = []
+    for label in large[:_MAX_STRANDS]:
+        left, top, wide, high = stats[label, :4]
+        window = labels[top : top + high, left : left + wide] == label
+        rows, columns = np.nonzero(window)
+        points = _walk(np.column_stack([columns, rows])) + [left, top]
+        width = 2 * float(np.median(depth[points[:, 1], points[:, 0]]))
+        if width > _NARROWEST * width_px:
+            strands.append(Strand(points.astype(float), width))
+    return strands
+
+
+def _thick(filled: NDArray[np.uint8], width_px: float) -> NDArray[np.uint8]:
+    """Bodies wider than two cables, grown by a rim: holders, occluders, markers."""
+    size = 2 * round(width_px) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    bodies = cv2.morphologyEx(filled, cv2.MORPH_OPEN, disc)
+    return cv2.dilate(bodies, np.ones((3, 3), np.uint8))
+
+
+def _junctions(lines: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels at which three or more lines meet, with their neighbours.
+
+    Counted are the steps from off to on around a pixel: a corner of a staircase has many
+    neighbours but only two such steps.
+    """
+    padded = np.pad(lines, 1).astype(np.int8)
+    ring = [(0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0)]
+    height, width = lines.shape
+    around = [padded[i : i + height, j : j + width] for i, j in ring]
+    steps = sum(
+        (here < following).astype(np.int8)
+        for here, following in zip(around, [*around[1:], around[0]], strict=True)
+    )
+    crossing = ((np.asarray(steps) >= 3) & lines).astype(np.uint8)
+    return cv2.dilate(crossing, np.ones((3, 3), np.uint8)) > 0
+
+
+def _walk(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Order the pixels (K, 2) of an unbranched 8-connected line from one end to the other."""
+    places = {(int(x), int(y)) for x, y in pixels}
+    steps = [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)]
+
+    def neighbours(p: tuple[int, int]) -> list[tuple[int, int]]:
+        return [(p[0] + i, p[1] + j) for i, j in steps if (p[0] + i, p[1] + j) in places]
+
+    ends = [p for p in sorted(places) if len(neighbours(p)) == 1]
+    at = ends[0] if ends else min(places)
+    line = [at]
+    places.discard(at)
+    while following := neighbours(at):
+        at = following[0]
+        line.append(at)
+        places.discard(at)
+    return np.array(line)

@@ -1,0 +1,187 @@
+"""Where a pixel lies on the cable's plane, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dlo_casadi.errors import VisionError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with radial and tangential distortion, as OpenCV defines it.
+
+    Parameters
+    ----------
+    matrix : (3, 3) [px]
+        [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+    distortion : (5,)
+        k1, k2, p1, p2, k3.
+    """
+
+    matrix: Array
+    distortion: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "matrix", np.asarray(self.matrix, float).reshape(3, 3))
+        object.__setattr__(self, "distortion", np.asarray(self.distortion, float).ravel())
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Two points known in the picture and in the board frame.
+
+    Parameters
+    ----------
+    pixels : (2, 2) [px]
+        Column u and row v of each point.
+    points : (2, 2) [m]
+        The same points in the board frame, x right, y up.
+    """
+
+    pixels: Array
+    points: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pixels", np.asarray(self.pixels, float).reshape(2, 2))
+        object.__setattr__(self, "points", np.asarray(self.points, float).reshape(2, 2))
+
+
+@dataclass(frozen=True)
+class View:
+    """Map between the pixels of one photograph and the plane of the cable.
+
+    A plane point (x, y) and the ray through its pixel satisfy, up to the factor w,
+
+        w [a, b, 1]^T = H [x, y, 1]^T
+
+    where (a, b) is the undistorted ray in normalised camera coordinates when a camera is known,
+    and the pixel (u, v) itself when not.
+
+    Parameters
+    ----------
+    homography : (3, 3)
+        H: board frame [m] to rays [-], or to pixels [px] without a camera.
+    shape : (height, width) [px]
+        Size of the photograph.
+    camera : Camera, optional
+        Its matrix and distortion.
+    reprojection_error : scalar [px]
+        Root mean square over the corners of the markers; 0 for two reference points.
+    markers : (n, 4, 2) [px]
+        Corners of the markers that were used.
+    """
+
+    homography: Array
+    shape: tuple[int, int]
+    camera: Camera | None = None
+    reprojection_error: float = 0.0
+    markers: Array = field(default_factory=lambda: np.zeros((0, 4, 2)))
+
+    def to_board(self, pixels: ArrayLike) -> Array:
+        """Points of the cable's plane [m] seen at pixels (K, 2) [px]; shape (K, 2)."""
+        rays = np.asarray(pixels, float).reshape(-1, 2)
+        if self.camera is not None and len(rays):
+            rays = undistort(rays, self.camera)
+        return _apply(np.linalg.inv(self.homography), rays)
+
+    def to_pixels(self, points: ArrayLike) -> Array:
+        """Pixels (K, 2) [px] at which points (K, 2) [m] of the cable's plane are seen."""
+        rays = _apply(self.homography, np.asarray(points, float).reshape(-1, 2))
+        return rays if self.camera is None else distort(rays, self.camera)
+
+    @property
+    def scale(self) -> float:
+        """Pixels per metre about the middle of the picture."""
+        height, width = self.shape
+        middle = np.array([(width - 1) / 2, (height - 1) / 2])
+        corners = self.to_board(middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
+        return float(np.sqrt(4.0 / _area(corners)))
+
+
+def from_reference(reference: Reference, shape: tuple[int, ...]) -> View:
+    """View of a camera that looks squarely at the cable, from two points known in the picture.
+
+    With z = x + i y on the board and q = u - i v in the picture (rows run down, y runs up),
+
+        q = A z + B,   A = (q_2 - q_1) / (z_2 - z_1)
+
+    Parameters
+    ----------
+    reference : Reference
+        The two points in both frames.
+    shape : (height, width, ...) [px]
+        Size of the photograph.
+
+    Raises
+    ------
+    VisionError
+        If the two points coincide, in the picture or on the board.
+    """
+    q = reference.pixels[:, 0] - 1j * reference.pixels[:, 1]
+    z = reference.points[:, 0] + 1j * reference.points[:, 1]
+    if abs(q[1] - q[0]) < 1.0 or abs(z[1] - z[0]) < 1e-6:
+        raise VisionError(
+            f"the two reference points are {abs(q[1] - q[0]):.3g} px and {abs(z[1] - z[0]):.3g} m "
+            "apart: too close for a scale. Try: points far apart, in px and in m."
+        )
+    a = (q[1] - q[0]) / (z[1] - z[0])
+    b = q[0] - a * z[0]
+    homography = np.array(
+        [[a.real, -a.imag, b.real], [-a.imag, -a.real, -b.imag], [0.0, 0.0, 1.0]],
+    )
+    return View(homography, (int(shape[0]), int(shape[1])))
+
+
+def distort(rays: Array, camera: Camera) -> Array:
+    """Pixels (K, 2) of undistorted normalised rays (K, 2).
+
+    With r^2 = a^2 + b^2 and g = 1 + k1 r^2 + k2 r^4 + k3 r^6,
+
+        a' = a g + 2 p1 a b + p2 (r^2 + 2 a^2),   b' = b g + p1 (r^2 + 2 b^2) + 2 p2 a b
+        u = fx a' + cx,                           v = fy b' + cy
+    """
+    k1, k2, p1, p2, k3 = np.pad(camera.distortion, (0, max(0, 5 - camera.distortion.size)))[:5]
+    a, b = rays[:, 0], rays[:, 1]
+    r2 = a * a + b * b
+    gain = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bent = np.column_stack(
+        [
+            a * gain + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
+            b * gain + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
+            np.ones_like(a),
+        ]
+    )
+    return (bent @ camera.matrix.T)[:, :2]
+
+
+def undistort(pixels: Array, camera: Camera) -> Array:
+    """Undistorted normalised rays (K, 2) of pixels (K, 2): the inverse of `distort`.
+
+    Fixed point a <- a + (a' - bent(a)), which contracts while the distortion is mild; it stops at
+    1e-7 px.
+    """
+    target = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.matrix).T
+    ray = target[:, :2].copy()
+    focal = float(camera.matrix[0, 0])
+    for _ in range(100):
+        miss = pixels - distort(ray, camera)
+        ray += miss @ np.linalg.inv(camera.matrix[:2, :2]).T
+        if np.abs(miss).max() < 1e-7 or np.abs(ray).max() > 1e3 * focal:
+            break
+    return ray
+
+
+def _apply(homography: Array, points: Array) -> Array:
+    mapped = points @ homography[:, :2].T + homography[:, 2]
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def _area(polygon: Array) -> float:
+    x, y = polygon.T
+    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)

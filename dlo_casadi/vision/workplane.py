@@ -1,0 +1,117 @@
+"""A metric picture of the cable's plane, coarse enough to find the cable quickly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.vision.view import Array, View
+
+CABLE_PX = 6.0  # width of the cable in this picture
+_MAX_PIXELS = 3.0e6
+_MAX_ENLARGEMENT = 2.0
+
+
+@dataclass(frozen=True)
+class WorkPlane:
+    """The part of the cable's plane that the cable can reach, at a known scale.
+
+    Parameters
+    ----------
+    image : (h, w, 3) uint8
+        The rectified picture; rows run down, i.e. along -y.
+    pixel : scalar [m]
+        Side of one of its pixels.
+    origin : (2,) [m]
+        Board coordinates of the centre of its first pixel.
+    reachable : (h, w) bool
+        Inside the photograph and near enough to the fixtures for a cable of this length.
+    """
+
+    image: NDArray[np.uint8]
+    pixel: float
+    origin: Array
+    reachable: NDArray[np.bool_]
+
+    def to_board(self, at: Array) -> Array:
+        """Points (K, 2) [m] of pixels (K, 2) of the working picture."""
+        return self.origin + self.pixel * np.asarray(at, float) * [1.0, -1.0]
+
+
+def rectify(
+    image: NDArray[np.uint8],
+    view: View,
+    *,
+    start: Array,
+    end: Array | None,
+    diameter: float,
+    length: float,
+) -> WorkPlane:
+    """Resample the photograph onto the cable's plane, where the cable is `CABLE_PX` wide.
+
+    A cable of length L between two fixtures stays inside the ellipse |p - start| + |p - end| <= L;
+    with a free end inside the disc |p - start| <= L. Both are widened a little, since the scale
+    may be off.
+    """
+    height, width = image.shape[:2]
+    reach = 1.08 * length + 2 * diameter
+    frame = np.stack(
+        np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33)), axis=-1
+    )
+    seen = view.to_board(frame.reshape(-1, 2))
+    if end is None:
+        lower, upper = start - reach, start + reach
+    else:
+        lower, upper = np.minimum(start, end), np.maximum(start, end)
+        slack = reach - np.linalg.norm(end - start) / 2
+        lower, upper = np.maximum(lower, upper - reach), np.minimum(upper, lower + reach)
+        lower, upper = (
+            np.minimum(lower, (start + end) / 2 - slack),
+            np.maximum(upper, (start + end) / 2 + slack),
+        )
+    lower = np.maximum(lower, seen.min(axis=0))
+    upper = np.minimum(upper, seen.max(axis=0))
+    size = np.maximum(upper - lower, diameter)
+    pixel = max(
+        diameter / CABLE_PX,
+        1.0 / (_MAX_ENLARGEMENT * view.scale),
+        float(np.sqrt(size.prod() / _MAX_PIXELS)),
+    )
+    columns, rows = (np.ceil(size / pixel)).astype(int) + 1
+    origin = np.array([lower[0], upper[1]])
+    at = _sources(view, origin, pixel, int(rows), int(columns))
+    inside = np.all((at >= 1) & (at <= [width - 2, height - 2]), axis=2)
+
+    shrink = 1.0 / (view.scale * pixel)
+    if shrink > 1.0 / 1.5:
+        small, factor = image, 1.0
+    else:
+        factor = shrink
+        small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    maps = ((at + 0.5) * factor - 0.5).astype(np.float32)
+    flat = cv2.remap(small, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    x = origin[0] + pixel * np.arange(columns, dtype=np.float32)
+    y = origin[1] - pixel * np.arange(rows, dtype=np.float32)[:, None]
+    far = np.hypot(x - start[0], y - start[1])
+    if end is not None:
+        far = far + np.hypot(x - end[0], y - end[1])
+    return WorkPlane(np.asarray(flat, np.uint8), pixel, origin, inside & (far <= reach))
+
+
+def _sources(view: View, origin: Array, pixel: float, rows: int, columns: int) -> Array:
+    """Pixels (rows, columns, 2) of the photograph that the working picture shows.
+
+    Computed on every eighth pixel and interpolated: the map bends by far less than a pixel there.
+    """
+    step = 8
+    nodes_x = (np.arange(-1, columns // step + 2) + 0.5) * step - 0.5
+    nodes_y = (np.arange(-1, rows // step + 2) + 0.5) * step - 0.5
+    x, y = np.meshgrid(origin[0] + pixel * nodes_x, origin[1] - pixel * nodes_y)
+    coarse = view.to_pixels(np.column_stack([x.ravel(), y.ravel()]))
+    coarse = coarse.reshape(len(nodes_y), len(nodes_x), 2).astype(np.float32)
+    fine = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(fine[step : step + rows, step : step + columns])
