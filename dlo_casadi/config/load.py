@@ -48,14 +48,12 @@ def load_config(path: str | Path) -> Config:
     document = Document.read(source)
     if not isinstance(document.data, dict):
         raise ConfigError(
-            f"a mapping with cable: and experiment: belongs at the top, "
+            "a mapping with cable: and experiment: belongs at the top, "
             f"found {kind_of(document.data)}",
             file=source,
         )
     try:
-        file = File.model_validate(
-            document.data, context={"folder": source.absolute().resolve().parent}
-        )
+        file = File.model_validate(document.data, context={"folder": source.absolute().parent})
     except ValidationError as error:
         raise document.error(explain(error.errors(), document.data)) from None
 
@@ -76,7 +74,7 @@ def load_config(path: str | Path) -> Config:
     if n_fit == 1:
         warnings.append("only one pose to fit: what it tells cannot be checked on another one")
     return Config(
-        path=source.absolute().resolve(),
+        path=source.absolute(),
         cable=file.cable,
         experiment=file.experiment.model_copy(update={"poses": reachable}),
         model=file.model,
@@ -139,7 +137,7 @@ def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) ->
         if distance > cable.length + slack:
             reasons[pose.name] = (
                 f"end ({pose.end[0]:g}, {pose.end[1]:g}) m is {distance:.4g} m from the start; "
-                f"the cable is {cable.length:.4g} m long. Are end and cable.length right, in metres?"
+                f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?"
             )
     return reasons
 
