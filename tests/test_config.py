@@ -1,0 +1,402 @@
+"""Configurations: every file of the repository loads; every mistake is named, with its line."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from dlo_casadi.config import Centerlines, Config, Images, dump_yaml, load_config, read_yaml
+from dlo_casadi.errors import ConfigError
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = sorted(ROOT.glob("configs/*.yaml"))
+SESSIONS = sorted(ROOT.glob("tests/data/bench/*/session.yaml"))
+
+GOOD = """\
+cable:
+  name: test cable
+  length: 0.8
+  mass: 0.23
+  diameter: 1.28e-2
+  youngs_modulus: 4.55e8
+experiment:
+  gravity: [0, -9.81]
+  boundary: {start: pinned, end: pinned}
+  measurement: {kind: centerlines, std: 3e-4}
+  poses:
+    - {file: a.csv, start: [0, 0], end: [0.5, 0.1], role: fit}
+    - {file: b.csv, start: [0, 0], end: [0.4, 0.1], role: fit}
+    - {file: c.csv, start: [0, 0], end: [0.3, 0.1], role: held_out}
+"""
+BOARD = (
+    "board: {dictionary: DICT_4X4_50, marker_size: 0.08, standoff: 0.012, "
+    "marker_centers: {0: [0, 0], 1: [1, 0]}}"
+)
+CAMERA = "camera: {matrix: [[900, 0, 600], [0, 900, 300], [0, 0, 1]]}"
+REFERENCE = "reference: {pixels: [[0, 0], [9, 0]], points: [[0, 0], [1, 0]]}"
+
+
+def load(folder: Path, *changes: tuple[str, str], text: str = GOOD) -> Config:
+    """Load the good configuration with some of its text replaced."""
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "test.yaml"
+    path.write_text(text)
+    for name in ("a.csv", "b.csv", "c.csv", "a.jpg", "b.jpg", "c.jpg"):
+        (folder / name).touch()
+    return load_config(path)
+
+
+def load_images(folder: Path, *parts: str) -> Config:
+    measurement = "{" + ", ".join(["kind: images", *parts]) + "}"
+    return load(folder, ("{kind: centerlines, std: 3e-4}", measurement), (".csv", ".jpg"))
+
+
+@pytest.mark.parametrize("path", CONFIGS + SESSIONS, ids=lambda p: f"{p.parent.name}/{p.stem}")
+def test_files_of_the_repository_load_completely(path):
+    config = load_config(path)
+    assert not config.skipped
+    assert config.measured_poses == config.experiment.poses
+    assert len(config.warnings) == (len(config.experiment.poses) == 1)
+
+
+def test_the_repository_holds_what_the_readme_promises():
+    names = {"cable", "black_wire", "white_wire", "black_wire_photo", "glass_strip"}
+    assert {path.stem for path in CONFIGS} == names
+    assert len(SESSIONS) == 17
+    truths = {path.parent.name for path in ROOT.glob("tests/data/bench_truth/*/truth.yaml")}
+    assert truths == {path.parent.name for path in SESSIONS} | {"connector"}
+
+
+def test_the_default_configuration():
+    config = load_config(ROOT / "configs/cable.yaml")
+    measurement = config.experiment.measurement
+    assert isinstance(measurement, Images)
+    assert measurement.camera is not None
+    assert measurement.board is not None
+    assert config.name == "cable"
+    assert config.cable.length == 0.8125
+    assert config.cable.rest_shape == "curved"
+    assert config.cable.prior_bending_stiffness == pytest.approx(
+        4.55e8 * math.pi * 0.0128**4 / 64, rel=1e-12
+    )
+    assert config.experiment.gravity == (0.0, -9.81)
+    assert measurement.std is None
+    assert measurement.camera.matrix[0] == (915.0, 0.0, 641.3)
+    assert measurement.board.marker_centers[2] == (1.14, -0.7)
+    assert measurement.board.standoff == 0.012
+    assert config.experiment.tolerances.length == 5.0e-4
+    assert len(config.experiment.poses) == 18
+    first = config.experiment.poses[0]
+    assert first.file == ROOT / "configs/bench/connector/pose_01.jpg"
+    assert (first.name, first.role, first.start, first.end) == (
+        "pose_01",
+        "fit",
+        (0.0, 0.0),
+        (0.508, 0.1016),
+    )
+    assert sum(pose.role == "held_out" for pose in config.experiment.poses) == 4
+
+
+def test_clamped_and_free_ends():
+    loop = load_config(ROOT / "configs/white_wire.yaml").experiment
+    assert (loop.boundary.start, loop.boundary.end) == ("clamped", "clamped")
+    assert loop.poses[0].end_heading == pytest.approx(-2 * math.pi, abs=1e-6)
+    strip = load_config(ROOT / "configs/glass_strip.yaml")
+    assert strip.experiment.boundary.end == "free"
+    assert strip.experiment.poses[0].end is None
+    assert strip.cable.prior_bending_stiffness == 5.0e-4
+
+
+def test_every_way_to_write_a_number(tmp_path):
+    for text in ("1e-3", "1.0e-3", "1.E-3", "+1e-03", "1.0e-03", "0.001", ".001"):
+        config = load(tmp_path, ("std: 3e-4", f"std: {text}"))
+        assert isinstance(config.experiment.measurement, Centerlines)
+        assert config.experiment.measurement.std == 0.001, text
+    assert load(tmp_path, ("0.23", "1.0e0")).cable.mass == 1.0
+    assert load(tmp_path, ("0.23", "010")).cable.mass == 10.0  # not octal
+
+
+def test_options_and_declared_effects(tmp_path):
+    options = """\
+model:
+  n: 40
+  element: link
+  effects:
+    - image_scale
+    - name: lumped_mass
+      parameters: {mass: 2e-2, position: {value: 0.5, fixed: true}}
+estimation: {algorithm1_inner: cobyla, rest_curvature_coefficients: 9}
+diagnosis:
+"""
+    config = load(tmp_path, text=GOOD + options)
+    assert (config.model.n, config.model.element) == (40, "link")
+    assert [effect.name for effect in config.model.effects] == ["image_scale", "lumped_mass"]
+    mass = config.model.effects[1].parameters["mass"]
+    position = config.model.effects[1].parameters["position"]
+    assert (mass.value, mass.fixed, position.value, position.fixed) == (0.02, False, 0.5, True)
+    assert config.estimation.algorithm1_inner == "cobyla"
+    assert config.estimation.algorithm1_n == 10
+    assert config.diagnosis.enabled
+    assert load(tmp_path).model.n is None
+
+
+def test_a_configuration_cannot_be_changed(tmp_path):
+    config = load(tmp_path)
+    with pytest.raises(ValueError, match="frozen"):
+        config.cable.length = 1.0
+    with pytest.raises(AttributeError):
+        config.path = Path()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "message"),
+    [
+        # keys
+        ("length: 0.8", "lenght: 0.8", 3, "unknown key 'lenght' in cable; did you mean 'length'?"),
+        ("  length: 0.8\n", "", 1, r"'length' is missing in cable: .* \[m\]"),
+        ("  gravity: [0, -9.81]\n", "", 7, "'gravity' is missing in experiment"),
+        ("cable:", "kable:", 1, "unknown key 'kable' in the top .* did you mean 'cable'?"),
+        ("  mass", "  gravity: 0\n  mass", 4, "'gravity' in cable; it belongs into experiment"),
+        ("  mass", "  colour: red\n  mass", 4, "'colour' in cable; known here: .*diameter, length"),
+        ("  mass", "  length: 1\n  mass", 4, "key 'length' occurs twice, first in line 3"),
+        ("role: held_out", "rol: fit", 14, r"unknown key 'rol' in pose 3 \(c.csv\);.*'role'"),
+        ("std: 3e-4", "board: {}", 10, "'board' in experiment.measurement; .*kind: images"),
+        # numbers
+        ("0.8\n", "long\n", 3, "cable.length: a number belongs here, found 'long'"),
+        ("0.8\n", "'0.8'\n", 3, "write it without quotes"),
+        ("0.8\n", "0,8\n", 3, "the decimal sign is a point: 0.8"),
+        ("0.8\n", "0.8 m\n", 3, "without the unit, such as 0.8"),
+        ("0.8\n", "\n", 3, "cable.length: a number belongs here, found nothing"),
+        ("0.8\n", "true\n", 3, "cable.length: a number belongs here, found true"),
+        ("0.8\n", ".nan\n", 3, "cable.length: a finite number belongs here"),
+        ("0.8\n", ".inf\n", 3, "cable.length: a finite number belongs here"),
+        ("0.8\n", "-0.8\n", 3, "cable.length: must be larger than 0, found -0.8"),
+        ("mass: 0.23", "mass: 0", 4, "cable.mass: must be larger than 0, found 0"),
+        ("1.28e-2", "-0.1", 5, "cable.diameter: must be larger than 0, found -0.1"),
+        ("[0.5, 0.1]", "[0.5]", 12, r"pose 1 \(a.csv\).end: two numbers \[x, y\] belong here"),
+        ("[0.5, 0.1]", "[0.5, x]", 12, r"pose 1 \(a.csv\).end\[1\]: a number belongs here"),
+        ("[0, -9.81]", "-9.81", 8, "gravity: two numbers"),
+        # units
+        ("length: 0.8", "length: 812.5", 3, "812.5 m: units are SI, did you mean 0.8125?"),
+        ("mass: 0.23", "mass: 230", 4, "230 kg for 0.8 m: units are SI, did you mean 0.23?"),
+        ("1.28e-2", "12.8", 5, "12.8 m is larger than the length 0.8 m.* did you mean 0.0128?"),
+        # words
+        ("held_out", "test", 14, "role: allowed are 'fit' or 'held_out', found 'test'"),
+        ("start: pinned", "start: free", 9, "'pinned' or 'clamped', .*only the end can be free"),
+        ("end: pinned", "end: glued", 9, "'pinned', 'clamped' or 'free', found 'glued'"),
+        ("kind: centerlines", "kind: photos", 10, "kind must be images or centerlines, .*'photos'"),
+        ("kind: centerlines, ", "", 10, "kind must be images or centerlines, found nothing"),
+        # stiffness
+        ("  youngs_modulus: 4.55e8\n", "", 1, "youngs_modulus .* or bending_stiffness .* neither"),
+        ("  gravity", "  tolerances: {end: 0}\n  gravity", 8, "known exactly write a small one"),
+        # poses
+        ("b.csv", "a.csv", 13, r"pose 2 \(a.csv\): pose 1 is called 'a' too"),
+        ("a.csv", "a.jpg", 12, "a photograph is not a CSV; measurement kind: images?"),
+        ("file: a.csv, ", "", 12, "'file' is missing in pose 1"),
+        ("role: fit", "role: held_out", 11, "no pose has role: fit"),
+    ],
+)
+def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        load(tmp_path, (old, new))
+    text = str(caught.value)
+    assert f"test.yaml, line {line}: " in text or f"\n  line {line}: " in text
+
+
+def test_both_stiffnesses(tmp_path):
+    with pytest.raises(ConfigError, match=r"line 7: .*found both"):
+        load(tmp_path, ("4.55e8\n", "4.55e8\n  bending_stiffness: 1\n"))
+
+
+def test_all_mistakes_are_listed_at_once(tmp_path):
+    with pytest.raises(ConfigError, match="3 problems") as caught:
+        load(tmp_path, ("lengt", "lenk"), ("0.23", "heavy"), ("3e-4", "-1"))
+    lines = str(caught.value).splitlines()[1:]
+    assert [line.split(":")[0] for line in lines] == ["  line 3", "  line 4", "  line 10"]
+
+
+def test_a_long_list_of_mistakes_is_cut(tmp_path):
+    poses = "".join(f"    - {{file: {i}.csv, start: [0, 0], end: [x, 0]}}\n" for i in range(20))
+    with pytest.raises(ConfigError, match=r"20 problems(.*\n)+.* and 8 more"):
+        load(tmp_path, text=GOOD.split("    - ")[0] + poses)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the file is empty"),
+        ("# nothing\n", "the file is empty"),
+        ("- 1\n- 2\n", "belongs at the top, found a list"),
+        ("hello\n", "belongs at the top, found text"),
+        ("cable:\nexperiment:\n", "cable: a mapping of keys and values belongs here"),
+        ("cable: {a: [\n", "line 2: not valid YAML"),
+        ("cable:\n\tlength: 1\n", r"line 2: not valid YAML: .*indent with spaces"),
+        ("a: 1\n---\nb: 2\n", "not valid YAML: but found another document"),
+        ("a: !!python/object:os.system 1\n", "line 1: not valid YAML: could not determine"),
+        ("&a [*a]\n", "belongs at the top"),
+    ],
+)
+def test_a_file_that_is_no_mapping(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message):
+        load(tmp_path, text=text)
+
+
+def test_a_file_that_cannot_be_read(tmp_path):
+    load(tmp_path)
+    with pytest.raises(ConfigError, match=r"tset.yaml: no such file; did you mean 'test.yaml'\?"):
+        load_config(tmp_path / "tset.yaml")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path)
+    (tmp_path / "photo.yaml").write_bytes(b"\xff\xd8\xff\xe0\x00\x10JFIF")
+    with pytest.raises(ConfigError, match="not a YAML text file"):
+        load_config(tmp_path / "photo.yaml")
+
+
+def test_headings_follow_the_boundary(tmp_path):
+    with pytest.raises(ConfigError, match=r"pose 1 \(a.csv\): a clamped start needs a start_head"):
+        load(tmp_path, ("start: pinned", "start: clamped"))
+    with pytest.raises(ConfigError, match=r"pose 2 \(b.csv\): a clamped end needs an end_heading"):
+        load(tmp_path, ("end: pinned", "end: clamped"))
+    with pytest.raises(ConfigError, match=r"pose 3 \(c.csv\): a free end has no end"):
+        load(tmp_path, ("end: pinned", "end: free"))
+    with pytest.raises(ConfigError, match=r"pose 2 \(b.csv\): a pinned end needs its position"):
+        load(tmp_path, ("end: [0.4, 0.1], ", ""))
+    unused = load(tmp_path, ("end: [0.4", "start_heading: 0.1, end: [0.4"))
+    assert unused.warnings == ("start_heading is not used, the start is pinned: b",)
+
+
+def test_a_pose_out_of_reach_is_left_out(tmp_path):
+    config = load(tmp_path, ("[0.5, 0.1]", "[0.5, 0.9]"))
+    assert [pose.name for pose in config.experiment.poses] == ["b", "c"]
+    (skipped,) = config.skipped
+    assert skipped.name == "a"
+    assert "end (0.5, 0.9) m is 1.03 m from the start; the cable is 0.8 m long" in skipped.reason
+    assert any("only one pose to fit" in warning for warning in config.warnings)
+
+
+def test_reach_allows_for_the_tolerances(tmp_path):
+    """Three standard deviations of length and end: 3 hypot(0.5, 0.2) mm = 1.6 mm."""
+    assert not load(tmp_path, ("[0.5, 0.1]", "[0.8015, 0]")).skipped
+    assert load(tmp_path, ("[0.5, 0.1]", "[0.8017, 0]")).skipped
+
+
+def test_no_pose_within_reach(tmp_path):
+    with pytest.raises(ConfigError, match="no pose to fit is left") as caught:
+        load(tmp_path, ("[0.5, 0.1]", "[508, 101]"), ("[0.4, 0.1]", "[0, 0.9]"))
+    assert "line 12: pose 1 (a.csv): end (508, 101) m is 517.9 m from" in str(caught.value)
+    assert "line 13: pose 2 (b.csv): end (0, 0.9) m is 0.9 m from the start" in str(caught.value)
+
+
+def test_a_missing_file_keeps_its_place_in_the_history(tmp_path):
+    config = load(tmp_path, ("b.csv", "bb.csv"))
+    assert [pose.name for pose in config.experiment.poses] == ["a", "bb", "c"]
+    assert [pose.name for pose in config.measured_poses] == ["a", "c"]
+    (skipped,) = config.skipped
+    assert skipped.name == "bb"
+    assert "bb.csv does not exist; did you mean b.csv?" in skipped.reason
+
+
+def test_no_file_at_all(tmp_path):
+    with pytest.raises(ConfigError, match=r"pose 1 \(aa.csv\): .*aa.csv does not exist"):
+        load(tmp_path, (".csv", ".csv"), ("a.csv", "aa.csv"), ("b.csv", "data/b.csv"))
+
+
+def test_what_photographs_need(tmp_path):
+    assert not load_images(tmp_path, CAMERA, BOARD).skipped
+    assert not load_images(tmp_path, REFERENCE).skipped
+    assert not load_images(tmp_path, BOARD.replace("0.012", "0.0")).skipped
+    with pytest.raises(ConfigError, match="either a board or a reference, found neither"):
+        load_images(tmp_path, CAMERA)
+    with pytest.raises(ConfigError, match="either a board or a reference, found both"):
+        load_images(tmp_path, CAMERA, BOARD, REFERENCE)
+    with pytest.raises(ConfigError, match=r"board.standoff: 0.012 m need a camera"):
+        load_images(tmp_path, BOARD)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("DICT_4X4_50", "4X4_50", "no dictionary '4X4_50'; did you mean 'DICT_4X4_50'?"),
+        ("1: [1, 0]", "50: [1, 0]", "DICT_4X4_50 has no marker 50: its ids end at 49"),
+        ("1: [1, 0]", "1: [0.01, 0]", "markers 0 and 1 are 0.01 m apart, closer than their size"),
+        ("1: [1, 0]", "one: [1, 0]", "a whole number belongs here, found 'one'"),
+        ("{0: [0, 0], 1: [1, 0]}", "{}", "marker_centers: at least 1 belongs here"),
+        ("0.012", "-0.012", "standoff: must not be smaller than 0"),
+        ("[[900, 0", "[[-900, 0", "positive fx and fy"),
+        (", [0, 0, 1]]", "]", "camera.matrix has only 2 of its values"),
+        ("1]]}", "1]], distortion: [0.1]}", "distortion: found 1 numbers; OpenCV knows 4, 5"),
+    ],
+)
+def test_mistakes_in_board_and_camera(tmp_path, old, new, message):
+    parts = f"{CAMERA}, {BOARD}"
+    assert old in parts
+    with pytest.raises(ConfigError, match=message):
+        load_images(tmp_path, parts.replace(old, new))
+
+
+def test_reference_points_are_two(tmp_path):
+    with pytest.raises(ConfigError, match="points: the two points are the same"):
+        load_images(tmp_path, REFERENCE.replace("[1, 0]", "[0, 0]"))
+    with pytest.raises(ConfigError, match="pixels has only 1 of its values"):
+        load_images(tmp_path, REFERENCE.replace(", [9, 0]", ""))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "warning"),
+    [
+        ("4.55e8", "455", "youngs_modulus 455 Pa is softer than any cable"),
+        ("1.28e-2", "1.0e-5", "times as dense as water"),
+        ("length: 0.8", "length: 81", "81 m long, but its ends are never more than 0.5"),
+        ("-9.81", "-9810", "gravity is 9810 m/s"),
+        ("3e-4", "0.3", "std 0.3 m is large"),
+    ],
+)
+def test_what_looks_odd_is_a_warning(tmp_path, old, new, warning):
+    config = load(tmp_path, (old, new))
+    assert any(warning in text for text in config.warnings), config.warnings
+
+
+def test_headings_in_degrees_are_a_warning(tmp_path):
+    clamped = ("start: pinned", "start: clamped")
+    config = load(tmp_path, clamped, ("end: [0.", "start_heading: 90, end: [0."))
+    assert any("in radians? a 90, b 90, c 90" in text for text in config.warnings)
+
+
+def test_yaml_round_trip_keeps_every_digit_and_the_order(tmp_path):
+    rng = np.random.default_rng(0)
+    shared = [1.0, 2.0]
+    data = {
+        "zeta": 1 / 3,
+        "alpha": rng.normal(size=5) * 10.0 ** rng.integers(-300, 300, size=5),
+        "tiny": np.float64(1e-5),
+        "count": np.int64(7),
+        "flag": np.bool_(True),
+        "none": None,
+        "tuple": (1, 2.5, "three"),
+        "twice": [shared, shared],
+        "texts": ["1e-3", "012", "1:30", "2024-01-01", "yes", "null", "1.2.3", "", "Größe: µm"],
+        "path": Path("a/b.csv"),
+        "limits": [math.inf, -math.inf],
+        "empty": [{}, []],
+    }
+    text = dump_yaml(data)
+    path = tmp_path / "parameters.yaml"
+    path.write_text(text, encoding="utf-8")
+    back = read_yaml(path)
+    assert list(back) == list(data)
+    assert "*" not in text
+    assert back["alpha"] == data["alpha"].tolist()
+    assert back["tuple"] == [1, 2.5, "three"]
+    assert back["path"] == "a/b.csv"
+    for key in ("zeta", "tiny", "count", "flag", "none", "twice", "texts", "limits", "empty"):
+        assert back[key] == data[key], key
+    assert yaml.safe_load(text) == back, "plain YAML 1.1 readers see the same data"
+
+
+def test_dump_refuses_what_is_no_data():
+    with pytest.raises(TypeError, match="object cannot be written as YAML"):
+        dump_yaml({"a": object()})

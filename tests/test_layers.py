@@ -1,0 +1,81 @@
+"""Imports go one way; yaml, cv2 and print each have one place."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+CHAIN = ["errors", "parameters", "chain", "rest", "effects", "model", "initial", "equilibrium"]
+MECHANICS = set(CHAIN)
+
+# layer -> what it may import beside itself. A new module gets its line here.
+MAY_IMPORT: dict[str, set[str]] = {
+    **{layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)},
+    "config": {"errors", "parameters"},
+    "measurements": {"errors", "config"},
+    "vision": {"errors"},
+    "estimation": MECHANICS | {"config", "measurements"},
+    "diagnosis": MECHANICS | {"config", "measurements", "estimation"},
+    "codegen": MECHANICS | {"config"},
+}
+BELOW_REPORT = set(MAY_IMPORT)
+MAY_IMPORT["report"] = BELOW_REPORT
+MAY_IMPORT["cli"] = BELOW_REPORT | {"report"}
+
+
+def layer_of(file: Path) -> str:
+    """Name of the layer: the folder or module directly in the package."""
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(file: Path) -> Iterator[str]:
+    """Absolute names of all modules that a file imports, also inside functions."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import in line {node.lineno}"
+            assert node.module is not None
+            yield node.module
+            if node.module == "dlo_casadi":
+                yield from (f"dlo_casadi.{alias.name}" for alias in node.names)
+
+
+def name(file: Path) -> str:
+    return str(file.relative_to(PACKAGE))
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if layer_of(file) != "__init__"], ids=name)
+def test_imports_go_one_way(file):
+    layer = layer_of(file)
+    assert layer in MAY_IMPORT, f"give the layer {layer!r} its line in MAY_IMPORT"
+    for module in imports(file):
+        if module.startswith("dlo_casadi."):
+            other = module.split(".")[1]
+            if other == "__version__":
+                continue
+            assert other in MAY_IMPORT[layer] | {layer}, f"{layer} must not import {other}"
+
+
+@pytest.mark.parametrize(
+    ("library", "layer"), [("yaml", "config"), ("pydantic", "config"), ("cv2", "vision")]
+)
+def test_a_library_with_one_place(library, layer):
+    users = {name(f) for f in FILES if any(m.split(".")[0] == library for m in imports(f))}
+    assert users, f"nothing imports {library}"
+    assert all(user.startswith(f"{layer}/") or user == f"{layer}.py" for user in users), users
+
+
+def test_only_the_commands_print_or_exit():
+    for file in FILES:
+        if layer_of(file) == "cli":
+            continue
+        for node in ast.walk(ast.parse(file.read_text())):
+            called = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
+            assert called not in ("print", "exit", "quit", "sys.exit", "breakpoint"), (
+                f"{name(file)}, line {getattr(node, 'lineno', '?')}: {called}"
+            )

@@ -1,0 +1,117 @@
+"""Centre-lines as CSV: order, repeated points, and messages that name file and line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dlo_casadi.config import Centerlines, load_config
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.measurements import read_centerline, write_centerline
+
+ROOT = Path(__file__).parents[1]
+START, END = (0.0, 0.0), (0.5, 0.1)
+LINE = np.array([[0.0, 0.0], [0.2, -0.1], [0.35, -0.05], [0.5, 0.1]])
+
+
+def csv(folder: Path, text: str) -> Path:
+    path = folder / "pose.csv"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted([*ROOT.glob("configs/*.yaml"), *ROOT.glob("tests/data/bench/*/session.yaml")]),
+    ids=lambda p: f"{p.parent.name}/{p.stem}",
+)
+def test_centerlines_of_the_repository(path):
+    """Each starts within 3 % of the length from the start; noise makes it 5 % longer at most."""
+    config = load_config(path)
+    if not isinstance(config.experiment.measurement, Centerlines):
+        pytest.skip("photographs")
+    for pose in config.experiment.poses:
+        points = read_centerline(pose.file, pose.start, pose.end)
+        assert points.shape[1] == 2
+        assert np.linalg.norm(points[0] - pose.start) < 0.03 * config.cable.length
+        along = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+        assert 0.5 * config.cable.length < along < 1.05 * config.cable.length
+
+
+def test_round_trip_is_exact(tmp_path):
+    points = np.random.default_rng(0).normal(size=(50, 2))
+    write_centerline(tmp_path / "a.csv", points)
+    np.testing.assert_array_equal(read_centerline(tmp_path / "a.csv", points[0]), points)
+    assert (tmp_path / "a.csv").read_text().startswith("x_m,y_m\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_a_reversed_file_is_put_right(tmp_path):
+    write_centerline(tmp_path / "a.csv", LINE[::-1])
+    np.testing.assert_array_equal(read_centerline(tmp_path / "a.csv", START, END), LINE)
+    np.testing.assert_array_equal(read_centerline(tmp_path / "a.csv", START), LINE)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_order_of_the_second_half_of_a_loop(tmp_path, reverse):
+    """Its last point is nearer to the start fixture than its first one, but sits at the end."""
+    angle = np.linspace(np.pi, 1.9 * np.pi, 20)
+    half = np.column_stack((1 - np.cos(angle), -np.sin(angle)))
+    write_centerline(tmp_path / "a.csv", half[::-1] if reverse else half)
+    points = read_centerline(tmp_path / "a.csv", (0.0, 0.0), tuple(half[-1]))
+    np.testing.assert_array_equal(points, half)
+
+
+def test_repeated_points_spaces_and_blank_lines(tmp_path):
+    path = csv(
+        tmp_path, "\ufeffx_m, y_m\r\n0,0\r\n 0 , 0\r\n1e-1,0.1\r\n0.1,0.1\r\n\r\n0.5,0.1\r\n"
+    )
+    points = read_centerline(path, START, END)
+    np.testing.assert_array_equal(points, [[0, 0], [0.1, 0.1], [0.5, 0.1]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "pose.csv: is empty; a header x_m,y_m and points belong here"),
+        ("x_m,y_m\n", "pose.csv: has a header but no points"),
+        ("x_m,y_m\n0,0\n", "pose.csv: holds one point only"),
+        ("x_m,y_m\n1,1\n1,1\n1,1\n", "pose.csv: holds one point only"),
+        ("0,0\n1,1\n", r"line 1: the header must be x_m,y_m \(metres\), found '0,0'"),
+        ("x_mm,y_mm\n0,0\n1,1\n", "line 1: the header must be x_m,y_m .*'x_mm,y_mm'"),
+        ("y_m,x_m\n0,0\n1,1\n", "line 1: the header must be x_m,y_m"),
+        ("x_m;y_m\n0;0\n1;1\n", "line 1: the header must be x_m,y_m .*'x_m;y_m'"),
+        ("x_m,y_m\n0,0\nnan,1\n", "line 3: 'nan' is not a finite number; leave out"),
+        ("x_m,y_m\n0,0\n\n0,inf\n", "line 4: 'inf' is not a finite number"),
+        ("x_m,y_m\n0,0\n1,\n", "line 3: '' is not a number"),
+        ("x_m,y_m\n0,0\n1,here\n", "line 3: 'here' is not a number"),
+        ("x_m,y_m\n0,0\n0,5,1,2\n", "line 3: two numbers x,y belong here, found 4: '0,5,1,2'"),
+        ("x_m,y_m\n0,0\n1\n", "line 3: two numbers x,y belong here, found 1"),
+        ("x_m,y_m\n0,0\n300,0\n508,101\n", r"531.2 m long: are the points in metres\?"),
+    ],
+)
+def test_a_bad_file_is_named_with_its_line(tmp_path, text, message):
+    with pytest.raises(MeasurementError, match=message) as caught:
+        read_centerline(csv(tmp_path, text), START, END)
+    assert caught.value.pose == "pose.csv"
+
+
+def test_a_file_that_cannot_be_read(tmp_path):
+    with pytest.raises(MeasurementError, match=r"none.csv: cannot be read: No such file"):
+        read_centerline(tmp_path / "none.csv", START)
+    (tmp_path / "photo.csv").write_bytes(b"\xff\xd8\xff\xe0")
+    with pytest.raises(MeasurementError, match=r"photo.csv: is not a text file"):
+        read_centerline(tmp_path / "photo.csv", START)
+
+
+def test_writing_keeps_the_old_file_if_it_fails(tmp_path):
+    path = tmp_path / "a.csv"
+    write_centerline(path, LINE)
+    with pytest.raises(MeasurementError, match=r"point 1 is .* not finite"):
+        write_centerline(path, [[0, 0], [np.nan, 1]])
+    with pytest.raises(MeasurementError, match=r"points of shape \(3,\)"):
+        write_centerline(path, [1, 2, 3])
+    np.testing.assert_array_equal(read_centerline(path, START), LINE)
+    with pytest.raises(MeasurementError, match="cannot be written: No such file"):
+        write_centerline(tmp_path / "none" / "a.csv", LINE)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.csv"]
