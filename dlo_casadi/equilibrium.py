@@ -284,9 +284,7 @@ def _from_start(
     n_bends = chain.n_headings - 1
     x0 = np.concatenate([phi, np.zeros(chain.n if model.extensible else 0)])
     bounds = np.concatenate([np.zeros(model.n_conditions), np.full(n_bends, JOINT_BOUND)])
-    out = solver(
-        x0=x0, p=np.concatenate([p, rest, ends, deviation]), lbg=-bounds, ubg=bounds
-    )
+    out = solver(x0=x0, p=np.concatenate([p, rest, ends, deviation]), lbg=-bounds, ubg=bounds)
     stats = solver.stats()
     phi = np.array(out["x"]).ravel()[: chain.n_headings]
     multipliers = np.array(out["lam_g"]).ravel()

@@ -46,6 +46,4 @@ class BendingSoftening(SectionLaw):
         """Energy over EI k^2 / 2: 2 int_0^1 t / (1 + t |k|/c) dt, by quadrature in t."""
         delta = _ROUNDING * cable.curvature_scale
         ratio = params["softness"] * (ca.sqrt(bend * bend + delta**2) - delta)
-        return sum(
-            2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)
-        )
+        return sum(2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True))

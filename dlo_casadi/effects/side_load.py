@@ -24,9 +24,7 @@ class SideLoad(Load):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the force per length."""
-        return (
-            Parameter("force_per_length", "N/m", scale=0.1 * 9.81 * cable.mass / cable.length),
-        )
+        return (Parameter("force_per_length", "N/m", scale=0.1 * 9.81 * cable.mass / cable.length),)
 
     def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
         """Potential energy of the load [J]."""

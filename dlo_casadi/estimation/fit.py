@@ -1,0 +1,344 @@
+"""Fit of a model to all measured poses: noise, roughness, parameters and their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.gauss_newton import (
+    BatchProblem,
+    Linearization,
+    Normal,
+    Point,
+    Tolerances,
+)
+from dlo_casadi.estimation.noise import NoiseModel, NoiseSample, estimate_noise, smooth_modes
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.start import all_at_once, measured_shapes
+from dlo_casadi.estimation.sweep import Shapes
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.float64]
+
+# Decades about the prior stiffness from which fits are started.
+DECADES = (0, -1, 1, -2, 2, -3, 3)
+# Slow displacements per pose that are kept out of the noise estimate.
+SMOOTH_MODES = 4
+# A first guess of an undeclared noise, only until it has been estimated.
+FIRST_STD = 3e-4
+ROUGHNESS_START = 0.3
+ROUGHNESS_FLOOR = 1e-3
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters that explain the measured poses best, and how well they are known.
+
+    Parameters
+    ----------
+    problem : BatchProblem
+        With the noise and the roughness found.
+    point : Point
+        Unknowns, shapes and objective at the minimum.
+    converged : bool
+    """
+
+    problem: BatchProblem
+    point: Point
+    converged: bool
+
+    @property
+    def model(self) -> CableModel:
+        """The model that was fitted."""
+        return self.problem.unknowns.model
+
+    @property
+    def noise(self) -> NoiseModel:
+        """Noise of the measured lines."""
+        return self.problem.noise
+
+    @property
+    def p(self) -> FloatArray:
+        """Parameter vector, in the order of `model.names` (SI)."""
+        return self.problem.unknowns.p(self.point.theta)
+
+    @property
+    def coefficients(self) -> FloatArray:
+        """Rest-curvature coefficients [1/m]."""
+        return self.problem.unknowns.coefficients(self.point.theta)
+
+    @property
+    def rest(self) -> FloatArray:
+        """Rest curvature of the bending cells before the first pose [1/m]."""
+        return self.problem.unknowns.rest(self.point.theta)
+
+    @cached_property
+    def linearization(self) -> Linearization:
+        """Residuals and Jacobians at the minimum."""
+        return self.problem.linearize(self.point)
+
+    @cached_property
+    def normal(self) -> Normal:
+        """Normal equations at the minimum."""
+        return self.problem.normal_equations(self.point, self.linearization)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance (size, size) of theta: inverse of the reduced Hessian."""
+        return np.asarray(np.linalg.pinv(self.normal.hessian, hermitian=True))
+
+    @cached_property
+    def degrees_of_freedom(self) -> float:
+        """Number of points minus the effective number of unknowns that they determine."""
+        problem = self.problem
+        effective = problem.unknowns.size - float(np.trace(self.covariance @ problem.precision))
+        precision = np.diag(1 / problem.deviation_std**2)
+        for block, cross, _ in self.normal.inner:
+            inverse = np.linalg.inv(block)
+            arm = inverse @ cross
+            full = inverse + arm @ self.covariance @ arm.T
+            effective += len(block) - float(np.trace(full @ precision))
+        return max(problem.n_points - effective, 1.0)
+
+    @property
+    def chi2_per_dof(self) -> float:
+        """Sum of squares of the whitened residuals per degree of freedom."""
+        return self.point.data / self.degrees_of_freedom
+
+    @property
+    def inflation(self) -> float:
+        """Factor on standard deviations where the residual exceeds the noise."""
+        return float(np.sqrt(max(1.0, self.chi2_per_dof)))
+
+    def std(self, name: str) -> float:
+        """Standard deviation of a parameter (SI), the residual's excess included."""
+        unknowns = self.problem.unknowns
+        if name not in unknowns.names:
+            return 0.0
+        k = unknowns.names.index(name)
+        slope = unknowns.scales[k]
+        if name in self.model.names:
+            slope = unknowns.slopes(self.point.theta)[self.model.names.index(name), k]
+        return float(abs(slope) * np.sqrt(self.covariance[k, k]) * self.inflation)
+
+    def value(self, name: str) -> float:
+        """Value of a parameter (SI)."""
+        return float(self.p[self.model.names.index(name)])
+
+    @cached_property
+    def stable(self) -> NDArray[np.bool_]:
+        """Whether each pose is a stable equilibrium at the fitted parameters."""
+        return self.problem.sweep.stable(self.point.shapes, self.p, self.rest)
+
+    @cached_property
+    def log_evidence(self) -> float:
+        """Laplace's approximation of the log marginal likelihood, constants dropped.
+
+        -objective + 1/2 log|P+| - 1/2 log|H| - 1/2 sum log|block| - log|noise|
+        """
+        problem = self.problem
+        eigen = np.linalg.eigvalsh(problem.precision)
+        prior = float(np.log(eigen[eigen > 1e-12]).sum())
+        hessian = float(np.linalg.slogdet(self.normal.hessian)[1])
+        inner = sum(
+            float(np.linalg.slogdet(block)[1]) + 2 * float(np.log(problem.deviation_std).sum())
+            for block, _, _ in self.normal.inner
+        )
+        return -self.point.objective + (prior - hessian - inner) / 2
+
+
+def starting_points(
+    problem: BatchProblem, theta: FloatArray, decades: Sequence[int] = DECADES
+) -> list[Point]:
+    """Equilibria near the measured shapes for stiffnesses over decades, best first."""
+    shapes, feet = measured_shapes(problem)
+    problem.refresh(feet)
+    held = np.zeros(problem.unknowns.size, dtype=bool)
+    held[: problem.unknowns.n_parameters] = True
+    points = []
+    for decade in decades:
+        start = theta.copy()
+        start[0] += decade * np.log(10)
+        point = all_at_once(problem, shapes, feet, start, held)
+        if point is not None and np.isfinite(point.objective):
+            points.append(point)
+    return sorted(points, key=lambda point: point.objective)
+
+
+def refine(
+    problem: BatchProblem, point: Point, *, estimate: bool, rounds: int = 3
+) -> tuple[BatchProblem, Point, bool]:
+    """Alternate between the fit, the roughness of the rest curvature and the noise.
+
+    The roughness maximises the marginal likelihood (MacKay's fixed point).
+
+    References
+    ----------
+    MacKay, Neural Computation 4 (1992).
+    """
+    point, converged = problem.descend(point, tolerance=1e-2)
+    for round_ in range(rounds):
+        lin = problem.linearize(point)
+        noise = problem.noise
+        if estimate and round_ < 2:
+            noise = noise_of(problem, point, lin)
+        roughness = roughness_of(problem, point, lin)
+        moved = abs(np.log(roughness / problem.roughness_std))
+        changed = abs(np.log(noise.std / problem.noise.std))
+        problem = problem.with_noise(noise, roughness)
+        problem.refresh(point.feet)
+        point = problem.evaluate(point.theta, point.shapes, point.feet)
+        point, converged = problem.descend(point)
+        if moved < 0.1 and changed < 0.02:
+            break
+    return problem, point, converged
+
+
+def noise_of(problem: BatchProblem, point: Point, lin: Linearization) -> NoiseModel:
+    """Noise estimated from the residuals with all that the shape may do projected out."""
+    model = problem.unknowns.model
+    length = model.cable.length
+    size = problem.unknowns.size
+    stacked = np.concatenate([directions[:, :size] for directions in lin.raw_directions])
+    stacked = stacked / np.maximum(np.abs(stacked).max(axis=0), 1e-300)
+    left, values, _ = np.linalg.svd(stacked, full_matrices=False)
+    shared = left[:, values > 1e-6 * values[0]]
+    cuts = np.cumsum([len(s) for s in point.feet])[:-1]
+    samples = []
+    for k, (s, block) in enumerate(zip(point.feet, np.split(shared, cuts), strict=True)):
+        own = lin.raw_directions[k][:, size:]
+        own = own / np.maximum(np.abs(own).max(axis=0), 1e-300)
+        modes = smooth_modes(s, length, SMOOTH_MODES, model.end == "free")
+        basis, values, _ = np.linalg.svd(np.concatenate([own, modes], axis=1), full_matrices=False)
+        weight = problem.measured[problem.used[k]].relative_std
+        samples.append(
+            NoiseSample(lin.raw[k], s, weight, basis[:, values > 1e-3 * values[0]], block)
+        )
+    return estimate_noise(samples, length)
+
+
+def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> float:
+    """One fixed-point update of the roughness of the rest curvature."""
+    unknowns = problem.unknowns
+    if unknowns.n_rest < 3:
+        return problem.roughness_std
+    rest = slice(unknowns.n_parameters, unknowns.size)
+    rough = unknowns.model.rest.roughness
+    hessian = problem.normal_equations(point, lin).hessian
+    covariance = np.linalg.pinv(hessian, hermitian=True)[rest, rest]
+    prior = rough.T @ rough / problem.roughness_std**2
+    well_determined = len(rough) - float(np.trace(covariance @ prior))
+    energy = float(((rough @ point.theta[rest]) ** 2).sum())
+    return float(max(np.sqrt(energy / max(well_determined, 1e-2)), ROUGHNESS_FLOOR))
+
+
+def fit_model(
+    model: CableModel,
+    measured: Sequence[MeasuredPose],
+    tolerances: Tolerances,
+    std: float | None = None,
+    *,
+    free: Sequence[str] | None = None,
+    start: Fit | None = None,
+    decades: Sequence[int] = DECADES,
+) -> Fit:
+    """Fit a model to all readable fit poses.
+
+    Parameters
+    ----------
+    model : CableModel
+    measured : sequence of MeasuredPose
+        All poses in the order in which they were taken.
+    tolerances : Tolerances
+    std : float, optional [m]
+        Declared noise of one coordinate; estimated, with its correlation, when absent.
+    free : sequence of str, optional
+        Names of the parameters to estimate; all by default.
+    start : Fit, optional
+        A fit of a similar model on the same mesh to start from; its noise is kept.
+    decades : sequence of int
+        Stiffnesses to start from, powers of ten about the prior.
+
+    Raises
+    ------
+    EstimationError
+        If there is no fit pose, or no start leads to an equilibrium near the measured shapes.
+    """
+    if not any(item.readable and not item.held_out for item in measured):
+        raise EstimationError(
+            "no pose to fit: every pose is held out or could not be read.\n"
+            "  Try: role: fit for at least one pose."
+        )
+    chosen = np.array([free is None or name in free for name in model.names])
+    unknowns = Unknowns(model, chosen, model.nominal)
+    if start is not None:
+        return _continue(unknowns, measured, tolerances, start)
+    noise = NoiseModel(std or FIRST_STD, declared=std is not None)
+    problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START)
+    points = starting_points(problem, problem.mean, decades)
+    if not points:
+        raise EstimationError(
+            f"no stiffness within {max(decades)} decades of {model.cable.bending_stiffness:.3g} "
+            "N m^2 gives an equilibrium near the measured shapes.\n"
+            "  Try: check the units of mass and length, the direction of gravity and the order "
+            "of the poses."
+        )
+    best: tuple[Point, bool] | None = None
+    for point in points[:3]:
+        candidate = problem.descend(point, tolerance=1e-2)
+        if best is None or candidate[0].objective < best[0].objective - 0.5:
+            better = best is not None
+            best = candidate
+            if better:
+                continue
+        elif abs(candidate[0].objective - best[0].objective) < 1.0:
+            break
+    assert best is not None
+    problem, point, converged = refine(problem, best[0], estimate=std is None)
+    return Fit(problem, point, converged)
+
+
+def _continue(
+    unknowns: Unknowns,
+    measured: Sequence[MeasuredPose],
+    tolerances: Tolerances,
+    start: Fit,
+) -> Fit:
+    """Fit a similar model from the minimum of another one, with the noise found there."""
+    model = unknowns.model
+    p = model.nominal.copy()
+    for i, name in enumerate(model.names):
+        if name in start.model.names:
+            p[i] = start.value(name)
+    unknowns = replace(unknowns, fixed=p)
+    theta = unknowns.pack(p, start.coefficients)
+    problem = BatchProblem(unknowns, measured, start.noise, tolerances, start.problem.roughness_std)
+    shapes, solved = problem.sweep.solve(
+        start.point.shapes, unknowns.p(theta), unknowns.rest(theta)
+    )
+    if not solved:
+        raise EstimationError("the shapes of the first fit are no equilibria of the second model")
+    feet = _feet_for(problem, start)
+    problem.refresh(feet)
+    point = problem.evaluate(theta, shapes, feet)
+    point, converged = problem.descend(point)
+    return Fit(problem, point, converged)
+
+
+def _feet_for(problem: BatchProblem, start: Fit) -> list[FloatArray]:
+    """Feet of the problem's fitted poses, by the pose's place in the session."""
+    known = dict(zip(start.problem.used, start.point.feet, strict=True))
+    return [known[j] for j in problem.used]
+
+
+def refit(problem: BatchProblem, shapes: Shapes, theta: FloatArray, feet: list[FloatArray]) -> Fit:
+    """Minimise a problem from shapes that are equilibria at theta."""
+    problem.refresh(feet)
+    point, converged = problem.descend(problem.evaluate(theta, shapes, feet))
+    return Fit(problem, point, converged)

@@ -1,0 +1,341 @@
+"""Gauss-Newton for the batch problem, with the equilibria eliminated pose by pose.
+
+    min over theta, deviations of
+        1/2 sum_j |W_j N_j (x_j - r_j(s_j))|^2 + 1/2 sum_j |deviation_j / std|^2
+        + 1/2 (theta - mean)^T P (theta - mean)
+    subject to every pose being an equilibrium
+
+The feet s_j of the measured points move with the curve; at a foot the normal distance does not
+change to first order with s, so that the Jacobian at fixed feet is the exact one. The
+deviations of a pose are eliminated by a Schur complement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve, normal_rows
+from dlo_casadi.estimation.sweep import Sensitivities, Shapes, Sweep
+from dlo_casadi.estimation.unknowns import Unknowns
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How well the declared values are known, one standard deviation."""
+
+    length: float = 5e-4
+    end: float = 2e-4
+    heading: float = 1e-2
+    scale: float = 3e-4
+
+    @property
+    def deviation(self) -> FloatArray:
+        """Standard deviations of a pose's deviations (4,) [m, m, rad, rad]."""
+        return np.array([self.end, self.end, self.heading, self.heading])
+
+
+@dataclass(frozen=True)
+class Point:
+    """Everything at one value of the unknowns.
+
+    Parameters
+    ----------
+    theta : (size,)
+    shapes : Shapes
+    feet : list of (K_j,) [m]
+    objective : float
+        Half the sum of squares, priors included.
+    data : float
+        Sum of squares of the whitened normal distances alone.
+    """
+
+    theta: FloatArray
+    shapes: Shapes
+    feet: list[FloatArray]
+    objective: float
+    data: float
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Residuals and Jacobians of the data at a point.
+
+    Parameters
+    ----------
+    residuals : list of (K_j,)
+        Whitened normal distances, measured minus model.
+    by_theta : list of (K_j, size)
+        Derivative of the residuals.
+    by_deviation : list of (K_j, n_deviations)
+    raw : list of (K_j,) [m]
+        Normal distances.
+    raw_directions : list of (K_j, size + n_deviations)
+        Their derivatives, not whitened.
+    shapes : Sensitivities
+        Derivatives of the equilibria.
+    """
+
+    residuals: list[FloatArray]
+    by_theta: list[FloatArray]
+    by_deviation: list[FloatArray]
+    raw: list[FloatArray]
+    raw_directions: list[FloatArray]
+    shapes: Sensitivities
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations with the deviations eliminated: hessian @ step = -gradient."""
+
+    hessian: FloatArray
+    gradient: FloatArray
+    inner: list[tuple[FloatArray, FloatArray, FloatArray]]
+
+
+class BatchProblem:
+    """The batch problem of one model, one noise model and one prior.
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+    measured : sequence of MeasuredPose
+        All poses in order; those held out or unreadable only carry the history.
+    noise : NoiseModel
+    tolerances : Tolerances
+    roughness_std : float
+        Prior of the rest curvature, see `Unknowns.prior_precision`.
+    sweep : Sweep, optional
+        Reused when only noise or priors have changed.
+    """
+
+    def __init__(
+        self,
+        unknowns: Unknowns,
+        measured: Sequence[MeasuredPose],
+        noise: NoiseModel,
+        tolerances: Tolerances,
+        roughness_std: float = 1.0,
+        sweep: Sweep | None = None,
+    ) -> None:
+        self.unknowns = unknowns
+        self.measured = tuple(measured)
+        self.noise = noise
+        self.tolerances = tolerances
+        self.roughness_std = roughness_std
+        self.sweep = sweep or Sweep(unknowns.model, [item.pose for item in measured])
+        self.used = [
+            j for j, item in enumerate(self.measured) if item.readable and not item.held_out
+        ]
+        self.precision = unknowns.prior_precision(roughness_std)
+        self.mean = unknowns.prior_mean()
+        self.deviation_std = tolerances.deviation[self.sweep.used_deviations]
+        self._whitening: dict[int, FloatArray] = {}
+
+    @property
+    def n_points(self) -> int:
+        """Number of measured points that are fitted."""
+        return sum(len(self.measured[j].points) for j in self.used)
+
+    # ---- evaluation --------------------------------------------------------------------------
+
+    def curves(self, theta: FloatArray, shapes: Shapes) -> list[NodeCurve]:
+        """Curves of all poses as the camera sees them."""
+        z = self.sweep.shapes_seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
+        return [NodeCurve.of(self.unknowns.model.chain, row) for row in z]
+
+    def _white(self, j: int, feet: FloatArray) -> FloatArray:
+        if j not in self._whitening:
+            self._whitening[j] = self.noise.whitening(feet, self.measured[j].relative_std)
+        return self._whitening[j]
+
+    def refresh(self, feet: Sequence[FloatArray]) -> None:
+        """Recompute the noise metric for points whose feet have moved."""
+        self._whitening = {}
+        for j, s in zip(self.used, feet, strict=True):
+            self._white(j, s)
+
+    def raw_residuals(
+        self, curves: list[NodeCurve], feet: list[FloatArray]
+    ) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Normal distances [m] of the fitted poses and the feet they belong to."""
+        distances, moved = [], []
+        for j, guess in zip(self.used, feet, strict=True):
+            points = self.measured[j].points
+            s = curves[j].feet(points, guess)
+            normals = curves[j].normals(s)
+            distances.append(((points - curves[j].at(s)) * normals).sum(axis=1))
+            moved.append(s)
+        return distances, moved
+
+    def evaluate(self, theta: FloatArray, shapes: Shapes, feet: list[FloatArray]) -> Point:
+        """Objective at given unknowns and equilibria."""
+        distances, moved = self.raw_residuals(self.curves(theta, shapes), feet)
+        white = [self._white(j, s) @ d for j, s, d in zip(self.used, moved, distances, strict=True)]
+        data = float(sum(row @ row for row in white))
+        gap = theta - self.mean
+        used = shapes.deviation[np.ix_(self.used, self.sweep.used_deviations)]
+        prior = float(gap @ self.precision @ gap + ((used / self.deviation_std) ** 2).sum())
+        return Point(theta, shapes, moved, (data + prior) / 2, data)
+
+    def linearize(self, point: Point) -> Linearization:
+        """Whitened residuals and their exact first derivatives."""
+        slopes = self.unknowns.slopes(point.theta)
+        sens = self.sweep.sensitivities(
+            point.shapes,
+            self.unknowns.p(point.theta),
+            self.unknowns.rest(point.theta),
+            slopes,
+            self.unknowns.rest_slopes,
+        )
+        return self.linearize_along(point, sens, slopes)
+
+    def linearize_along(
+        self, point: Point, sens: Sensitivities, slopes: FloatArray
+    ) -> Linearization:
+        """Residuals and derivatives for given derivatives of the shapes and parameters."""
+        p, rest = self.unknowns.p(point.theta), self.unknowns.rest(point.theta)
+        z, by_x, by_p, by_dev = self.sweep.observe(point.shapes, p, rest)
+        columns = self.sweep.used_deviations
+        out: tuple[list[FloatArray], ...] = ([], [], [], [], [])
+        for j, s in zip(self.used, point.feet, strict=True):
+            curve = NodeCurve.of(self.unknowns.model.chain, z[j])
+            normals = curve.normals(s)
+            rows = normal_rows(curve, s, normals)
+            white = self._white(j, s)
+            d = ((self.measured[j].points - curve.at(s)) * normals).sum(axis=1)
+            theta_z = by_x[j] @ sens.theta[j] + by_p[j] @ slopes
+            deviation_z = (by_x[j] @ sens.deviation[j] + by_dev[j])[:, columns]
+            out[0].append(white @ d)
+            directions = -rows @ np.concatenate([theta_z, deviation_z], axis=1)
+            whitened = white @ directions
+            out[1].append(whitened[:, : slopes.shape[1]])
+            out[2].append(whitened[:, slopes.shape[1] :])
+            out[3].append(d)
+            out[4].append(directions)
+        return Linearization(*out, shapes=sens)
+
+    def normal_equations(self, point: Point, lin: Linearization) -> Normal:
+        """Gauss-Newton normal equations of theta, deviations eliminated."""
+        gap = point.theta - self.mean
+        hessian = self.precision.copy()
+        gradient = self.precision @ gap
+        inner = []
+        precision = np.diag(1 / self.deviation_std**2)
+        columns = self.sweep.used_deviations
+        for k, j in enumerate(self.used):
+            e, a, b = lin.residuals[k], lin.by_theta[k], lin.by_deviation[k]
+            hessian += a.T @ a
+            gradient += a.T @ e
+            if b.shape[1]:
+                block = b.T @ b + precision
+                cross = b.T @ a
+                slope = b.T @ e + precision @ point.shapes.deviation[j, columns]
+                solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+                hessian -= cross.T @ solved[:, :-1]
+                gradient -= cross.T @ solved[:, -1]
+                inner.append((block, cross, slope))
+        return Normal(hessian, gradient, inner)
+
+    def _step(self, point: Point, normal: Normal, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Damped step of theta within its bounds, and the deviations that go with it."""
+        lower, upper = self.unknowns.bounds
+        scale = np.maximum(np.diag(normal.hessian), 1e-12)
+        matrix = normal.hessian + damping * np.diag(scale)
+        step = -np.linalg.solve(matrix, normal.gradient)
+        new = point.theta + step
+        if np.any(new < lower) or np.any(new > upper):
+            step = _bounded_step(matrix, normal.gradient, lower - point.theta, upper - point.theta)
+        deviation = point.shapes.deviation.copy()
+        columns = self.sweep.used_deviations
+        for j, (block, cross, slope) in zip(self.used, normal.inner, strict=False):
+            deviation[j, columns] -= np.linalg.solve(block, cross @ step + slope)
+        return step, deviation
+
+    # ---- solution ----------------------------------------------------------------------------
+
+    def descend(
+        self, point: Point, max_iterations: int = 40, tolerance: float = 1e-4
+    ) -> tuple[Point, bool]:
+        """Levenberg-Marquardt from an equilibrium point.
+
+        Parameters
+        ----------
+        tolerance : float
+            Predicted decrease of the objective at which the fit has converged; a decrease of
+            1/2 is one standard deviation of one parameter.
+
+        Returns
+        -------
+        Point, bool
+            The minimum and whether it converged.
+        """
+        damping = 0.0
+        lin = self.linearize(point)
+        for _ in range(max_iterations):
+            normal = self.normal_equations(point, lin)
+            while True:
+                step, deviation = self._step(point, normal, damping)
+                trial = self._try(point, lin, step, deviation)
+                if trial is not None and trial.objective <= point.objective + 1e-9 * abs(
+                    point.objective
+                ):
+                    break
+                damping = max(10 * damping, 1e-4)
+                if damping > 1e8:
+                    return point, False
+            gain = point.objective - trial.objective
+            damping = damping / 10 if damping > 1e-6 else 0.0
+            point = trial
+            lin = self.linearize(point)
+            if gain < tolerance and damping < 1e-2:
+                return point, True
+        return point, False
+
+    def _try(
+        self, point: Point, lin: Linearization, step: FloatArray, deviation: FloatArray
+    ) -> Point | None:
+        """Equilibria and objective after a step; None if some pose loses its equilibrium."""
+        theta = point.theta + step
+        sens = lin.shapes
+        change = (
+            sens.theta @ step
+            + (sens.deviation @ (deviation - point.shapes.deviation)[:, :, None])[:, :, 0]
+        )
+        size = float(np.abs(change[:, : self.sweep.n_phi]).max())
+        if size > 1.5:
+            return None
+        n_phi = self.sweep.n_phi
+        guess = Shapes(
+            point.shapes.phi + change[:, :n_phi], point.shapes.lam + change[:, n_phi:], deviation
+        )
+        shapes, converged = self.sweep.solve(
+            guess, self.unknowns.p(theta), self.unknowns.rest(theta)
+        )
+        if not converged or np.abs(shapes.phi - guess.phi).max() > 1.0:
+            return None
+        return self.evaluate(theta, shapes, point.feet)
+
+    def with_noise(self, noise: NoiseModel, roughness_std: float) -> BatchProblem:
+        """Return the same problem with another noise or roughness."""
+        return BatchProblem(
+            self.unknowns, self.measured, noise, self.tolerances, roughness_std, self.sweep
+        )
+
+
+def _bounded_step(
+    matrix: FloatArray, gradient: FloatArray, lower: FloatArray, upper: FloatArray
+) -> FloatArray:
+    """Minimise the quadratic model within bounds."""
+    factor = np.linalg.cholesky(matrix).T
+    target = -np.linalg.solve(factor.T, gradient)
+    low, high = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
+    high = np.where(high - low < 1e-14, low + 1e-14, high)
+    return np.asarray(lsq_linear(factor, target, bounds=(low, high), method="bvls").x)

@@ -1,0 +1,248 @@
+"""Equilibria of many poses at once: one Newton method over the stacked poses.
+
+All poses share the parameters; a drift carries the rest curvature from pose to pose. The
+Newton step solves the poses' KKT systems as one batch and passes changes of the rest curvature
+on in order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.equilibrium import JOINT_BOUND, Pose, is_stable
+from dlo_casadi.model import DEVIATIONS, CableModel
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Stacked unknowns of m poses.
+
+    Parameters
+    ----------
+    phi : (m, n_headings) [rad]
+    lam : (m, n_conditions)
+    deviation : (m, 4)
+        Deviations of each pose from its declared ends [m, m, rad, rad].
+    """
+
+    phi: FloatArray
+    lam: FloatArray
+    deviation: FloatArray
+
+    def subset(self, index: Sequence[int] | NDArray[np.intp]) -> Shapes:
+        """Shapes of some of the poses."""
+        return Shapes(self.phi[index], self.lam[index], self.deviation[index])
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """Derivatives of the stacked equilibria.
+
+    `theta` (m, N, size) by the unknowns, `deviation` (m, N, 4) by each pose's own deviation;
+    N counts headings and multipliers.
+    """
+
+    theta: FloatArray
+    deviation: FloatArray
+
+
+class Sweep:
+    """A model evaluated over m poses at once.
+
+    Parameters
+    ----------
+    model : CableModel
+    poses : sequence of Pose
+        In the order in which they were taken.
+    """
+
+    def __init__(self, model: CableModel, poses: Sequence[Pose]) -> None:
+        self.model = model
+        self.poses = tuple(poses)
+        self.m = len(self.poses)
+        self.n_phi = model.chain.n_headings
+        self.n_unknowns = self.n_phi + model.n_conditions
+        self._ends = np.array([pose.vector for pose in self.poses]).T
+        self._maps = {
+            name: getattr(model, name).map(self.m)
+            for name in ("kkt", "sensitivity", "observation", "shape")
+        }
+        if model.has_state:
+            self._next = model.next_rest
+        self.used_deviations = [DEVIATIONS.index(name) for name in model.deviations]
+
+    def _call(self, name: str, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[FloatArray]:
+        """Evaluate a mapped function; each output (m, rows, columns)."""
+        outputs = self._maps[name](
+            shapes.phi.T,
+            shapes.lam.T,
+            np.repeat(p[:, None], self.m, axis=1),
+            rest.T,
+            self._ends,
+            shapes.deviation.T,
+        )
+        stacked = []
+        for out in outputs if isinstance(outputs, tuple | list) else (outputs,):
+            dense = out.toarray()
+            stacked.append(dense.reshape(dense.shape[0], self.m, -1).transpose(1, 0, 2))
+        return stacked
+
+    def rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """Rest curvature (m, n_cells) that each pose finds, from the first on."""
+        if not self.model.has_state:
+            return np.repeat(rest[None], self.m, axis=0)
+        out = [rest]
+        for j in range(self.m - 1):
+            after = self._next(
+                shapes.phi[j], shapes.lam[j], p, out[-1], self._ends[:, j], shapes.deviation[j]
+            )[0]
+            out.append(np.array(after).ravel())
+        return np.array(out)
+
+    def _carry(
+        self, shapes: Shapes, p: FloatArray, rests: FloatArray
+    ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Derivatives of each pose's rest curvature after it, by (phi, rest before, p)."""
+        blocks = []
+        for j in range(self.m):
+            out = self._next(
+                shapes.phi[j], shapes.lam[j], p, rests[j], self._ends[:, j], shapes.deviation[j]
+            )
+            blocks.append(tuple(np.array(block) for block in out[1:]))
+        return blocks
+
+    def solve(
+        self,
+        shapes: Shapes,
+        p: FloatArray,
+        rest: FloatArray,
+        max_iterations: int = 25,
+        tolerance: float = 1e-10,
+    ) -> tuple[Shapes, bool]:
+        """Newton's method from nearby shapes.
+
+        Parameters
+        ----------
+        shapes : Shapes
+            Where to start; deviations are kept.
+        p : (n_parameters,)
+        rest : (n_cells,) [1/m]
+            Before the first pose.
+        tolerance : float [rad]
+            Largest step at convergence.
+
+        Returns
+        -------
+        Shapes, bool
+            The shapes and whether every pose converged.
+        """
+        phi, lam = shapes.phi.copy(), shapes.lam.copy()
+        last = np.inf
+        for _ in range(max_iterations):
+            now = replace(shapes, phi=phi, lam=lam)
+            rests = self.rests(now, p, rest)
+            force, matrix = self._call("kkt", now, p, rests)
+            if not np.all(np.isfinite(matrix)):
+                return shapes, False
+            try:
+                step = -np.linalg.solve(matrix, force)[:, :, 0]
+            except np.linalg.LinAlgError:
+                return shapes, False
+            if self.model.has_state:
+                step = self._pass_on(now, p, rests, matrix, step)
+            size = float(np.abs(step[:, : self.n_phi]).max())
+            damp = min(1.0, 0.5 / size) if size > 0 else 1.0
+            phi = phi + damp * step[:, : self.n_phi]
+            lam = lam + damp * step[:, self.n_phi :]
+            # Newton's method has reached rounding when steps are tiny and no longer shrink.
+            if size < tolerance or (size < 1e-7 and size > 0.5 * last):
+                return replace(shapes, phi=phi, lam=lam), True
+            last = size
+        return replace(shapes, phi=phi, lam=lam), False
+
+    def _pass_on(
+        self,
+        shapes: Shapes,
+        p: FloatArray,
+        rests: FloatArray,
+        matrix: FloatArray,
+        step: FloatArray,
+    ) -> FloatArray:
+        """Newton step with the change of rest curvature handed from pose to pose."""
+        _, by_rest, _ = self._call("sensitivity", shapes, p, rests)
+        carry = self._carry(shapes, p, rests)
+        change = np.zeros(rests.shape[1])
+        out = step.copy()
+        for j in range(self.m):
+            if change.any():
+                out[j] -= np.linalg.solve(matrix[j], by_rest[j] @ change)
+            by_phi, by_before, _ = carry[j]
+            change = by_phi @ out[j, : self.n_phi] + by_before @ change
+        return out
+
+    def sensitivities(
+        self,
+        shapes: Shapes,
+        p: FloatArray,
+        rest: FloatArray,
+        slopes: FloatArray,
+        rest_slopes: FloatArray,
+    ) -> Sensitivities:
+        """Derivatives of the equilibria by the implicit function theorem.
+
+        Parameters
+        ----------
+        slopes : (n_parameters, size)
+            dp/dtheta.
+        rest_slopes : (n_cells, size)
+            d rest / d theta before the first pose.
+        """
+        rests = self.rests(shapes, p, rest)
+        _, matrix = self._call("kkt", shapes, p, rests)
+        by_p, by_rest, by_deviation = self._call("sensitivity", shapes, p, rests)
+        size = slopes.shape[1]
+        direct = by_p @ slopes
+        if not self.model.has_state:
+            right = np.concatenate([direct + by_rest @ rest_slopes, by_deviation], axis=2)
+            solved = -np.linalg.solve(matrix, right)
+            return Sensitivities(solved[:, :, :size], solved[:, :, size:])
+        solved = -np.linalg.solve(matrix, np.concatenate([direct, by_rest, by_deviation], axis=2))
+        n_cells = rest_slopes.shape[0]
+        carry = self._carry(shapes, p, rests)
+        change = rest_slopes
+        rows = []
+        for j in range(self.m):
+            total = solved[j, :, :size] + solved[j, :, size : size + n_cells] @ change
+            rows.append(total)
+            by_phi, by_before, by_own = carry[j]
+            change = by_phi @ total[: self.n_phi] + by_before @ change + by_own @ slopes
+        return Sensitivities(np.array(rows), solved[:, :, size + n_cells :])
+
+    def observe(
+        self, shapes: Shapes, p: FloatArray, rest: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Observation vectors (m, nz) and their derivatives by unknowns, p and deviation."""
+        rests = self.rests(shapes, p, rest)
+        z, by_x, by_p, by_deviation = self._call("observation", shapes, p, rests)
+        return z[:, :, 0], by_x, by_p, by_deviation
+
+    def shapes_seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """Observation vectors (m, nz) only."""
+        return self._call("shape", shapes, p, self.rests(shapes, p, rest))[0][:, :, 0]
+
+    def stable(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> NDArray[np.bool_]:
+        """Whether each pose is a strict minimum of the energy under its end conditions."""
+        _, matrix = self._call("kkt", shapes, p, self.rests(shapes, p, rest))
+        bends = np.abs(np.diff(shapes.phi, axis=1)).max(axis=1)
+        return np.array(
+            [
+                is_stable(k, self.model.n_conditions) and bend < JOINT_BOUND
+                for k, bend in zip(matrix, bends, strict=True)
+            ]
+        )

@@ -1,0 +1,150 @@
+"""Unknowns of a fit: scaled parameters and rest curvature, with their Gaussian prior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# A weak prior of the rest curvature: a turn per length, one standard deviation.
+REST_TURNS_STD = 1.0
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """The vector theta of a fit: free parameters (scaled or logarithmic), then rest coefficients.
+
+    Parameters
+    ----------
+    model : CableModel
+    free : (n_parameters,) bool
+        Which parameters are estimated; the others stay at `fixed`.
+    fixed : (n_parameters,)
+        Parameter values of what is not estimated (SI).
+    rest_free : bool
+        Whether the rest curvature is estimated.
+    """
+
+    model: CableModel
+    free: BoolArray
+    fixed: FloatArray
+    rest_free: bool = True
+
+    @property
+    def _used(self) -> NDArray[np.intp]:
+        return np.flatnonzero(self.free)
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of free parameters."""
+        return int(self.free.sum())
+
+    @property
+    def n_rest(self) -> int:
+        """Number of free rest-curvature coefficients."""
+        return self.model.rest.n_coefficients if self.rest_free else 0
+
+    @property
+    def size(self) -> int:
+        """Length of theta."""
+        return self.n_parameters + self.n_rest
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries of theta."""
+        names = [self.model.names[i] for i in self._used]
+        return (*names, *(f"rest_curvature[{k}]" for k in range(self.n_rest)))
+
+    @property
+    def scales(self) -> FloatArray:
+        """SI value per unit of theta; 1 for logarithmic parameters."""
+        parameters = [self.model.parameters[i] for i in self._used]
+        scales = [1.0 if q.log else q.scale for q in parameters]
+        return np.array(scales + [self.model.cable.curvature_scale] * self.n_rest)
+
+    def pack(self, p: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """Theta of parameter values and rest coefficients."""
+        parts = []
+        for i in self._used:
+            q = self.model.parameters[i]
+            parts.append(np.log(p[i]) if q.log else p[i] / q.scale)
+        rest = coefficients / self.model.cable.curvature_scale if self.rest_free else []
+        return np.concatenate([np.array(parts), rest])
+
+    def p(self, theta: FloatArray) -> FloatArray:
+        """Parameter vector of the model (SI)."""
+        p = self.fixed.copy()
+        for value, i in zip(theta, self._used, strict=False):
+            q = self.model.parameters[i]
+            p[i] = np.exp(value) if q.log else value * q.scale
+        return p
+
+    def slopes(self, theta: FloatArray) -> FloatArray:
+        """dp/dtheta (n_parameters of the model, size)."""
+        out = np.zeros((len(self.model.parameters), self.size))
+        for k, i in enumerate(self._used):
+            q = self.model.parameters[i]
+            out[i, k] = np.exp(theta[k]) if q.log else q.scale
+        return out
+
+    def coefficients(self, theta: FloatArray) -> FloatArray:
+        """Rest-curvature coefficients [1/m]."""
+        if not self.rest_free:
+            return np.zeros(self.model.rest.n_coefficients)
+        return theta[self.n_parameters :] * self.model.cable.curvature_scale
+
+    def rest(self, theta: FloatArray) -> FloatArray:
+        """Rest curvature of the bending cells before the first pose [1/m]."""
+        return self.model.rest_basis @ self.coefficients(theta)
+
+    @property
+    def rest_slopes(self) -> FloatArray:
+        """d rest / d theta (n_cells, size)."""
+        out = np.zeros((self.model.chain.n_cells, self.size))
+        if self.rest_free:
+            out[:, self.n_parameters :] = self.model.rest_basis * self.model.cable.curvature_scale
+        return out
+
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of theta."""
+        lower, upper = [], []
+        for i in self._used:
+            q = self.model.parameters[i]
+            low, high = (np.log(q.lower), np.log(q.upper)) if q.log else (q.lower, q.upper)
+            scale = 1.0 if q.log else q.scale
+            lower.append(low / scale)
+            upper.append(high / scale)
+        rest = np.full(self.n_rest, 20.0)
+        return np.concatenate([lower, -rest]), np.concatenate([upper, rest])
+
+    def prior_mean(self) -> FloatArray:
+        """Mean of the Gaussian prior of theta."""
+        nominal = self.model.nominal
+        return self.pack(nominal, np.zeros(self.model.rest.n_coefficients))
+
+    def prior_precision(self, roughness_std: float) -> FloatArray:
+        """Precision matrix (size, size) of the prior of theta.
+
+        Parameters
+        ----------
+        roughness_std : float
+            Standard deviation of second differences of the scaled rest coefficients.
+        """
+        precision = np.zeros((self.size, self.size))
+        for k, i in enumerate(self._used):
+            q = self.model.parameters[i]
+            std = q.prior_std if q.log else q.prior_std / q.scale
+            precision[k, k] = 0.0 if np.isinf(std) else 1 / std**2
+        if self.n_rest:
+            rest = slice(self.n_parameters, self.size)
+            rough = self.model.rest.roughness
+            precision[rest, rest] = rough.T @ rough / roughness_std**2
+            precision[rest, rest] += np.eye(self.n_rest) / REST_TURNS_STD**2
+        return precision
