@@ -9,7 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.curve import SmoothCurve, chord_length, fit_curve
-from dlo_casadi.vision.refine import Crossings, cable_direction, fit_profiles, sample_profiles
+from dlo_casadi.vision.refine import (
+    Crossings,
+    average,
+    cable_direction,
+    edge_shape,
+    fit_profiles,
+    sample_profiles,
+)
 from dlo_casadi.vision.search import find_cable
 from dlo_casadi.vision.view import Array, View
 from dlo_casadi.vision.workplane import rectify
@@ -86,14 +93,17 @@ def extract_centerline(
     plane = rectify(image, view, start=first, end=last, diameter=diameter, length=length)
     chain = find_cable(plane, start=first, end=last, diameter=diameter, length=length).chain
     curve, t = _first_curve(chain.strands, diameter, first, last)
-    crossings = None
     bright = image.astype(np.float32)
-    for _ in range(_ROUNDS):
-        profiles = sample_profiles(bright, view, curve, t, diameter)
-        inner = profiles.inside & (t > t[0] + 2 * diameter) & (t < t[-1] - 2 * diameter)
-        direction = cable_direction(profiles, inner, diameter)
-        crossings = fit_profiles(profiles, direction, diameter, 0.7 / view.scale)
-        good = _sound(crossings, profiles.inside, diameter)
+    profiles = sample_profiles(bright, view, curve, t, diameter)
+    good = profiles.inside & (t > t[0] + 2 * diameter) & (t < t[-1] - 2 * diameter)
+    direction = cable_direction(profiles, good, diameter)
+    shape = edge_shape(profiles, direction, good, diameter, 0.7 / view.scale)
+    for along, known in ((0.15, False), (0.15, False), (0.5, True)):
+        raw = sample_profiles(bright, view, curve, t, diameter)
+        profiles = average(raw, good if known else raw.inside, along * diameter)
+        crossings = fit_profiles(profiles, direction, good, shape)
+        sound = _sound(crossings, raw.inside, diameter)
+        good = good & sound if known else sound
         if good.sum() < 10:
             raise VisionError("no cable found")
         points = curve.position(t) + crossings.offset[:, None] * curve.normal(t)
