@@ -1,0 +1,196 @@
+"""What a session of measurements has led to: plain results, computed elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.config import Config
+from dlo_casadi.estimation.fit import Fit
+
+FloatArray = NDArray[np.float64]
+StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
+Verdict = Literal["complete", "effect_found", "unexplained"]
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """One parameter of one stage.
+
+    Parameters
+    ----------
+    value, std : float
+        In `unit`; std is 0 where the parameter was not estimated.
+    unit : str
+    interval_95 : (float or None, float or None), optional
+        Profile-likelihood interval; None in it = unbounded; absent = not computed.
+    identifiable : bool, optional
+        False where the interval is unbounded or spans more than a factor of ten.
+    at_bound : bool
+        Whether the value sits on a physical bound.
+    """
+
+    value: float
+    std: float
+    unit: str
+    interval_95: tuple[float | None, float | None] | None = None
+    identifiable: bool | None = None
+    at_bound: bool = False
+
+
+@dataclass(frozen=True)
+class RestCurvatureEstimate:
+    """Rest curvature along the cable: s [m], value and standard deviation [1/m]."""
+
+    s: FloatArray
+    value: FloatArray
+    std: FloatArray
+
+
+@dataclass(frozen=True)
+class PoseShape:
+    """One pose as one stage sees it.
+
+    Parameters
+    ----------
+    curve : (M, 2) [m]
+        Predicted from the end conditions alone, as the camera would see it.
+    rmse : float or None [m]
+        Root mean square distance of the measured points to it; None without points.
+    s : (K,) [m]
+        Arc lengths of the measured points.
+    residual : (K,)
+        Normal distance of the measured points from the prediction over the noise's std.
+    energy : float [J]
+    stable : bool
+    """
+
+    curve: FloatArray
+    rmse: float | None
+    s: FloatArray
+    residual: FloatArray
+    energy: float
+    stable: bool
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the fit.
+
+    Parameters
+    ----------
+    name : StageName
+    rmse_fit, rmse_held_out : float or None [m]
+        Over all measured points of that role.
+    chi2_per_dof : float or None
+    parameters : dict of ParameterEstimate
+    rest_curvature : RestCurvatureEstimate
+    shapes : dict of PoseShape
+        By pose name; poses without a prediction are absent.
+    note : str
+        Why the stage is empty or ended early, if so.
+    """
+
+    name: StageName
+    rmse_fit: float | None
+    rmse_held_out: float | None
+    chi2_per_dof: float | None
+    parameters: dict[str, ParameterEstimate]
+    rest_curvature: RestCurvatureEstimate
+    shapes: dict[str, PoseShape]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class PoseInput:
+    """One pose as it was measured.
+
+    Parameters
+    ----------
+    name : str
+        File stem.
+    role : "fit" or "held_out"
+    points : (K, 2) [m]
+        Centre-line from start to end; empty if it could not be read.
+    image : Path, optional
+        The photograph.
+    pixels : (K, 2), optional
+        The points in the photograph.
+    to_pixels : callable, optional
+        Maps board metres (M, 2) to the photograph's pixels.
+    problem : str
+        Why the pose could not be read, if so.
+    coverage, confidence : float, optional
+        Share of the cable that was seen; 0 to 1.
+    """
+
+    name: str
+    role: Literal["fit", "held_out"]
+    points: FloatArray
+    image: Path | None = None
+    pixels: FloatArray | None = None
+    to_pixels: Any = None
+    problem: str = ""
+    coverage: float | None = None
+    confidence: float | None = None
+
+
+@dataclass(frozen=True)
+class MeasurementSummary:
+    """How well the centre-lines were measured."""
+
+    kind: Literal["images", "centerlines"]
+    poses_fit: int
+    poses_held_out: int
+    points: int
+    std: float
+    std_source: Literal["declared", "estimated"]
+    correlation_length: float
+
+
+@dataclass(frozen=True)
+class Discretization:
+    """Mesh of the model and the largest shape error [m] it causes, from two meshes."""
+
+    n: int
+    element: Literal["arc", "link"]
+    error: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Everything a run has found. `report/` turns it into files and figures.
+
+    Parameters
+    ----------
+    effects, candidates, unexplained, next_pose
+        As in report.json ("dlo-report/1"), ready to be written.
+    fit : Fit
+        The last stage's fit, from which parameters.yaml is written.
+    diagnosis : object or None
+        The diagnosis's own result, for figures.
+    """
+
+    config: Config
+    poses: tuple[PoseInput, ...]
+    measurement: MeasurementSummary
+    stages: tuple[Stage, ...]
+    discretization: Discretization
+    timing: dict[str, float]
+    fit: Fit
+    verdict: Verdict = "complete"
+    warnings: tuple[str, ...] = ()
+    effects: tuple[dict[str, Any], ...] = ()
+    candidates: tuple[dict[str, Any], ...] = ()
+    unexplained: dict[str, Any] | None = None
+    next_pose: dict[str, Any] | None = None
+    diagnosis: Any = None
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def stage(self, name: StageName) -> Stage | None:
+        """Return the stage of that name, or None."""
+        return next((stage for stage in self.stages if stage.name == name), None)
