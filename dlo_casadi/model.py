@@ -347,6 +347,11 @@ class CableModel:
         return ca.Function("kkt", self._arguments, [self._stationarity, ca.densify(matrix)])
 
     @cached_property
+    def balance(self) -> ca.Function:
+        """Same arguments -> stationarity (N,) only."""
+        return ca.Function("balance", self._arguments, [self._stationarity])
+
+    @cached_property
     def sensitivity(self) -> ca.Function:
         """Same arguments -> derivatives of the stationarity by p, rest and deviation."""
         blocks = [

@@ -124,8 +124,14 @@ class PoseInput:
         Maps board metres (M, 2) to the photograph's pixels.
     problem : str
         Why the pose could not be read, if so.
+    center : (float, float), optional [m]
+        Middle of the photograph in the board frame.
+    weight : (K,), optional
+        Relative standard deviations of the points.
     coverage, confidence : float, optional
         Share of the cable that was seen; 0 to 1.
+    messages : tuple of str
+        What the camera step noticed.
     """
 
     name: str
@@ -135,8 +141,11 @@ class PoseInput:
     pixels: FloatArray | None = None
     to_pixels: Any = None
     problem: str = ""
+    center: tuple[float, float] | None = None
+    weight: FloatArray | None = None
     coverage: float | None = None
     confidence: float | None = None
+    messages: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,8 @@ SMOOTH_MODES = 4
 FIRST_STD = 3e-4
 ROUGHNESS_START = 0.3
 ROUGHNESS_FLOOR = 1e-3
+# Smallest scatter of the poses' ends, as a share of the tolerance.
+SCATTER_FLOOR = 0.05
 
 
 @dataclass(frozen=True)
@@ -174,9 +176,10 @@ def starting_points(
 def refine(
     problem: BatchProblem, point: Point, *, estimate: bool, rounds: int = 3
 ) -> tuple[BatchProblem, Point, bool]:
-    """Alternate between the fit, the roughness of the rest curvature and the noise.
+    """Alternate between the fit, the noise, the roughness of the rest curvature and the scatter.
 
-    The roughness maximises the marginal likelihood (MacKay's fixed point).
+    Roughness and scatter (how much the poses' ends differ from one another, within the
+    tolerances) maximise the marginal likelihood (MacKay's fixed point).
 
     References
     ----------
@@ -189,9 +192,13 @@ def refine(
         if estimate and round_ < 2:
             noise = noise_of(problem, point, lin)
         roughness = roughness_of(problem, point, lin)
-        moved = abs(np.log(roughness / problem.roughness_std))
+        scatter = scatter_of(problem, point, lin)
+        moved = max(
+            abs(np.log(roughness / problem.roughness_std)),
+            float(np.abs(np.log(scatter / problem.scatter)).max()),
+        )
         changed = abs(np.log(noise.std / problem.noise.std))
-        problem = problem.with_noise(noise, roughness)
+        problem = problem.changed(noise, roughness, scatter)
         problem.refresh(point.feet)
         point = problem.evaluate(point.theta, point.shapes, point.feet)
         point, converged = problem.descend(point)
@@ -238,6 +245,32 @@ def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> flo
     return float(max(np.sqrt(energy / max(well_determined, 1e-2)), ROUGHNESS_FLOOR))
 
 
+def scatter_of(problem: BatchProblem, point: Point, lin: Linearization) -> FloatArray:
+    """One fixed-point update of the scatter of ends and headings, never above the tolerance."""
+    columns = problem.sweep.used_deviations
+    if not columns:
+        return problem.scatter
+    normal = problem.normal_equations(point, lin)
+    covariance = np.linalg.pinv(normal.hessian, hermitian=True)
+    variance = []
+    for block, cross, _ in normal.inner:
+        inverse = np.linalg.inv(block)
+        arm = inverse @ cross
+        variance.append(np.diag(inverse + arm @ covariance @ arm.T))
+    square = (point.shapes.deviation[np.ix_(problem.used, columns)] ** 2).sum(axis=0)
+    determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
+    scatter = problem.scatter.copy()
+    limits = problem.tolerances.deviation
+    # Both coordinates of an end share one scatter, and so do both headings.
+    for group in ((0, 1), (2, 3)):
+        members = [k for k, column in enumerate(columns) if column in group]
+        if members:
+            found = np.sqrt(square[members].sum() / max(determined[members].sum(), 1e-3))
+            for column in group:
+                scatter[column] = np.clip(found, SCATTER_FLOOR * limits[column], limits[column])
+    return scatter
+
+
 def fit_model(
     model: CableModel,
     measured: Sequence[MeasuredPose],
@@ -245,6 +278,7 @@ def fit_model(
     std: float | None = None,
     *,
     free: Sequence[str] | None = None,
+    values: FloatArray | None = None,
     start: Fit | None = None,
     decades: Sequence[int] = DECADES,
 ) -> Fit:
@@ -260,6 +294,8 @@ def fit_model(
         Declared noise of one coordinate; estimated, with its correlation, when absent.
     free : sequence of str, optional
         Names of the parameters to estimate; all by default.
+    values : (n_parameters,), optional
+        Where the parameters start, or stay if they are not estimated; nominal by default.
     start : Fit, optional
         A fit of a similar model on the same mesh to start from; its noise is kept.
     decades : sequence of int
@@ -276,12 +312,14 @@ def fit_model(
             "  Try: role: fit for at least one pose."
         )
     chosen = np.array([free is None or name in free for name in model.names])
-    unknowns = Unknowns(model, chosen, model.nominal)
+    begin = model.nominal if values is None else values
+    unknowns = Unknowns(model, chosen, begin)
     if start is not None:
         return _continue(unknowns, measured, tolerances, start)
     noise = NoiseModel(std or FIRST_STD, declared=std is not None)
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START)
-    points = starting_points(problem, problem.mean, decades)
+    theta = unknowns.pack(begin, np.zeros(model.rest.n_coefficients))
+    points = starting_points(problem, theta, decades)
     if not points:
         raise EstimationError(
             f"no stiffness within {max(decades)} decades of {model.cable.bending_stiffness:.3g} "

@@ -112,6 +112,8 @@ class BatchProblem:
     tolerances : Tolerances
     roughness_std : float
         Prior of the rest curvature, see `Unknowns.prior_precision`.
+    scatter : (4,), optional
+        Standard deviations of a pose's own deviations; the tolerances by default.
     sweep : Sweep, optional
         Reused when only noise or priors have changed.
     """
@@ -123,6 +125,7 @@ class BatchProblem:
         noise: NoiseModel,
         tolerances: Tolerances,
         roughness_std: float = 1.0,
+        scatter: FloatArray | None = None,
         sweep: Sweep | None = None,
     ) -> None:
         self.unknowns = unknowns
@@ -136,7 +139,8 @@ class BatchProblem:
         ]
         self.precision = unknowns.prior_precision(roughness_std)
         self.mean = unknowns.prior_mean()
-        self.deviation_std = tolerances.deviation[self.sweep.used_deviations]
+        self.scatter = tolerances.deviation if scatter is None else scatter
+        self.deviation_std = self.scatter[self.sweep.used_deviations]
         self._whitening: dict[int, FloatArray] = {}
 
     @property
@@ -151,7 +155,8 @@ class BatchProblem:
         z = self.sweep.shapes_seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
         return [NodeCurve.of(self.unknowns.model.chain, row) for row in z]
 
-    def _white(self, j: int, feet: FloatArray) -> FloatArray:
+    def whitening(self, j: int, feet: FloatArray) -> FloatArray:
+        """Whitening matrix (K_j, K_j) of pose j [1/m], computed for the feet at `refresh`."""
         if j not in self._whitening:
             self._whitening[j] = self.noise.whitening(feet, self.measured[j].relative_std)
         return self._whitening[j]
@@ -160,7 +165,7 @@ class BatchProblem:
         """Recompute the noise metric for points whose feet have moved."""
         self._whitening = {}
         for j, s in zip(self.used, feet, strict=True):
-            self._white(j, s)
+            self.whitening(j, s)
 
     def raw_residuals(
         self, curves: list[NodeCurve], feet: list[FloatArray]
@@ -178,7 +183,9 @@ class BatchProblem:
     def evaluate(self, theta: FloatArray, shapes: Shapes, feet: list[FloatArray]) -> Point:
         """Objective at given unknowns and equilibria."""
         distances, moved = self.raw_residuals(self.curves(theta, shapes), feet)
-        white = [self._white(j, s) @ d for j, s, d in zip(self.used, moved, distances, strict=True)]
+        white = [
+            self.whitening(j, s) @ d for j, s, d in zip(self.used, moved, distances, strict=True)
+        ]
         data = float(sum(row @ row for row in white))
         gap = theta - self.mean
         used = shapes.deviation[np.ix_(self.used, self.sweep.used_deviations)]
@@ -209,7 +216,7 @@ class BatchProblem:
             curve = NodeCurve.of(self.unknowns.model.chain, z[j])
             normals = curve.normals(s)
             rows = normal_rows(curve, s, normals)
-            white = self._white(j, s)
+            white = self.whitening(j, s)
             d = ((self.measured[j].points - curve.at(s)) * normals).sum(axis=1)
             theta_z = by_x[j] @ sens.theta[j] + by_p[j] @ slopes
             deviation_z = (by_x[j] @ sens.deviation[j] + by_dev[j])[:, columns]
@@ -323,10 +330,18 @@ class BatchProblem:
             return None
         return self.evaluate(theta, shapes, point.feet)
 
-    def with_noise(self, noise: NoiseModel, roughness_std: float) -> BatchProblem:
-        """Return the same problem with another noise or roughness."""
+    def changed(
+        self, noise: NoiseModel, roughness_std: float, scatter: FloatArray | None = None
+    ) -> BatchProblem:
+        """Return the same problem with another noise, roughness or scatter of the ends."""
         return BatchProblem(
-            self.unknowns, self.measured, noise, self.tolerances, roughness_std, self.sweep
+            self.unknowns,
+            self.measured,
+            noise,
+            self.tolerances,
+            roughness_std,
+            self.scatter if scatter is None else scatter,
+            self.sweep,
         )
 
 

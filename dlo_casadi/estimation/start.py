@@ -202,6 +202,6 @@ def _predicted(
         rows = normal_rows(curve, s, normals)
         d = ((problem.measured[j].points - curve.at(s)) * normals).sum(axis=1)
         d = d - rows @ (by_x[j] @ correction[j])
-        white = problem._white(j, s)
+        white = problem.whitening(j, s)
         out.append((white @ d, -white @ (rows @ (by_x[j] @ by_theta[j] + by_p[j] @ slopes))))
     return out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,8 +75,9 @@ class Unknowns:
         for i in self._used:
             q = self.model.parameters[i]
             parts.append(np.log(p[i]) if q.log else p[i] / q.scale)
-        rest = coefficients / self.model.cable.curvature_scale if self.rest_free else []
-        return np.concatenate([np.array(parts), rest])
+        if self.rest_free:
+            parts += list(coefficients / self.model.cable.curvature_scale)
+        return np.array(parts)
 
     def p(self, theta: FloatArray) -> FloatArray:
         """Parameter vector of the model (SI)."""
@@ -103,9 +105,21 @@ class Unknowns:
         """Rest curvature of the bending cells before the first pose [1/m]."""
         return self.model.rest_basis @ self.coefficients(theta)
 
+    def symbolic_p(self, theta: ca.SX) -> ca.SX:
+        """Parameter vector of the model as an expression of theta."""
+        p = ca.SX(ca.DM(self.fixed))
+        for k, i in enumerate(self._used):
+            q = self.model.parameters[i]
+            p[i] = ca.exp(theta[k]) if q.log else theta[k] * q.scale
+        return p
+
+    def symbolic_rest(self, theta: ca.SX) -> ca.SX:
+        """Rest curvature before the first pose as an expression of theta."""
+        return ca.DM(self.rest_slopes) @ theta
+
     @property
     def rest_slopes(self) -> FloatArray:
-        """d rest / d theta (n_cells, size)."""
+        """Derivative of the rest curvature by theta (n_cells, size)."""
         out = np.zeros((self.model.chain.n_cells, self.size))
         if self.rest_free:
             out[:, self.n_parameters :] = self.model.rest_basis * self.model.cable.curvature_scale

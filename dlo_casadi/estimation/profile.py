@@ -1,0 +1,132 @@
+"""Profile-likelihood interval of one parameter: everything else is refitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
+from dlo_casadi.estimation.unknowns import Unknowns
+
+# 95 % of a standard normal lies within this many standard deviations.
+NORMAL_95 = 1.959964
+# Where a declared noise is taken as white, the lines are still not trusted to be free of a
+# smooth error of this share of it, which no number of points averages out. It is counted on top
+# of the statistical error. An estimated correlation contains such errors already.
+SYSTEMATIC_SHARE = 0.05
+# Search for the interval's ends within this factor of the estimate, in steps growing by two.
+LARGEST_LOG_STEP = float(np.log(1e4))
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A 95 % interval [SI]; None = unbounded within four decades."""
+
+    low: float | None
+    high: float | None
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether it is bounded and spans no more than a factor of ten."""
+        return self.low is not None and self.high is not None and self.high <= 10 * self.low
+
+
+def threshold(fit: Fit) -> float:
+    """Rise of twice the objective at the ends of the interval.
+
+    (1.96 + b)^2 times the excess of the residual over the noise, where b, for a declared noise, is
+    the length in its metric of a systematic error of SYSTEMATIC_SHARE of it in all points.
+    """
+    square = 0.0
+    for j, feet in zip(fit.problem.used, fit.point.feet, strict=True):
+        if not fit.noise.declared:
+            break
+        weight = fit.problem.measured[j].relative_std
+        constant = SYSTEMATIC_SHARE * fit.noise.std * weight
+        square += float(((fit.problem.whitening(j, feet) @ constant) ** 2).sum())
+    return (NORMAL_95 + np.sqrt(square)) ** 2 * fit.inflation**2
+
+
+def stiffness_interval(fit: Fit) -> Interval:
+    """Profile-likelihood interval of the bending stiffness [N m^2].
+
+    The stiffness is held, everything else refitted; the prior of the stiffness itself does not
+    count.
+    """
+    model = fit.model
+    log_ei = float(np.log(fit.p[0]))
+    k = fit.problem.unknowns.names.index("bending_stiffness")
+    log_std = float(np.sqrt(fit.covariance[k, k])) * fit.inflation
+    limit = threshold(fit)
+    others = np.array([name != "bending_stiffness" for name in model.names])
+    others &= fit.problem.unknowns.free
+    gap = fit.point.theta[k] - fit.problem.mean[k]
+    base = 2 * fit.point.objective - fit.problem.precision[k, k] * gap**2
+    keep = np.arange(fit.problem.unknowns.size) != k
+
+    def held(log_value: float, near: Point) -> tuple[Point, float] | None:
+        p = fit.p.copy()
+        p[0] = np.exp(log_value)
+        unknowns = Unknowns(model, others, p, fit.problem.unknowns.rest_free)
+        problem = BatchProblem(
+            unknowns,
+            fit.problem.measured,
+            fit.noise,
+            fit.problem.tolerances,
+            fit.problem.roughness_std,
+            fit.problem.scatter,
+            fit.problem.sweep,
+        )
+        problem.refresh(near.feet)
+        theta = near.theta
+        shapes, ok = problem.sweep.solve(near.shapes, unknowns.p(theta), unknowns.rest(theta))
+        if not ok:
+            return None
+        point, _ = problem.descend(problem.evaluate(theta, shapes, near.feet), tolerance=1e-2)
+        return point, 2 * point.objective - base - limit
+
+    def end(direction: int) -> float | None:
+        near = replace(fit.point, theta=fit.point.theta[keep])
+        low, f_low = 0.0, -limit
+        step = min(max(np.sqrt(limit) * log_std, 1e-4), 0.7)
+        while low < LARGEST_LOG_STEP:
+            tried = held(log_ei + direction * (low + step), near)
+            if tried is None:
+                step /= 4
+                if step < 1e-3:
+                    break
+                continue
+            point, value = tried
+            if value > 0:
+                return _crossing(held, log_ei, direction, (low, f_low), (low + step, value), near)
+            near, low, f_low = point, low + step, value
+            step *= 2
+        return None
+
+    ends = [end(-1), end(1)]
+    low, high = (None if e is None else float(np.exp(e)) for e in ends)
+    return Interval(low, high)
+
+
+def _crossing(held, log_ei, direction, below, above, near) -> float:  # type: ignore[no-untyped-def]
+    """Place where the profile crosses the threshold, by two secant steps on its root."""
+    (a, f_a), (b, f_b) = below, above
+    for _ in range(2):
+        # The profile is close to a parabola: its square root is close to linear.
+        base = f_a - 1e-12 if a == 0 else None
+        if base is not None:
+            guess = b * np.sqrt(-f_a / (f_b - f_a))
+        else:
+            guess = a + (b - a) * (-f_a) / (f_b - f_a)
+        tried = held(log_ei + direction * guess, near)
+        if tried is None:
+            break
+        if tried[1] > 0:
+            b, f_b = guess, tried[1]
+        else:
+            a, f_a = guess, tried[1]
+        if abs(tried[1]) < 0.05 * abs(f_a - f_b) or b - a < 1e-3:
+            return float(log_ei + direction * guess)
+    return float(log_ei + direction * (a + (b - a) * (-f_a) / (f_b - f_a)))

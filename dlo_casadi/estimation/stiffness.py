@@ -1,0 +1,105 @@
+"""Stiffness alone: the cable straight at rest, nothing else estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.sweep import Shapes, Sweep
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.float64]
+
+# Steps per decade of the first search, over three decades to both sides of the prior.
+_PER_DECADE = 3
+
+
+@dataclass(frozen=True)
+class StiffnessFit:
+    """Bending stiffness EI [N m^2] that predicts the fit poses best, and its log's std."""
+
+    EI: float
+    log_std: float
+    rms: float
+
+
+def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> StiffnessFit:
+    """Least squares of the distances of all fit points over EI, the cable straight at rest.
+
+    The equilibria are followed from the prior stiffness along the decades, so that each is on
+    the branch that prediction would choose there.
+    """
+    used = [item for item in measured if item.readable and not item.held_out]
+    sweep = Sweep(model, [item.pose for item in used])
+    rest = np.zeros(model.chain.n_cells)
+    n_points = sum(len(item.points) for item in used)
+
+    def at(log_ei: float) -> FloatArray:
+        p = model.nominal.copy()
+        p[0] = np.exp(log_ei)
+        return p
+
+    def follow(shapes: Shapes, log_ei: float) -> tuple[Shapes, float]:
+        moved, ok = sweep.solve(shapes, at(log_ei), rest)
+        if not ok or not sweep.stable(moved, at(log_ei), rest).all():
+            cold = _cold(model, at(log_ei), rest, used)
+            if cold is None:
+                return shapes, np.inf
+            moved = cold
+        z = sweep.shapes_seen(moved, at(log_ei), rest)
+        total = sum(
+            float((NodeCurve.of(model.chain, row).distances(item.points) ** 2).sum())
+            for row, item in zip(z, used, strict=True)
+        )
+        return moved, total
+
+    prior = float(np.log(model.cable.bending_stiffness))
+    grid: dict[float, tuple[Shapes, float]] = {}
+    first = _cold(model, at(prior), rest, used)
+    if first is None:
+        first = Shapes(
+            np.zeros((len(used), model.chain.n_headings)),
+            np.zeros((len(used), model.n_conditions)),
+            np.zeros((len(used), 4)),
+        )
+    step = np.log(10) / _PER_DECADE
+    for direction in (1, -1):
+        shapes = first
+        for k in range(3 * _PER_DECADE + 1):
+            log_ei = prior + direction * k * step
+            shapes, total = follow(shapes, log_ei)
+            grid[log_ei] = (shapes, total)
+    best = min(grid, key=lambda q: grid[q][1])
+
+    def cost(log_ei: float) -> float:
+        return follow(grid[best][0], log_ei)[1]
+
+    found = minimize_scalar(
+        cost, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-3}
+    )
+    log_ei, total = float(found.x), float(found.fun)
+    width = 0.02
+    bend = (cost(log_ei + width) - 2 * total + cost(log_ei - width)) / width**2
+    variance = total / max(n_points - 1, 1)
+    log_std = float(np.sqrt(2 * variance / bend)) if bend > 0 else float("inf")
+    return StiffnessFit(float(np.exp(log_ei)), log_std, float(np.sqrt(total / n_points)))
+
+
+def _cold(
+    model: CableModel, p: FloatArray, rest: FloatArray, used: Sequence[MeasuredPose]
+) -> Shapes | None:
+    """Stable equilibria of lowest energy, or None if one is missing."""
+    predictions = predict_poses(model, p, rest, [item.pose for item in used])
+    phi, lam = [], []
+    for prediction in predictions:
+        if prediction is None:
+            return None
+        phi.append(prediction.equilibrium.phi)
+        lam.append(prediction.equilibrium.multipliers)
+    return Shapes(np.array(phi), np.array(lam), np.zeros((len(used), 4)))

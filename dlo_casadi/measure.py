@@ -1,0 +1,130 @@
+"""Read what a configuration names: photographs or centre-lines, one pose at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from dlo_casadi import vision
+from dlo_casadi.config import Config
+from dlo_casadi.config import Pose as DeclaredPose
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.measurements import read_centerline
+from dlo_casadi.outcome import PoseInput
+
+# Points kept of one centre-line; more only repeat their neighbours' noise.
+MOST_POINTS = 240
+
+
+def read_poses(
+    config: Config, step: Callable[[str, int, int], None]
+) -> tuple[tuple[PoseInput, ...], tuple[MeasuredPose, ...]]:
+    """Read all poses in the order in which they were taken.
+
+    A pose that cannot be read keeps its end conditions, for the history, and says why.
+
+    Parameters
+    ----------
+    step : callable
+        Called with the pose's file name, how many are done and how many there are.
+
+    Raises
+    ------
+    MeasurementError
+        If no fit pose can be read; its text lists the reasons.
+    """
+    skipped = {item.name: item.reason for item in config.skipped}
+    poses = config.experiment.poses
+    inputs = []
+    for k, pose in enumerate(poses):
+        step(pose.file.name, k, len(poses))
+        try:
+            if pose.name in skipped:
+                raise MeasurementError(skipped[pose.name])
+            item = _read_image(config, pose) if _is_photograph(config) else _read_csv(pose)
+        except MeasurementError as error:
+            item = PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=error.message)
+        inputs.append(item)
+    step("", len(poses), len(poses))
+    if not any(len(item.points) and item.role == "fit" for item in inputs):
+        reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
+        raise MeasurementError(f"no fit pose could be read:\n{reasons}")
+    measured = tuple(
+        MeasuredPose(conditions(pose), item.points, item.weight, pose.role == "held_out")
+        for pose, item in zip(poses, inputs, strict=True)
+    )
+    return tuple(inputs), measured
+
+
+def conditions(pose: DeclaredPose) -> Pose:
+    """End conditions of a configured pose."""
+    return Pose(
+        start=tuple(pose.start),
+        end=None if pose.end is None else tuple(pose.end),
+        start_heading=pose.start_heading,
+        end_heading=pose.end_heading,
+        branch=pose.branch,
+        name=pose.name,
+    )
+
+
+def _is_photograph(config: Config) -> bool:
+    return config.experiment.measurement.kind == "images"
+
+
+def _read_csv(pose: DeclaredPose) -> PoseInput:
+    points = read_centerline(pose.file, pose.start, pose.end)
+    step = max(1, -(-len(points) // MOST_POINTS))
+    return PoseInput(pose.name, pose.role, points[::step])
+
+
+def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
+    image = vision.read_image(pose.file)
+    view = view_of(config, image)
+    line = vision.extract_centerline(
+        image,
+        view,
+        start=pose.start,
+        end=pose.end,
+        diameter=config.cable.diameter,
+        length=config.cable.length,
+    )
+    kept = slice(None, None, max(1, -(-len(line.points) // MOST_POINTS)))
+    return PoseInput(
+        pose.name,
+        pose.role,
+        line.points[kept],
+        image=pose.file,
+        pixels=line.pixels[kept],
+        to_pixels=view.to_pixels,
+        center=tuple(view.to_board([[image.shape[1] / 2, image.shape[0] / 2]])[0]),
+        weight=(line.std / np.median(line.std))[kept],
+        coverage=line.coverage,
+        confidence=line.confidence,
+        messages=line.messages,
+    )
+
+
+def view_of(config: Config, image: np.ndarray) -> vision.View:
+    """Where the photograph's pixels lie on the cable's plane."""
+    measurement = config.experiment.measurement
+    assert measurement.kind == "images"
+    if measurement.reference is not None:
+        reference = vision.Reference(
+            np.array(measurement.reference.pixels), np.array(measurement.reference.points)
+        )
+        return vision.from_reference(reference, image.shape)
+    assert measurement.board is not None
+    declared = measurement.board
+    board = vision.Board(
+        declared.dictionary, declared.marker_size, declared.standoff, declared.marker_centers
+    )
+    camera = None
+    if measurement.camera is not None:
+        camera = vision.Camera(
+            np.array(measurement.camera.matrix), np.array(measurement.camera.distortion)
+        )
+    return vision.locate_board(image, board, camera)

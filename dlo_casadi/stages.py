@@ -1,0 +1,213 @@
+"""Stages of a fit as results: parameters, predictions and errors of each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.equilibrium import Equilibrium
+from dlo_casadi.estimation.algorithm1 import Algorithm1Result
+from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.prediction import Prediction, predict_poses, rms_distance
+from dlo_casadi.estimation.profile import Interval
+from dlo_casadi.estimation.stiffness import StiffnessFit
+from dlo_casadi.model import CableModel
+from dlo_casadi.outcome import (
+    ParameterEstimate,
+    PoseShape,
+    RestCurvatureEstimate,
+    Stage,
+    StageName,
+)
+
+FloatArray = NDArray[np.float64]
+
+_CURVE_POINTS = 201
+_REST_POINTS = 41
+
+
+def pose_shape(prediction: Prediction, item: MeasuredPose, std: float) -> PoseShape:
+    """One predicted pose beside its measured points."""
+    curve = prediction.curve
+    places = np.linspace(0.0, curve.length, _CURVE_POINTS)
+    eq: Equilibrium = prediction.equilibrium
+    if not item.readable:
+        empty = np.zeros(0)
+        return PoseShape(curve.at(places), None, empty, empty, eq.energy, eq.stable)
+    s = curve.nearest(item.points)
+    gap = item.points - curve.at(s)
+    residual = (gap * curve.normals(s)).sum(axis=1) / std
+    rmse = float(np.sqrt((gap**2).sum(axis=1).mean()))
+    return PoseShape(curve.at(places), rmse, s, residual, eq.energy, eq.stable)
+
+
+def _stage(
+    name: StageName,
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    measured: Sequence[MeasuredPose],
+    std: float,
+    parameters: dict[str, ParameterEstimate],
+    rest_curvature: RestCurvatureEstimate,
+    chi2_per_dof: float | None,
+    note: str = "",
+) -> Stage:
+    predictions = predict_poses(model, p, rest, [item.pose for item in measured])
+    shapes = {
+        item.pose.name: pose_shape(prediction, item, std)
+        for prediction, item in zip(predictions, measured, strict=True)
+        if prediction is not None
+    }
+    lost = [
+        item.pose.name
+        for prediction, item in zip(predictions, measured, strict=True)
+        if prediction is None
+    ]
+    if lost:
+        note = (note + f" No equilibrium for {', '.join(lost)}.").strip()
+    return Stage(
+        name,
+        rms_distance(predictions, measured, held_out=False),
+        rms_distance(predictions, measured, held_out=True),
+        chi2_per_dof,
+        parameters,
+        rest_curvature,
+        shapes,
+        note,
+    )
+
+
+def _no_rest(length: float) -> RestCurvatureEstimate:
+    s = np.linspace(0.0, length, _REST_POINTS)
+    return RestCurvatureEstimate(s, np.zeros_like(s), np.zeros_like(s))
+
+
+def initial_stage(model: CableModel, measured: Sequence[MeasuredPose], std: float) -> Stage:
+    """Prior stiffness, straight at rest: the paper's alpha^0."""
+    stiffness = ParameterEstimate(float(model.nominal[0]), 0.0, "N m^2")
+    rest = np.zeros(model.chain.n_cells)
+    return _stage(
+        "initial",
+        model,
+        model.nominal,
+        rest,
+        measured,
+        std,
+        {"bending_stiffness": stiffness},
+        _no_rest(model.cable.length),
+        None,
+    )
+
+
+def stiffness_stage(
+    model: CableModel, measured: Sequence[MeasuredPose], std: float, found: StiffnessFit
+) -> Stage:
+    """Stiffness fitted, straight at rest."""
+    p = model.nominal.copy()
+    p[0] = found.EI
+    known = found.log_std < np.log(10.0) / 3.92
+    interval = tuple(
+        float(found.EI * np.exp(sign * 1.96 * found.log_std)) if known else None for sign in (-1, 1)
+    )
+    spread = found.EI * min(found.log_std, 1e3)
+    stiffness = ParameterEstimate(
+        found.EI, spread, "N m^2", (interval[0], interval[1]), bool(known)
+    )
+    return _stage(
+        "stiffness_only",
+        model,
+        p,
+        np.zeros(model.chain.n_cells),
+        measured,
+        std,
+        {"bending_stiffness": stiffness},
+        _no_rest(model.cable.length),
+        None,
+    )
+
+
+def algorithm1_stage(
+    result: Algorithm1Result | None,
+    measured: Sequence[MeasuredPose],
+    std: float,
+    length: float,
+    note: str = "",
+) -> Stage:
+    """The paper's loop; empty where it cannot apply."""
+    if result is None:
+        return Stage("algorithm1", None, None, None, {}, _no_rest(length), {}, note)
+    h = length / (len(result.theta_0) + 1)
+    s = (np.arange(len(result.theta_0)) + 1) * h
+    value = np.asarray(result.theta_0) / h
+    return _stage(
+        "algorithm1",
+        result.model,
+        result.p,
+        result.rest,
+        measured,
+        std,
+        {"bending_stiffness": ParameterEstimate(result.EI, 0.0, "N m^2")},
+        RestCurvatureEstimate(s, value, np.zeros_like(s)),
+        None,
+        result.message,
+    )
+
+
+def fit_stage(
+    name: StageName,
+    fit: Fit,
+    measured: Sequence[MeasuredPose],
+    interval: Interval,
+    reported: Sequence[str] = (),
+) -> Stage:
+    """A fit of the batch problem.
+
+    Parameters
+    ----------
+    reported : sequence of str
+        Qualified names of the parameters that are effects, not nuisances.
+    """
+    model = fit.model
+    stiffness = ParameterEstimate(
+        float(fit.p[0]),
+        fit.std("bending_stiffness"),
+        "N m^2",
+        (interval.low, interval.high),
+        interval.identifiable,
+    )
+    parameters = {"bending_stiffness": stiffness}
+    for qualified in reported:
+        q = model.parameters[model.names.index(qualified)]
+        value = fit.value(qualified)
+        at_bound = min(value - q.lower, q.upper - value) < 1e-9 * q.scale
+        parameters[qualified] = ParameterEstimate(
+            value, fit.std(qualified), q.unit, at_bound=at_bound
+        )
+    return _stage(
+        name,
+        model,
+        fit.p,
+        fit.rest,
+        measured,
+        fit.noise.std,
+        parameters,
+        rest_curvature_of(fit),
+        fit.chi2_per_dof,
+    )
+
+
+def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
+    """Rest curvature along the cable with its standard deviation."""
+    model, unknowns = fit.model, fit.problem.unknowns
+    s = np.linspace(0.0, model.cable.length, _REST_POINTS)
+    if unknowns.n_rest == 0:
+        return _no_rest(model.cable.length)
+    basis = model.rest.basis(s)
+    tail = slice(unknowns.n_parameters, unknowns.size)
+    scaled = basis * model.cable.curvature_scale * fit.inflation
+    variance = np.einsum("ik,kl,il->i", scaled, fit.covariance[tail, tail], scaled)
+    return RestCurvatureEstimate(s, basis @ fit.coefficients, np.sqrt(np.maximum(variance, 0)))
