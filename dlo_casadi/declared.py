@@ -23,8 +23,8 @@ from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.model import CableModel
 
-# Elements of the first mesh; refined from the data.
-FIRST_MESH = 40
+# Elements of the declared model's mesh; refined from the data.
+MESH = 40
 REST_COEFFICIENTS = 13
 
 
@@ -117,7 +117,7 @@ def declared_model(config: Config, center: tuple[float, float] | None = None) ->
     coefficients = config.estimation.rest_curvature_coefficients or REST_COEFFICIENTS
     model = CableModel(
         cable=cable,
-        n=options.n or FIRST_MESH,
+        n=options.n or MESH,
         element=options.element,
         start=experiment.boundary.start,
         end=experiment.boundary.end,

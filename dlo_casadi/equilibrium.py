@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, clamped_headings
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.float64]
 Branch = Literal["ccw", "cw"]
@@ -280,7 +280,7 @@ def _from_start(
     chain = model.chain
     solver = _solver(id(model), _Held(model))
     ends = pose.vector
-    deviation = np.zeros(4)
+    deviation = np.zeros(len(DEVIATIONS))
     n_bends = chain.n_headings - 1
     x0 = np.concatenate([phi, np.zeros(chain.n if model.extensible else 0)])
     bounds = np.concatenate([np.zeros(model.n_conditions), np.full(n_bends, JOINT_BOUND)])

@@ -41,8 +41,9 @@ FloatArray = NDArray[np.float64]
 
 # ln(1000): a prior of the stiffness may be off by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
-# Where the ends of a pose may deviate from what is declared, in the order of `deviation`.
-DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading")
+# What may be different in every pose, in the order of `deviation`: where the ends deviate from
+# what is declared [m, rad], and a force of unknown cause [N].
+DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading", "pull_x", "pull_y")
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,8 @@ class CableModel:
                     parameter.name: self._p[self.names.index(f"{effect.label}.{parameter.name}")]
                     for parameter in effect.parameters(self.cable)
                 }
+                for name in effect.per_pose:
+                    local[name] = self._deviation[DEVIATIONS.index(name)]
                 picked.append((effect, local))
         return picked
 
@@ -220,6 +223,7 @@ class CableModel:
         used = [] if self.end == "free" else ["end_x", "end_y"]
         used += ["start_heading"] if self.start == "clamped" else []
         used += ["end_heading"] if self.end == "clamped" else []
+        used += [name for effect in self.effects for name in effect.per_pose]
         return tuple(used)
 
     # ---- mechanics ---------------------------------------------------------------------------
@@ -344,7 +348,9 @@ class CableModel:
         """(phi, lam, p, rest, ends, deviation) -> stationarity (N,), its Jacobian (N, N)."""
         unknowns = ca.vertcat(self._phi, self._lam)
         matrix = ca.jacobian(self._stationarity, unknowns)
-        return ca.Function("kkt", self._arguments, [self._stationarity, ca.densify(matrix)])
+        return ca.Function(
+            "kkt", self._arguments, [ca.densify(self._stationarity), ca.densify(matrix)]
+        )
 
     @cached_property
     def balance(self) -> ca.Function:
@@ -378,7 +384,7 @@ class CableModel:
             position, direction = move(nodes[i, :].T, slopes[i, :].T, self._p, self._ends)
             rows.append(ca.horzcat(position.T, direction.T))
         table = ca.vertcat(*rows)
-        return ca.vec(table if self.element == "arc" else table[:, :2])
+        return ca.densify(ca.vec(table if self.element == "arc" else table[:, :2]))
 
     @cached_property
     def observation(self) -> ca.Function:
@@ -422,7 +428,7 @@ class CableModel:
         blocks = [
             ca.densify(ca.jacobian(rest, symbol)) for symbol in (self._phi, self._rest, self._p)
         ]
-        return ca.Function("next_rest", self._arguments, [rest, *blocks])
+        return ca.Function("next_rest", self._arguments, [ca.densify(rest), *blocks])
 
     @cached_property
     def energy(self) -> ca.Function:

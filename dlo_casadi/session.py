@@ -13,10 +13,9 @@ import numpy as np
 
 from dlo_casadi.config import Config
 from dlo_casadi.declared import Declared, declared_model, straight
-from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.batch import solve_batch
-from dlo_casadi.estimation.fit import Fit, fit_model
+from dlo_casadi.estimation.fit import Fit, fit_model, refine_mesh
 from dlo_casadi.estimation.mesh import discretization_error
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import stiffness_interval
@@ -26,8 +25,10 @@ from dlo_casadi.model import CableModel
 from dlo_casadi.outcome import Discretization, MeasurementSummary, Outcome, PoseInput, Stage
 from dlo_casadi.stages import algorithm1_stage, fit_stage, initial_stage, stiffness_stage
 
+# The search over decades of stiffness runs on this mesh.
+FIRST_MESH = 20
 # The mesh is refined until its error is below this share of the noise.
-MESH_SHARE = 0.05
+MESH_SHARE = 0.1
 FINEST_MESH = 320
 # Huber's constant: points beyond it count with their distance instead of its square.
 HUBER = 1.5
@@ -138,26 +139,20 @@ def fit_declared(
     A mesh that is too coarse looks like a missing effect; it is refined first.
     """
     std = config.experiment.measurement.std
-    model = declared.model if n is None else declared.model.with_mesh(n)
+    finest = config.model.n or n
+    model = declared.model.with_mesh(min(finest or FIRST_MESH, FIRST_MESH))
     free = [name for name in model.names if name not in declared.fixed]
+    fit = fit_model(
+        model, measured, declared.tolerances, std, free=free, values=declared.start_values()
+    )
+    size = finest or 2 * FIRST_MESH
     while True:
-        fit = fit_model(
-            model,
-            measured,
-            declared.tolerances,
-            std,
-            free=free,
-            values=declared.start_values(),
-        )
-        try:
-            error = discretization_error(fit)
-        except EstimationError:
-            if model.n >= FINEST_MESH:
-                raise
-            error = np.inf
-        if config.model.n or error <= MESH_SHARE * fit.noise.std or model.n >= FINEST_MESH:
+        if size != fit.model.n:
+            fit = refine_mesh(fit, size, estimate=std is None)
+        error = discretization_error(fit)
+        if finest or error <= MESH_SHARE * fit.noise.std or size >= FINEST_MESH:
             return fit, error
-        model = model.with_mesh(2 * model.n)
+        size *= 2
 
 
 def before_stages(

@@ -26,6 +26,7 @@ from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
 from dlo_casadi.effects.side_load import SideLoad
 from dlo_casadi.effects.stiff_section import StiffSection
 from dlo_casadi.effects.stiffness_gradient import StiffnessGradient
+from dlo_casadi.effects.unknown_pull import UnknownPull
 
 EFFECTS: dict[str, type[Effect]] = {
     effect.name: effect
@@ -76,4 +77,5 @@ __all__ = [
     "StateEffect",
     "StiffSection",
     "StiffnessGradient",
+    "UnknownPull",
 ]

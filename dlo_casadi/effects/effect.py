@@ -81,6 +81,8 @@ class Effect:
 
     name: ClassVar[str]
     slot: ClassVar[str]
+    # Unknowns of each pose that the effect uses beside its parameters; see model.DEVIATIONS.
+    per_pose: ClassVar[tuple[str, ...]] = ()
 
     label: str = ""
 

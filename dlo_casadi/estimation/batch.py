@@ -28,6 +28,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import NodeCurve, normal_rows
 from dlo_casadi.estimation.sweep import Shapes
+from dlo_casadi.model import DEVIATIONS
 
 FloatArray = NDArray[np.float64]
 
@@ -129,7 +130,7 @@ class _BatchNlp:
         ends = ca.SX.sym("ends", 6)
         p = unknowns.symbolic_p(theta)
         phi, lam, dev, rest = self._split(own, n_dev)
-        deviation = ca.SX.zeros(4)
+        deviation = ca.SX.zeros(len(DEVIATIONS))
         for k, column in enumerate(self.columns):
             deviation[column] = dev[k] * problem.deviation_std[k]
         if not model.has_state:

@@ -29,7 +29,7 @@ FloatArray = NDArray[np.float64]
 # Decades about the prior stiffness from which fits are started.
 DECADES = (0, -1, 1, -2, 2, -3, 3)
 # Slow displacements per pose that are kept out of the noise estimate.
-SMOOTH_MODES = 4
+SMOOTH_MODES = 5
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
 ROUGHNESS_START = 0.3
@@ -195,7 +195,7 @@ def refine(
         scatter = scatter_of(problem, point, lin)
         moved = max(
             abs(np.log(roughness / problem.roughness_std)),
-            float(np.abs(np.log(scatter / problem.scatter)).max()),
+            float(np.abs(np.log(scatter[:4] / problem.scatter[:4])).max()),
         )
         changed = abs(np.log(noise.std / problem.noise.std))
         problem = problem.changed(noise, roughness, scatter)
@@ -350,15 +350,22 @@ def _continue(
 ) -> Fit:
     """Fit a similar model from the minimum of another one, with the noise found there."""
     model = unknowns.model
-    p = model.nominal.copy()
+    p = unknowns.fixed.copy()
     for i, name in enumerate(model.names):
         if name in start.model.names:
             p[i] = start.value(name)
     unknowns = replace(unknowns, fixed=p)
     theta = unknowns.pack(p, start.coefficients)
-    problem = BatchProblem(unknowns, measured, start.noise, tolerances, start.problem.roughness_std)
+    problem = BatchProblem(
+        unknowns,
+        measured,
+        start.noise,
+        tolerances,
+        start.problem.roughness_std,
+        start.problem.scatter,
+    )
     shapes, solved = problem.sweep.solve(
-        start.point.shapes, unknowns.p(theta), unknowns.rest(theta)
+        on_other_mesh(start.point.shapes, start.model, model), p, unknowns.rest(theta)
     )
     if not solved:
         raise EstimationError("the shapes of the first fit are no equilibria of the second model")
@@ -369,14 +376,29 @@ def _continue(
     return Fit(problem, point, converged)
 
 
+def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
+    """Headings interpolated from one model's mesh to another's."""
+    if model.chain == other.chain:
+        return shapes
+    coarse, fine = model.chain.heading_places, other.chain.heading_places
+    phi = np.array([np.interp(fine, coarse, row) for row in shapes.phi])
+    lam = shapes.lam
+    if lam.shape[1] != other.n_conditions:
+        lam = np.zeros((len(phi), other.n_conditions))
+    return Shapes(phi, lam, shapes.deviation)
+
+
+def refine_mesh(fit: Fit, n: int, *, estimate: bool) -> Fit:
+    """Fit the same model on another mesh, from a fit's minimum."""
+    problem = fit.problem
+    model = fit.model.with_mesh(n)
+    unknowns = replace(problem.unknowns, model=model)
+    moved = _continue(unknowns, problem.measured, problem.tolerances, fit)
+    problem, point, converged = refine(moved.problem, moved.point, estimate=estimate, rounds=2)
+    return Fit(problem, point, converged)
+
+
 def _feet_for(problem: BatchProblem, start: Fit) -> list[FloatArray]:
     """Feet of the problem's fitted poses, by the pose's place in the session."""
     known = dict(zip(start.problem.used, start.point.feet, strict=True))
     return [known[j] for j in problem.used]
-
-
-def refit(problem: BatchProblem, shapes: Shapes, theta: FloatArray, feet: list[FloatArray]) -> Fit:
-    """Minimise a problem from shapes that are equilibria at theta."""
-    problem.refresh(feet)
-    point, converged = problem.descend(problem.evaluate(theta, shapes, feet))
-    return Fit(problem, point, converged)

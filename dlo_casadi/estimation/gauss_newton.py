@@ -38,8 +38,8 @@ class Tolerances:
 
     @property
     def deviation(self) -> FloatArray:
-        """Standard deviations of a pose's deviations (4,) [m, m, rad, rad]."""
-        return np.array([self.end, self.end, self.heading, self.heading])
+        """Standard deviations of a pose's deviations, see `model.DEVIATIONS`; pulls are free."""
+        return np.array([self.end, self.end, self.heading, self.heading, np.inf, np.inf])
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class BatchProblem:
     tolerances : Tolerances
     roughness_std : float
         Prior of the rest curvature, see `Unknowns.prior_precision`.
-    scatter : (4,), optional
+    scatter : (len(DEVIATIONS),), optional
         Standard deviations of a pose's own deviations; the tolerances by default.
     sweep : Sweep, optional
         Reused when only noise or priors have changed.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.fit import Fit, on_other_mesh
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 
@@ -23,10 +23,8 @@ def on_mesh(fit: Fit, n: int) -> tuple[Sweep, Shapes, FloatArray, bool]:
     """
     model = fit.model.with_mesh(n)
     sweep = Sweep(model, [item.pose for item in fit.problem.measured])
-    coarse, fine = fit.model.chain.heading_places, model.chain.heading_places
-    phi = np.array([np.interp(fine, coarse, row) for row in fit.point.shapes.phi])
     rest = model.rest_basis @ fit.coefficients
-    shapes = Shapes(phi, fit.point.shapes.lam, fit.point.shapes.deviation)
+    shapes = on_other_mesh(fit.point.shapes, fit.model, model)
     solved, ok = sweep.solve(shapes, fit.p, rest)
     return sweep, solved, rest, ok
 

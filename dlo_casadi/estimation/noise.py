@@ -147,7 +147,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
 
 
 def estimate_noise(
-    samples: list[NoiseSample], cable_length: float, max_points: int = 100
+    samples: list[NoiseSample], cable_length: float, max_points: int = 80
 ) -> NoiseModel:
     """Estimate size and correlation of the noise from normal distances of all poses.
 
@@ -164,7 +164,7 @@ def estimate_noise(
     # A correlation that is there but weak must not be dropped: it makes smooth residuals
     # look significant. So the likelihood alone decides, without a price on the parameters.
     best, best_deviance = NoiseModel(white_std), white_deviance
-    low, high = np.log(0.002), np.log(0.25)
+    low, high = np.log(0.002), np.log(0.1)
     for kernel in ("exponential", "gaussian"):
 
         def unit(q: FloatArray, kernel: Kernel = kernel) -> NoiseModel:
@@ -180,7 +180,7 @@ def estimate_noise(
             deviance,
             simplex[0],
             method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.2, "maxfev": 60},
+            options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.2, "maxfev": 40},
         )
         if found.fun < best_deviance:
             best_deviance = float(found.fun)

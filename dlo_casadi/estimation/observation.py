@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,25 @@ class MeasuredPose:
         return len(self.points) > 0
 
 
+# Polynomial coefficients (powers of u, weights) of the interpolants' derivatives by u.
+_HERMITE = np.array(
+    [
+        [[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]],
+        [[0, 0, 1, 0], [-6, 6, -4, -2], [6, -6, 3, 3], [0, 0, 0, 0]],
+        [[-6, 6, -4, -2], [12, -12, 6, 6], [0, 0, 0, 0], [0, 0, 0, 0]],
+    ],
+    dtype=float,
+)
+_LINEAR = np.array(
+    [
+        [[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+        [[-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+        [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+    ],
+    dtype=float,
+)
+
+
 @dataclass(frozen=True)
 class NodeCurve:
     """A curve given by the model's observation vector z: nodes and, for arcs, slopes dr/ds.
@@ -68,44 +88,44 @@ class NodeCurve:
         """Number of elements."""
         return len(self.nodes) - 1
 
+    def _local(self, s: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """Element index (K,) and the fraction (K,) of its length at s [m]."""
+        u = s * (self.n / self.length)
+        e = np.minimum(u.astype(np.intp), self.n - 1)
+        return e, u - e
+
     def weights(self, s: FloatArray, derivative: int = 0) -> tuple[NDArray[np.intp], FloatArray]:
         """Element index (K,) and weights (K, 4) of [r_e, r_(e+1), h t_e, h t_(e+1)] at s [m]."""
+        e, u = self._local(s)
         h = self.length / self.n
-        e = np.clip((s / h).astype(int), 0, self.n - 1)
-        u = s / h - e
+        powers = u[:, None] ** np.arange(4)
+        table = (_HERMITE if self.slopes is not None else _LINEAR)[derivative]
+        return e, powers @ table / h**derivative
+
+    @cached_property
+    def _handles(self) -> FloatArray:
+        """Per element [r_e, r_(e+1), h t_e, h t_(e+1)] (n, 4, 2)."""
         if self.slopes is None:
-            zero = np.zeros_like(u)
-            rows = {
-                0: (1 - u, u, zero, zero),
-                1: (-1 + zero, 1 + zero, zero, zero),
-                2: (zero, zero, zero, zero),
-            }[derivative]
-        else:
-            rows = {
-                0: (
-                    2 * u**3 - 3 * u**2 + 1,
-                    -2 * u**3 + 3 * u**2,
-                    u**3 - 2 * u**2 + u,
-                    u**3 - u**2,
-                ),
-                1: (
-                    6 * u**2 - 6 * u,
-                    -6 * u**2 + 6 * u,
-                    3 * u**2 - 4 * u + 1,
-                    3 * u**2 - 2 * u,
-                ),
-                2: (12 * u - 6, -12 * u + 6, 6 * u - 4, 6 * u - 2),
-            }[derivative]
-        return e, np.stack(rows, axis=1) / h**derivative
+            zero = np.zeros((self.n, 2))
+            return np.stack([self.nodes[:-1], self.nodes[1:], zero, zero], axis=1)
+        slopes = self.slopes * (self.length / self.n)
+        return np.stack([self.nodes[:-1], self.nodes[1:], slopes[:-1], slopes[1:]], axis=1)
+
+    def frame(self, s: FloatArray, derivatives: int) -> list[FloatArray]:
+        """Position (K, 2) [m] and its first derivatives by s at arc lengths s."""
+        e, u = self._local(s)
+        powers = u[:, None] ** np.arange(4)
+        handles = self._handles[e]
+        scale = self.n / self.length
+        table = _HERMITE if self.slopes is not None else _LINEAR
+        return [
+            np.einsum("kw,kwd->kd", powers @ table[d], handles) * scale**d
+            for d in range(derivatives + 1)
+        ]
 
     def at(self, s: FloatArray, derivative: int = 0) -> FloatArray:
         """Positions (K, 2) [m] at arc lengths s, or derivatives by s."""
-        e, w = self.weights(s, derivative)
-        out = w[:, :1] * self.nodes[e] + w[:, 1:2] * self.nodes[e + 1]
-        if self.slopes is not None:
-            h = self.length / self.n
-            out += h * (w[:, 2:3] * self.slopes[e] + w[:, 3:4] * self.slopes[e + 1])
-        return out
+        return self.frame(s, derivative)[derivative]
 
     def feet(self, points: FloatArray, guess: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] of the points' feet, by Newton steps from a guess.
@@ -115,12 +135,13 @@ class NodeCurve:
         s = guess.copy()
         limit = 0.5 * self.length / self.n
         for _ in range(12):
-            gap = points - self.at(s)
-            t, bend = self.at(s, 1), self.at(s, 2)
-            curvature = np.maximum((t * t).sum(1) - (bend * gap).sum(1), 0.2 * (t * t).sum(1))
-            step = np.clip((t * gap).sum(1) / curvature, -limit, limit)
+            position, t, bend = self.frame(s, 2)
+            gap = points - position
+            square = (t * t).sum(axis=1)
+            curvature = np.maximum(square - (bend * gap).sum(axis=1), 0.2 * square)
+            step = np.clip((t * gap).sum(axis=1) / curvature, -limit, limit)
             new = np.clip(s + step, 0.0, self.length)
-            done = np.abs(new - s).max() < 1e-9 * self.length
+            done = np.abs(new - s).max() < 1e-8 * self.length
             s = new
             if done:
                 break

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium import Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def predict_poses(
         except EquilibriumError:
             out.append(None)
             continue
-        arguments = (eq.phi, eq.multipliers, p, rest, pose.vector, np.zeros(4))
+        arguments = (eq.phi, eq.multipliers, p, rest, pose.vector, np.zeros(len(DEVIATIONS)))
         z = np.array(model.shape(*arguments)).ravel()
         out.append(Prediction(eq, NodeCurve.of(model.chain, z), rest))
         if model.has_state:

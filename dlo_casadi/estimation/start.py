@@ -16,62 +16,81 @@ from dlo_casadi.estimation.observation import (
     normal_rows,
 )
 from dlo_casadi.estimation.sweep import Shapes
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.float64]
 
+_KINEMATIC_STEPS = 8
 
-def headings_along(measured: MeasuredPose, model: CableModel) -> tuple[FloatArray, FloatArray]:
-    """Headings of a smooth curve of the cable's length through the measured points.
 
-    Gauss-Newton on the kinematics alone: distances to the points, with a small penalty on the
-    second differences of the headings where there is no point to hold them.
+def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
+    """Shapes of all poses: along the measured line where there is one, guessed elsewhere.
+
+    Gauss-Newton on the kinematics alone, all poses in step: distances of the points, with a
+    small penalty on the second differences of the headings where no point holds them.
 
     Returns
     -------
-    (n_headings,) [rad], (K,) [m]
-        Headings and arc lengths of the points' feet.
+    Shapes, list of (K_j,) [m]
+        Shapes without multipliers, and arc lengths of the fitted poses' points.
     """
+    model, used = problem.unknowns.model, problem.used
     chain = model.chain
-    places = chord_places(measured, chain.length)
-    phi = _polyline_headings(measured, model, places)
-    n_lam = model.n_conditions
-    ends = measured.pose.vector
-    p, rest = model.nominal, np.zeros(chain.n_cells)
+    m = len(problem.measured)
+    flat = np.zeros(chain.n_cells)
+    phi = np.array([guesses(model, item.pose, flat)[0] for item in problem.measured])
+    feet = []
+    for j in used:
+        places = chord_places(problem.measured[j], chain.length)
+        phi[j] = _polyline_headings(problem.measured[j], model, places)
+        feet.append(places)
+    shapes = Shapes(phi, np.zeros((m, model.n_conditions)), np.zeros((m, len(DEVIATIONS))))
+    for iteration in range(_KINEMATIC_STEPS + 1):
+        z, by_x, _, _ = problem.sweep.observe(shapes, model.nominal, flat)
+        for k, j in enumerate(used):
+            curve = NodeCurve.of(chain, z[j])
+            if iteration > 1:
+                feet[k] = curve.feet(problem.measured[j].points, feet[k])
+            if iteration < _KINEMATIC_STEPS:
+                slopes = by_x[j][:, : chain.n_headings]
+                phi[j] += _kinematic_step(
+                    problem.measured[j], model, curve, slopes, phi[j], feet[k]
+                )
+    return shapes, feet
+
+
+def _kinematic_step(
+    item: MeasuredPose,
+    model: CableModel,
+    curve: NodeCurve,
+    slopes: FloatArray,
+    phi: FloatArray,
+    s: FloatArray,
+) -> FloatArray:
+    """Step of the headings towards the measured points, at most half a radian."""
+    chain = model.chain
+    gap = item.points - curve.at(s)
     penalty = np.diff(np.eye(len(phi)), n=2, axis=0)
-    # 3 mm of noise a point against bends that change by less than a turn per length and cell.
-    rough = penalty * 0.003 / (model.cable.curvature_scale * chain.h * 3e-1)
-    s = places
-    for iteration in range(8):
-        z, by_x, _, _ = (
-            np.array(block)
-            for block in model.observation(phi, np.zeros(n_lam), p, rest, ends, np.zeros(4))
-        )
-        curve = NodeCurve.of(chain, z[:, 0])
-        if iteration > 1:
-            s = curve.feet(measured.points, s)
-        gap = measured.points - curve.at(s)
-        x_rows = normal_rows(curve, s, np.tile([1.0, 0.0], (len(s), 1)))
-        y_rows = normal_rows(curve, s, np.tile([0.0, 1.0], (len(s), 1)))
-        slopes = by_x[:, : len(phi)]
-        system = [x_rows @ slopes, y_rows @ slopes, rough]
-        target = [gap[:, 0], gap[:, 1], -rough @ phi]
-        if measured.pose.end is not None:
-            last = [chain.n, 2 * chain.n + 1]
-            system.append(10 * slopes[last])
-            target.append(10 * (np.array(measured.pose.end) - curve.nodes[-1]))
-        for held, index, heading in (
-            (model.start == "clamped", 0, measured.pose.start_heading),
-            (model.end == "clamped", len(phi) - 1, measured.pose.end_heading),
-        ):
-            if held and heading is not None:
-                row = np.zeros((1, len(phi)))
-                row[0, index] = 0.01
-                system.append(row)
-                target.append(np.array([0.01 * (heading - phi[index])]))
-        step = np.linalg.lstsq(np.concatenate(system), np.concatenate(target), rcond=None)[0]
-        phi = phi + step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
-    return phi, curve.feet(measured.points, s)
+    # 3 mm of noise a point against bends that change by 0.3 turns per length from cell to cell.
+    rough = penalty * 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
+    axes = [np.tile(axis, (len(s), 1)) for axis in ([1.0, 0.0], [0.0, 1.0])]
+    system = [normal_rows(curve, s, axis) @ slopes for axis in axes] + [rough]
+    target = [gap[:, 0], gap[:, 1], -rough @ phi]
+    if item.pose.end is not None:
+        system.append(10 * slopes[[chain.n, 2 * chain.n + 1]])
+        target.append(10 * (np.array(item.pose.end) - curve.nodes[-1]))
+    for held, index, heading in (
+        (model.start == "clamped", 0, item.pose.start_heading),
+        (model.end == "clamped", len(phi) - 1, item.pose.end_heading),
+    ):
+        if held and heading is not None:
+            row = np.zeros((1, len(phi)))
+            row[0, index] = 0.01
+            system.append(row)
+            target.append(np.array([0.01 * (heading - phi[index])]))
+    stacked = np.concatenate(system)
+    step = np.linalg.solve(stacked.T @ stacked, stacked.T @ np.concatenate(target))
+    return step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
 
 
 def _polyline_headings(measured: MeasuredPose, model: CableModel, places: FloatArray) -> FloatArray:
@@ -91,22 +110,6 @@ def _polyline_headings(measured: MeasuredPose, model: CableModel, places: FloatA
         turns = np.round((measured.pose.start_heading - headings[0]) / (2 * np.pi))
         headings = headings + 2 * np.pi * turns
     return np.interp(chain.heading_places, (grid[1:] + grid[:-1]) / 2, headings)
-
-
-def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
-    """Shapes of all poses: along the measured line where there is one, guessed elsewhere."""
-    model = problem.unknowns.model
-    phis, feet = [], []
-    for j, item in enumerate(problem.measured):
-        if j in problem.used:
-            phi, s = headings_along(item, model)
-            feet.append(s)
-        else:
-            phi = guesses(model, item.pose, np.zeros(model.chain.n_cells))[0]
-        phis.append(phi)
-    m = len(phis)
-    shapes = Shapes(np.array(phis), np.zeros((m, model.n_conditions)), np.zeros((m, 4)))
-    return shapes, feet
 
 
 def all_at_once(
@@ -141,7 +144,8 @@ def all_at_once(
         slopes = unknowns.slopes(theta)
         try:
             sens = sweep.sensitivities(shapes, p, rest, slopes, unknowns.rest_slopes)
-            correction = _newton_correction(problem, shapes, p, rest)
+            force, matrix = sweep.kkt(shapes, p, rest)
+            correction = -np.linalg.solve(matrix, force[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
             return None
         point = problem.evaluate(theta, shapes, feet)
@@ -172,16 +176,6 @@ def all_at_once(
     if not converged or np.abs(solved.phi - shapes.phi).max() > 1.5:
         return None
     return problem.evaluate(theta, solved, feet)
-
-
-def _newton_correction(
-    problem: BatchProblem, shapes: Shapes, p: FloatArray, rest: FloatArray
-) -> FloatArray:
-    """Change of (phi, lam) that removes the imbalance to first order (m, N)."""
-    sweep = problem.sweep
-    rests = sweep.rests(shapes, p, rest)
-    force, matrix = sweep._call("kkt", shapes, p, rests)
-    return -np.linalg.solve(matrix, force)[:, :, 0]
 
 
 def _predicted(

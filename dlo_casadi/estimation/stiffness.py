@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Shapes, Sweep
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         first = Shapes(
             np.zeros((len(used), model.chain.n_headings)),
             np.zeros((len(used), model.n_conditions)),
-            np.zeros((len(used), 4)),
+            np.zeros((len(used), len(DEVIATIONS))),
         )
     step = np.log(10) / _PER_DECADE
     for direction in (1, -1):
@@ -102,4 +102,4 @@ def _cold(
             return None
         phi.append(prediction.equilibrium.phi)
         lam.append(prediction.equilibrium.multipliers)
-    return Shapes(np.array(phi), np.array(lam), np.zeros((len(used), 4)))
+    return Shapes(np.array(phi), np.array(lam), np.zeros((len(used), len(DEVIATIONS))))

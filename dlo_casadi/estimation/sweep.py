@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +28,8 @@ class Shapes:
     ----------
     phi : (m, n_headings) [rad]
     lam : (m, n_conditions)
-    deviation : (m, 4)
-        Deviations of each pose from its declared ends [m, m, rad, rad].
+    deviation : (m, len(DEVIATIONS))
+        What is different in every pose, see `model.DEVIATIONS`.
     """
 
     phi: FloatArray
@@ -44,12 +45,39 @@ class Shapes:
 class Sensitivities:
     """Derivatives of the stacked equilibria.
 
-    `theta` (m, N, size) by the unknowns, `deviation` (m, N, 4) by each pose's own deviation;
+    `theta` (m, N, size) by the unknowns, `deviation` (m, N, len(DEVIATIONS)) by each pose's own deviation;
     N counts headings and multipliers.
     """
 
     theta: FloatArray
     deviation: FloatArray
+
+
+class _Mapped:
+    """A CasADi function over m poses that reads and writes NumPy's memory, without copies.
+
+    Converting between DM and NumPy costs several times the evaluation itself.
+    """
+
+    def __init__(self, function: ca.Function, m: int) -> None:
+        self._function = function if m == 1 else function.map(m)
+        self._buffer, self._run = self._function.buffer()
+        self._inputs = [np.zeros((m, function.size1_in(i))) for i in range(function.n_in())]
+        self._shapes = [
+            (m, function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
+        ]
+        for i, block in enumerate(self._inputs):
+            self._buffer.set_arg(i, memoryview(block))
+
+    def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
+        """Arguments (m, rows) or (rows,) for all alike -> outputs (m, rows, columns)."""
+        for block, value in zip(self._inputs, arguments, strict=True):
+            block[...] = value
+        outputs = [np.zeros(shape) for shape in self._shapes]
+        for i, block in enumerate(outputs):
+            self._buffer.set_res(i, memoryview(block))
+        self._run()
+        return [block.transpose(0, 2, 1) for block in outputs]
 
 
 class Sweep:
@@ -68,30 +96,28 @@ class Sweep:
         self.m = len(self.poses)
         self.n_phi = model.chain.n_headings
         self.n_unknowns = self.n_phi + model.n_conditions
-        self._ends = np.array([pose.vector for pose in self.poses]).T
-        self._maps = {
-            name: getattr(model, name).map(self.m)
-            for name in ("kkt", "sensitivity", "observation", "shape")
-        }
-        if model.has_state:
-            self._next = model.next_rest
+        self._ends = np.array([pose.vector for pose in self.poses])
+        self._maps: dict[str, _Mapped] = {}
         self.used_deviations = [DEVIATIONS.index(name) for name in model.deviations]
 
     def _call(self, name: str, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[FloatArray]:
-        """Evaluate a mapped function; each output (m, rows, columns)."""
-        outputs = self._maps[name](
-            shapes.phi.T,
-            shapes.lam.T,
-            np.repeat(p[:, None], self.m, axis=1),
-            rest.T,
-            self._ends,
-            shapes.deviation.T,
-        )
-        stacked = []
-        for out in outputs if isinstance(outputs, tuple | list) else (outputs,):
-            dense = out.toarray()
-            stacked.append(dense.reshape(dense.shape[0], self.m, -1).transpose(1, 0, 2))
-        return stacked
+        """Evaluate a function of the model for all poses; each output (m, rows, columns)."""
+        if name not in self._maps:
+            self._maps[name] = _Mapped(getattr(self.model, name), self.m)
+        mapped = self._maps[name]
+        return mapped(shapes.phi, shapes.lam, p, rest, self._ends, shapes.deviation)
+
+    def _after(self, j: int, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[FloatArray]:
+        """Rest curvature after pose j and its derivatives by (phi, rest before, p)."""
+        if "after" not in self._maps:
+            self._maps["after"] = _Mapped(self.model.next_rest, 1)
+        arguments = (shapes.phi[j], shapes.lam[j], p, rest, self._ends[j], shapes.deviation[j])
+        return [block[0] for block in self._maps["after"](*arguments)]
+
+    def kkt(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Imbalance (m, N) and KKT matrices (m, N, N); `rest` is that before the first pose."""
+        force, matrix = self._call("kkt", shapes, p, self.rests(shapes, p, rest))
+        return force[:, :, 0], matrix
 
     def rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Rest curvature (m, n_cells) that each pose finds, from the first on."""
@@ -99,10 +125,7 @@ class Sweep:
             return np.repeat(rest[None], self.m, axis=0)
         out = [rest]
         for j in range(self.m - 1):
-            after = self._next(
-                shapes.phi[j], shapes.lam[j], p, out[-1], self._ends[:, j], shapes.deviation[j]
-            )[0]
-            out.append(np.array(after).ravel())
+            out.append(self._after(j, shapes, p, out[-1])[0][:, 0])
         return np.array(out)
 
     def _carry(
@@ -111,10 +134,8 @@ class Sweep:
         """Derivatives of each pose's rest curvature after it, by (phi, rest before, p)."""
         blocks = []
         for j in range(self.m):
-            out = self._next(
-                shapes.phi[j], shapes.lam[j], p, rests[j], self._ends[:, j], shapes.deviation[j]
-            )
-            blocks.append(tuple(np.array(block) for block in out[1:]))
+            _, by_phi, by_rest, by_p = self._after(j, shapes, p, rests[j])
+            blocks.append((by_phi, by_rest, by_p))
         return blocks
 
     def solve(

@@ -1,0 +1,41 @@
+"""A force of unknown cause, free in every pose."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.chain import Curve
+from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.parameters import Parameter
+
+
+class UnknownPull(Load):
+    """A force at one place of the cable that may be another one in every pose.
+
+        V_j = - f_j . r(s)                                            [J]
+
+    It assumes no cause: it tells where and how the cable is pulled when no effect explains the
+    residual. The forces are unknowns of the poses, not parameters of the cable, so that nothing
+    can be predicted from them.
+
+    Parameters
+    ----------
+    position : scalar [m], in [0, L]
+    """
+
+    name = "unknown_pull"
+    per_pose = ("pull_x", "pull_y")
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the place."""
+        length = cable.length
+        return (
+            Parameter(
+                "position", "m", nominal=length / 2, scale=0.1 * length, upper=length, lower=0.0
+            ),
+        )
+
+    def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
+        """Potential energy of the force [J]."""
+        force = ca.vertcat(params["pull_x"], params["pull_y"])
+        return -ca.dot(force, curve.position(params["position"]))
