@@ -150,7 +150,9 @@ def fit_declared(
         if size != fit.model.n:
             fit = refine_mesh(fit, size, estimate=std is None)
         error = discretization_error(fit)
-        if finest or error <= MESH_SHARE * fit.noise.std or size >= FINEST_MESH:
+        # Where an effect is missing, the mesh need not be finer than what is missing.
+        worth = max(fit.noise.std, fit.residual_rms)
+        if finest or error <= MESH_SHARE * worth or size >= FINEST_MESH:
             return fit, error
         size *= 2
 

@@ -28,8 +28,10 @@ FloatArray = NDArray[np.float64]
 
 # Decades about the prior stiffness from which fits are started.
 DECADES = (0, -1, 1, -2, 2, -3, 3)
-# Slow displacements per pose that are kept out of the noise estimate.
+# Slow displacements per pose that are kept out of the noise estimate: many while an effect may
+# be missing, few once the model is taken as complete, because noise is slow, too.
 SMOOTH_MODES = 5
+SETTLED_MODES = 2
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
 ROUGHNESS_START = 0.3
@@ -113,6 +115,11 @@ class Fit:
         """Sum of squares of the whitened residuals per degree of freedom."""
         return self.point.data / self.degrees_of_freedom
 
+    @cached_property
+    def residual_rms(self) -> float:
+        """Root mean square normal distance of the fitted points [m]."""
+        return float(np.sqrt((np.concatenate(self.linearization.raw) ** 2).mean()))
+
     @property
     def inflation(self) -> float:
         """Factor on standard deviations where the residual exceeds the noise."""
@@ -155,6 +162,18 @@ class Fit:
         return -self.point.objective + (prior - hessian - inner) / 2
 
 
+def settle(fit: Fit) -> Fit:
+    """Estimate noise, roughness and scatter anew for a model that is taken as complete."""
+    problem, point, converged = refine(
+        fit.problem,
+        fit.point,
+        estimate=not fit.noise.declared,
+        rounds=2,
+        modes=SETTLED_MODES,
+    )
+    return Fit(problem, point, converged)
+
+
 def starting_points(
     problem: BatchProblem, theta: FloatArray, decades: Sequence[int] = DECADES
 ) -> list[Point]:
@@ -174,7 +193,12 @@ def starting_points(
 
 
 def refine(
-    problem: BatchProblem, point: Point, *, estimate: bool, rounds: int = 3
+    problem: BatchProblem,
+    point: Point,
+    *,
+    estimate: bool,
+    rounds: int = 3,
+    modes: int = SMOOTH_MODES,
 ) -> tuple[BatchProblem, Point, bool]:
     """Alternate between the fit, the noise, the roughness of the rest curvature and the scatter.
 
@@ -190,7 +214,7 @@ def refine(
         lin = problem.linearize(point)
         noise = problem.noise
         if estimate and round_ < 2:
-            noise = noise_of(problem, point, lin)
+            noise = noise_of(problem, point, lin, modes)
         roughness = roughness_of(problem, point, lin)
         scatter = scatter_of(problem, point, lin)
         moved = max(
@@ -207,7 +231,9 @@ def refine(
     return problem, point, converged
 
 
-def noise_of(problem: BatchProblem, point: Point, lin: Linearization) -> NoiseModel:
+def noise_of(
+    problem: BatchProblem, point: Point, lin: Linearization, modes: int = SMOOTH_MODES
+) -> NoiseModel:
     """Noise estimated from the residuals with all that the shape may do projected out."""
     model = problem.unknowns.model
     length = model.cable.length
@@ -221,8 +247,8 @@ def noise_of(problem: BatchProblem, point: Point, lin: Linearization) -> NoiseMo
     for k, (s, block) in enumerate(zip(point.feet, np.split(shared, cuts), strict=True)):
         own = lin.raw_directions[k][:, size:]
         own = own / np.maximum(np.abs(own).max(axis=0), 1e-300)
-        modes = smooth_modes(s, length, SMOOTH_MODES, model.end == "free")
-        basis, values, _ = np.linalg.svd(np.concatenate([own, modes], axis=1), full_matrices=False)
+        slow = smooth_modes(s, length, modes, model.end == "free")
+        basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
         weight = problem.measured[problem.used[k]].relative_std
         samples.append(
             NoiseSample(lin.raw[k], s, weight, basis[:, values > 1e-3 * values[0]], block)
@@ -281,6 +307,7 @@ def fit_model(
     values: FloatArray | None = None,
     start: Fit | None = None,
     decades: Sequence[int] = DECADES,
+    max_iterations: int = 40,
 ) -> Fit:
     """Fit a model to all readable fit poses.
 
@@ -300,6 +327,8 @@ def fit_model(
         A fit of a similar model on the same mesh to start from; its noise is kept.
     decades : sequence of int
         Stiffnesses to start from, powers of ten about the prior.
+    max_iterations : int
+        Of a fit that continues from `start`.
 
     Raises
     ------
@@ -315,7 +344,7 @@ def fit_model(
     begin = model.nominal if values is None else values
     unknowns = Unknowns(model, chosen, begin)
     if start is not None:
-        return _continue(unknowns, measured, tolerances, start)
+        return _continue(unknowns, measured, tolerances, start, max_iterations)
     noise = NoiseModel(std or FIRST_STD, declared=std is not None)
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START)
     theta = unknowns.pack(begin, np.zeros(model.rest.n_coefficients))
@@ -347,12 +376,13 @@ def _continue(
     measured: Sequence[MeasuredPose],
     tolerances: Tolerances,
     start: Fit,
+    max_iterations: int = 40,
 ) -> Fit:
     """Fit a similar model from the minimum of another one, with the noise found there."""
     model = unknowns.model
     p = unknowns.fixed.copy()
     for i, name in enumerate(model.names):
-        if name in start.model.names:
+        if name in start.model.names and unknowns.free[i]:
             p[i] = start.value(name)
     unknowns = replace(unknowns, fixed=p)
     theta = unknowns.pack(p, start.coefficients)
@@ -372,7 +402,7 @@ def _continue(
     feet = _feet_for(problem, start)
     problem.refresh(feet)
     point = problem.evaluate(theta, shapes, feet)
-    point, converged = problem.descend(point)
+    point, converged = problem.descend(point, max_iterations)
     return Fit(problem, point, converged)
 
 

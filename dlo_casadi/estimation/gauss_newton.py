@@ -167,6 +167,10 @@ class BatchProblem:
         for j, s in zip(self.used, feet, strict=True):
             self.whitening(j, s)
 
+    def share_metric(self, other: BatchProblem) -> None:
+        """Take over the noise metric of a problem with the same poses and noise."""
+        self._whitening = other._whitening
+
     def raw_residuals(
         self, curves: list[NodeCurve], feet: list[FloatArray]
     ) -> tuple[list[FloatArray], list[FloatArray]]:

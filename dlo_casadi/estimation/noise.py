@@ -18,6 +18,7 @@ from scipy.optimize import minimize
 
 FloatArray = NDArray[np.float64]
 Kernel = Literal["exponential", "matern", "gaussian"]
+KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 
 
 def correlation(kernel: Kernel, ratio: FloatArray) -> FloatArray:
@@ -165,7 +166,7 @@ def estimate_noise(
     # look significant. So the likelihood alone decides, without a price on the parameters.
     best, best_deviance = NoiseModel(white_std), white_deviance
     low, high = np.log(0.002), np.log(0.1)
-    for kernel in ("exponential", "gaussian"):
+    for kernel in KERNELS:
 
         def unit(q: FloatArray, kernel: Kernel = kernel) -> NoiseModel:
             share = 0.98 / (1 + np.exp(-np.clip(q[0], -8, 8)))

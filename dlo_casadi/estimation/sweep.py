@@ -120,7 +120,12 @@ class Sweep:
         return force[:, :, 0], matrix
 
     def rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Rest curvature (m, n_cells) that each pose finds, from the first on."""
+        """Rest curvature (m, n_cells) that each pose finds, from the first on.
+
+        A `rest` that is given per pose already, (m, n_cells), is returned as it is.
+        """
+        if rest.ndim == 2:
+            return rest
         if not self.model.has_state:
             return np.repeat(rest[None], self.m, axis=0)
         out = [rest]
@@ -152,9 +157,9 @@ class Sweep:
         ----------
         shapes : Shapes
             Where to start; deviations are kept.
-        p : (n_parameters,)
-        rest : (n_cells,) [1/m]
-            Before the first pose.
+        p : (n_parameters,) or (m, n_parameters)
+        rest : (n_cells,) or (m, n_cells) [1/m]
+            Before the first pose, or of each pose.
         tolerance : float [rad]
             Largest step at convergence.
 
@@ -175,7 +180,7 @@ class Sweep:
                 step = -np.linalg.solve(matrix, force)[:, :, 0]
             except np.linalg.LinAlgError:
                 return shapes, False
-            if self.model.has_state:
+            if self.model.has_state and rest.ndim == 1:
                 step = self._pass_on(now, p, rests, matrix, step)
             size = float(np.abs(step[:, : self.n_phi]).max())
             damp = min(1.0, 0.5 / size) if size > 0 else 1.0

@@ -1,0 +1,90 @@
+"""Confirmation: a candidate goes into the batch problem and everything is refitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.screening import Screened
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.fit import Fit, fit_model
+
+# Shares of the one-step estimate from which a refit is tried.
+SHARES = (1.0, 0.5, 0.2, 0.05)
+
+
+@dataclass(frozen=True)
+class Confirmed:
+    """A candidate refitted with all parameters free.
+
+    Parameters
+    ----------
+    screened : Screened
+    fit : Fit
+    validation : CrossValidation
+    gain : float
+        Decrease of twice the objective.
+    bic : float
+        Gain minus the price of the parameters, q log N; larger is better.
+    """
+
+    screened: Screened
+    fit: Fit
+    validation: CrossValidation
+    gain: float
+    bic: float
+
+    @property
+    def candidate(self) -> Candidate:
+        """The candidate."""
+        return self.screened.candidate
+
+
+def confirm(base: Fit, screened: Screened) -> Confirmed | None:
+    """Refit with a candidate added; None if no equilibria can be followed to it."""
+    fit = refit_with(base, screened)
+    if fit is None:
+        return None
+    gain = 2 * (base.point.objective - fit.point.objective)
+    price = len(screened.candidate.frees) * np.log(max(base.problem.n_points, 2))
+    return Confirmed(screened, fit, cross_validate(fit), gain, gain - float(price))
+
+
+def refit_with(base: Fit, screened: Screened) -> Fit | None:
+    """Fit the model with a candidate added, from its one-step estimate."""
+    model = screened.candidate.add_to(base.model)
+    best: Fit | None = None
+    for share in SHARES:
+        values = model.nominal.copy()
+        for name, value in screened.start.items():
+            i = model.names.index(name)
+            scanned = name not in screened.candidate.screened
+            values[i] = value if scanned else values[i] + share * (value - values[i])
+        try:
+            fit = fit_model(
+                model,
+                base.problem.measured,
+                base.problem.tolerances,
+                free=_free(base, model.names),
+                values=values,
+                start=base,
+            )
+        except EstimationError:
+            continue
+        if best is None or fit.point.objective < best.point.objective:
+            best = fit
+        if best.point.objective < base.point.objective and best.converged:
+            break
+    return best
+
+
+def _free(base: Fit, names: tuple[str, ...]) -> list[str]:
+    """All parameters but those that the base keeps fixed."""
+    unknowns = base.problem.unknowns
+    fixed = {
+        name for name, free in zip(unknowns.model.names, unknowns.free, strict=True) if not free
+    }
+    return [name for name in names if name not in fixed]

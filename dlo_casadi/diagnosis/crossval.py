@@ -1,0 +1,193 @@
+"""Cross-validation over whole poses, without fitting again for each.
+
+Leaving pose j out of the normal equations gives the unknowns without it in one Gauss-Newton step,
+
+    theta_(-j) = theta - (H - H_j)^-1 (g - g_j)
+
+(exact for a linear model), at which pose j is predicted from its declared end conditions. Where
+there is one pose only, stretches of its arc take the place of poses.
+
+References
+----------
+Beirami et al., On optimal generalizability in parametric learning, NeurIPS 2017.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.sweep import Shapes
+
+FloatArray = NDArray[np.float64]
+
+# Stretches into which the arc of a single pose is cut.
+STRETCHES = 5
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Errors of predictions of what was left out.
+
+    Parameters
+    ----------
+    squares : (folds,) [m^2]
+        Sum of squared distances of each fold's points.
+    counts : (folds,)
+        Number of points of each fold.
+    complete : bool
+        Whether each fold could be predicted.
+    """
+
+    squares: FloatArray
+    counts: FloatArray
+    complete: bool
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square distance over all points [m]."""
+        if not self.complete:
+            return float("inf")
+        return float(np.sqrt(self.squares.sum() / self.counts.sum()))
+
+    def clearly_worse_than(self, other: CrossValidation, factor: float = 2.0) -> bool:
+        """Whether the mean paired difference of the folds exceeds its standard error."""
+        if not self.complete:
+            return True
+        gap = self.squares / self.counts - other.squares / other.counts
+        if len(gap) < 2:
+            return bool(gap.sum() > 0)
+        error = float(gap.std(ddof=1)) / np.sqrt(len(gap))
+        return bool(gap.mean() > factor * error)
+
+
+def cross_validate(fit: Fit) -> CrossValidation:
+    """Leave each fit pose out once (of a single pose, each stretch of its arc)."""
+    if len(fit.problem.used) == 1:
+        return _stretches(fit)
+    problem, lin = fit.problem, fit.linearization
+    thetas = []
+    total = fit.normal
+    for k, (block, cross, slope) in enumerate(_inner(fit)):
+        a, e = lin.by_theta[k], lin.residuals[k]
+        h_j = a.T @ a
+        g_j = a.T @ e
+        if len(block):
+            solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+            h_j = h_j - cross.T @ solved[:, :-1]
+            g_j = g_j - cross.T @ solved[:, -1]
+        thetas.append(_without(fit, total.hessian - h_j, total.gradient - g_j))
+    squares, counts, complete = [], [], True
+    curves = _predicted(fit, thetas)
+    for j, curve in zip(problem.used, curves, strict=True):
+        points = problem.measured[j].points
+        counts.append(len(points))
+        if curve is None:
+            complete = False
+            squares.append(np.inf)
+        else:
+            squares.append(float((curve.distances(points) ** 2).sum()))
+    return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)
+
+
+def _inner(fit: Fit) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Deviation blocks of each fitted pose; empty ones where there is none."""
+    if fit.normal.inner:
+        return fit.normal.inner
+    size = fit.problem.unknowns.size
+    empty = (np.zeros((0, 0)), np.zeros((0, size)), np.zeros(0))
+    return [empty] * len(fit.problem.used)
+
+
+def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> FloatArray:
+    """Unknowns after one step with a part of the data left out."""
+    lower, upper = fit.problem.unknowns.bounds
+    ridge = 1e-9 * np.diag(np.diag(fit.normal.hessian))
+    step = -np.linalg.solve(hessian + ridge, gradient)
+    return np.clip(fit.point.theta + step, lower, upper)
+
+
+def _predicted(fit: Fit, thetas: list[FloatArray]) -> list[NodeCurve | None]:
+    """Curve of each fitted pose at its own unknowns, from the declared end conditions."""
+    problem, sweep = fit.problem, fit.problem.sweep
+    unknowns, model = problem.unknowns, fit.model
+    shapes = fit.point.shapes
+    plain = Shapes(shapes.phi, shapes.lam, np.zeros_like(shapes.deviation))
+    if model.has_state:
+        return [
+            _predict_all(fit, plain, theta)[j]
+            for j, theta in zip(problem.used, thetas, strict=True)
+        ]
+    p = np.repeat(fit.p[None], sweep.m, axis=0)
+    rest = np.repeat(fit.rest[None], sweep.m, axis=0)
+    for j, theta in zip(problem.used, thetas, strict=True):
+        p[j], rest[j] = unknowns.p(theta), unknowns.rest(theta)
+    solved, ok = sweep.solve(plain, p, rest)
+    if not ok:
+        return _one_by_one(fit, plain, p, rest)
+    z = sweep.shapes_seen(solved, p, rest)
+    return [NodeCurve.of(model.chain, z[j]) for j in problem.used]
+
+
+def _one_by_one(fit: Fit, plain: Shapes, p: FloatArray, rest: FloatArray) -> list[NodeCurve | None]:
+    """The same where some pose has no equilibrium nearby: only that one is lost."""
+    sweep = fit.problem.sweep
+    out: list[NodeCurve | None] = []
+    for j in fit.problem.used:
+        own_p, own_rest = np.repeat(fit.p[None], sweep.m, 0), np.repeat(fit.rest[None], sweep.m, 0)
+        own_p[j], own_rest[j] = p[j], rest[j]
+        solved, ok = sweep.solve(plain, own_p, own_rest)
+        z = sweep.shapes_seen(solved, own_p, own_rest)[j] if ok else None
+        out.append(None if z is None else NodeCurve.of(fit.model.chain, z))
+    return out
+
+
+def _predict_all(fit: Fit, plain: Shapes, theta: FloatArray) -> list[NodeCurve | None]:
+    """All poses in order at one value of the unknowns, a state carried along."""
+    sweep, unknowns = fit.problem.sweep, fit.problem.unknowns
+    p, rest = unknowns.p(theta), unknowns.rest(theta)
+    solved, ok = sweep.solve(plain, p, rest)
+    if not ok:
+        return [None] * sweep.m
+    return [NodeCurve.of(fit.model.chain, z) for z in sweep.shapes_seen(solved, p, rest)]
+
+
+def _stretches(fit: Fit) -> CrossValidation:
+    """Cross-validation along the arc of a single pose."""
+    problem, lin = fit.problem, fit.linearization
+    j = problem.used[0]
+    points = problem.measured[j].points
+    joint = np.concatenate([lin.by_theta[0], lin.by_deviation[0]], axis=1)
+    size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
+    prior = np.zeros((size + n_dev, size + n_dev))
+    prior[:size, :size] = problem.precision
+    prior[size:, size:] = np.diag(1 / problem.deviation_std**2)
+    own = fit.point.shapes.deviation[j, problem.sweep.used_deviations]
+    pull = np.concatenate([fit.point.theta - problem.mean, own])
+    squares, counts, complete = [], [], True
+    sweep = problem.sweep
+    for rows in np.array_split(np.arange(len(points)), STRETCHES):
+        kept = np.setdiff1d(np.arange(len(points)), rows)
+        a, e = joint[kept], lin.residuals[0][kept]
+        hessian = a.T @ a + prior
+        hessian += 1e-9 * np.diag(np.diag(hessian))
+        step = -np.linalg.solve(hessian, a.T @ e + prior @ pull)
+        lower, upper = problem.unknowns.bounds
+        theta = np.clip(fit.point.theta + step[:size], lower, upper)
+        plain = Shapes(
+            fit.point.shapes.phi, fit.point.shapes.lam, np.zeros_like(fit.point.shapes.deviation)
+        )
+        p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
+        solved, ok = sweep.solve(plain, p, rest)
+        counts.append(len(rows))
+        if not ok:
+            squares.append(np.inf)
+            complete = False
+            continue
+        curve = NodeCurve.of(fit.model.chain, sweep.shapes_seen(solved, p, rest)[j])
+        squares.append(float((curve.distances(points[rows]) ** 2).sum()))
+    return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)

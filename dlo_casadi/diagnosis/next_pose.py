@@ -1,0 +1,71 @@
+"""Which pose to photograph next: the one that separates rival explanations best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.prediction import predict_poses
+
+FloatArray = NDArray[np.float64]
+
+# End poses that are tried, drawn within the reach that the session has explored.
+TRIED = 30
+SEED = 0
+
+
+@dataclass(frozen=True)
+class NextPose:
+    """An end pose and the RMS difference [m] of the rivals' predictions there."""
+
+    end: tuple[float, float]
+    difference: float
+
+
+def next_pose(first: Fit, second: Fit) -> NextPose | None:
+    """Reachable end pose at which two fits predict the most different shapes.
+
+    The candidates are spread over the box of the ends that were used, a tenth wider, within
+    97 % of the cable's length from the start; None for a free end.
+    """
+    poses = [item.pose for item in first.problem.measured]
+    if first.model.end == "free":
+        return None
+    ends = np.array([pose.end for pose in poses])
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    margin = 0.1 * np.maximum(high - low, 0.1 * first.model.cable.length)
+    generator = np.random.default_rng(SEED)
+    places = np.linspace(0.0, first.model.cable.length, 101)
+    best: NextPose | None = None
+    for _ in range(TRIED):
+        end = generator.uniform(low - margin, high + margin)
+        nearest = poses[int(((ends - end) ** 2).sum(axis=1).argmin())]
+        reach = float(np.hypot(*(end - np.array(nearest.start))))
+        if not 0.03 < reach / first.model.cable.length < 0.97:
+            continue
+        pose: Pose = replace(nearest, end=(float(end[0]), float(end[1])), name="next")
+        pair = [
+            predict_poses(fit.model, fit.p, _rest_now(fit), [pose])[0] for fit in (first, second)
+        ]
+        if pair[0] is None or pair[1] is None:
+            continue
+        gap = pair[0].curve.at(places) - pair[1].curve.at(places)
+        difference = float(np.sqrt((gap**2).sum(axis=1).mean()))
+        # Beyond a tenth of the length the rivals sit on different branches: no clean test.
+        if difference > 0.1 * first.model.cable.length:
+            continue
+        if best is None or difference > best.difference:
+            best = NextPose((round(float(end[0]), 4), round(float(end[1]), 4)), difference)
+    return best
+
+
+def _rest_now(fit: Fit) -> FloatArray:
+    """Rest curvature after the session's last pose."""
+    if not fit.model.has_state:
+        return fit.rest
+    rests = fit.problem.sweep.rests(fit.point.shapes, fit.p, fit.rest)
+    return rests[-1]

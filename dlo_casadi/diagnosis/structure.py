@@ -1,0 +1,146 @@
+"""Is the residual noise? Slow modes along the arc of every pose against their distribution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, f, norm
+
+from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.noise import smooth_modes
+
+FloatArray = NDArray[np.float64]
+
+# Slow sines per pose in which a missing effect would show.
+MODES = 6
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Tests of the residual of a fit.
+
+    Parameters
+    ----------
+    statistic, dof, p_value : float
+        Energy of the residual in slow modes along the arcs, over what the noise explains, with
+        the fit's own directions taken into account: chi-square, or F where the noise has been
+        estimated.
+    chi2_per_dof : float
+        Of all points.
+    runs_z : float
+        Runs of equal sign along the arcs against independent points, as a normal score;
+        negative = fewer, longer runs. Whitened residuals.
+    order_z, span_z : float
+        Rank correlation of the poses' slow energy with their order and with their span, as a
+        normal score.
+    per_pose : dict
+        Slow energy per degree of freedom by pose name.
+    """
+
+    statistic: float
+    dof: int
+    p_value: float
+    chi2_per_dof: float
+    runs_z: float
+    order_z: float
+    span_z: float
+    per_pose: dict[str, float]
+
+
+def noise_degrees(fit: Fit) -> float:
+    """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
+    if fit.noise.declared:
+        return float("inf")
+    if fit.noise.share == 0:
+        return float(fit.problem.n_points)
+    independent = fit.model.cable.length / (np.sqrt(2 * np.pi) * fit.noise.length)
+    return float(max(4.0, len(fit.problem.used) * independent))
+
+
+def structure_of(fit: Fit) -> Structure:
+    """Test the residual of a fit for what the noise does not explain."""
+    problem, lin, normal = fit.problem, fit.linearization, fit.normal
+    model = fit.model
+    coefficients, own, arms = [], [], []
+    inner = normal.inner or [None] * len(problem.used)
+    for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
+        modes = smooth_modes(s, model.cable.length, MODES, model.end == "free")
+        basis, _ = np.linalg.qr(problem.whitening(j, s) @ modes)
+        a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
+        covariance = np.eye(basis.shape[1])
+        block = inner[k]
+        if block is not None:
+            solved = np.linalg.solve(block[0], np.column_stack([b.T, block[1]]))
+            covariance -= b @ solved[:, : len(b)]
+            a = a - b @ solved[:, len(b) :]
+        coefficients.append(basis.T @ lin.residuals[k])
+        own.append(covariance)
+        arms.append(a)
+    stacked = np.concatenate(coefficients)
+    arm = np.concatenate(arms)
+    covariance = -arm @ fit.covariance @ arm.T
+    at = 0
+    for block in own:
+        covariance[at : at + len(block), at : at + len(block)] += block
+        at += len(block)
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    kept = values > 0.05
+    along = vectors[:, kept].T @ stacked
+    statistic, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
+    noise_dof = noise_degrees(fit)
+    p_value = (
+        float(chi2.sf(statistic, dof))
+        if np.isinf(noise_dof)
+        else float(f.sf(statistic / max(dof, 1), max(dof, 1), noise_dof))
+    )
+    energies = np.array(
+        [
+            float((c**2).sum()) / max(float(np.trace(v)), 0.1)
+            for c, v in zip(coefficients, own, strict=True)
+        ]
+    )
+    names = [problem.measured[j].pose.name for j in problem.used]
+    spans = np.array([_span(fit, j) for j in problem.used])
+    return Structure(
+        statistic,
+        dof,
+        p_value,
+        fit.chi2_per_dof,
+        _runs(lin.residuals),
+        _rank_score(energies, np.arange(len(energies), dtype=float)),
+        _rank_score(energies, spans),
+        dict(zip(names, energies.tolist(), strict=True)),
+    )
+
+
+def _span(fit: Fit, j: int) -> float:
+    pose = fit.problem.measured[j].pose
+    if pose.end is None:
+        return 0.0
+    return float(np.hypot(pose.end[0] - pose.start[0], pose.end[1] - pose.start[1]))
+
+
+def _runs(residuals: list[FloatArray]) -> float:
+    """Wald and Wolfowitz's runs test over all poses, as a normal score."""
+    excess, variance = 0.0, 0.0
+    for e in residuals:
+        positive = e > 0
+        n1, n2 = int(positive.sum()), int((~positive).sum())
+        n = n1 + n2
+        if min(n1, n2) < 2:
+            continue
+        mean = 1 + 2 * n1 * n2 / n
+        excess += 1 + int((positive[1:] != positive[:-1]).sum()) - mean
+        variance += (mean - 1) * (mean - 2) / (n - 1)
+    return excess / np.sqrt(variance) if variance > 0 else 0.0
+
+
+def _rank_score(a: FloatArray, b: FloatArray) -> float:
+    """Spearman's rank correlation as a normal score."""
+    if len(a) < 4 or np.ptp(b) == 0:
+        return 0.0
+    ranks = [np.argsort(np.argsort(x)).astype(float) for x in (a, b)]
+    rho = float(np.corrcoef(ranks[0], ranks[1])[0, 1])
+    return float(np.clip(rho * np.sqrt(len(a) - 1), norm.ppf(1e-12), -norm.ppf(1e-12)))
