@@ -1,0 +1,352 @@
+"""The contract of every effect in EFFECTS, and the law of each."""
+
+from dataclasses import replace
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from dlo_casadi.effects import (
+    EFFECTS,
+    BendingSoftening,
+    Cable,
+    ClampAngle,
+    Effect,
+    EndOffset,
+    EndSpring,
+    GravityTilt,
+    ImageDistortion,
+    ImageScale,
+    Kinematics,
+    LumpedMass,
+    PointForce,
+    RestCurvatureDrift,
+    SectionLaw,
+    SideLoad,
+    StartSpring,
+    StiffnessGradient,
+    StiffSection,
+)
+from dlo_casadi.equilibrium import Pose, solve_equilibrium
+from dlo_casadi.model import DEVIATIONS, CableModel
+
+CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
+ENDS = np.array([0.1, 0.05, 0.5, -0.1, 0.4, -0.2])  # start, end [m], headings [rad]
+STILL = np.zeros(len(DEVIATIONS))
+SLOTS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
+UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad"}
+EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
+BOTH = pytest.mark.parametrize("element", ["arc", "link"])
+OUTPUTS = ("kkt", "observation", "next_rest")
+
+
+@cache
+def plain(name: str, element: str) -> CableModel:
+    """Model without the effect, with the boundaries that it needs."""
+    held = "clamped" if name == "clamp_angle" else "pinned"
+    return CableModel(CABLE, n=5, element=element, start=held, end=held, gravity=(1.0, -9.7))
+
+
+@cache
+def with_effect(name: str, element: str) -> CableModel:
+    return plain(name, element).with_effect(EFFECTS[name]())
+
+
+def own_parameters(model: CableModel, values: str) -> np.ndarray:
+    """Parameter vector with the effect's at "nominal" or well off it, within bounds."""
+    rng = np.random.default_rng(0)
+    p = model.nominal.copy()
+    if values == "nominal":
+        return p
+    for i, q in enumerate(model.parameters[1:], start=1):
+        moved = q.nominal + q.scale * rng.uniform(0.3, 0.8)
+        p[i] = np.clip(moved, q.lower, q.upper)
+    return p
+
+
+def state(model: CableModel, headings: str) -> tuple[np.ndarray, ...]:
+    """Arguments phi, lam, (p), rest, ends, deviation; p is put in by the caller."""
+    rng = np.random.default_rng(1)
+    phi = rng.normal(scale=0.5, size=model.chain.n_headings)
+    lam = rng.normal(size=model.n_conditions)
+    rest = rng.normal(size=model.chain.n_cells)
+    if headings == "straight":
+        phi, lam, rest = 0 * phi, 0 * lam, 0 * rest
+    return phi, lam, rest
+
+
+def outputs(model: CableModel, name: str, p: np.ndarray, headings: str = "random"):
+    phi, lam, rest = state(model, headings)
+    found = getattr(model, name)(phi, lam, p, rest, ENDS, STILL)
+    return [np.array(block) for block in found]
+
+
+def number(expression) -> np.ndarray:
+    return np.array(ca.evalf(ca.SX(expression))).squeeze()
+
+
+# ---- contract ----------------------------------------------------------------------------------
+
+
+@EVERY
+def test_declaration(name):
+    effect = EFFECTS[name]()
+    assert isinstance(effect, Effect)
+    assert (effect.name, effect.label) == (name, name)
+    assert effect.slot in SLOTS
+    declared = effect.parameters(CABLE)
+    assert declared
+    for q in declared:
+        assert q.unit in UNITS, f"{q.name}: unit {q.unit!r}"
+        assert np.isfinite(q.nominal)
+        assert q.lower <= q.nominal <= q.upper
+        assert q.nominal + q.scale <= q.upper or q.nominal - q.scale >= q.lower
+    assert len({q.name for q in declared}) == len(declared)
+
+
+@EVERY
+@BOTH
+@pytest.mark.parametrize("headings", ["straight", "random"])
+@pytest.mark.parametrize("values", ["nominal", "off"])
+def test_gradients_and_hessians_are_finite(name, element, headings, values):
+    """No sqrt(0), atan2(0, 0) or 0/0 in the Lagrangian, its Hessian, or the derivatives by p."""
+    model = with_effect(name, element)
+    p = own_parameters(model, values)
+    for function in (*OUTPUTS, "sensitivity"):
+        for block in outputs(model, function, p, headings):
+            assert np.all(np.isfinite(block)), function
+
+
+@EVERY
+@BOTH
+def test_no_effect_at_nominal_values(name, element):
+    """Balance, Hessian, measured curve and state are those of the model without the effect."""
+    model, bare = with_effect(name, element), plain(name, element)
+    for function in OUTPUTS:
+        with_it = outputs(model, function, model.nominal)
+        without = outputs(bare, function, bare.nominal)
+        by_p = {"observation": 2, "next_rest": 3}.get(function)
+        for k, (one, other) in enumerate(zip(with_it, without, strict=True)):
+            if k == by_p:
+                one = one[:, : other.shape[1]]  # without the effect's own parameters
+            # The rounding of a few dozen terms, of size up to 1e2 in the Hessian.
+            np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11, err_msg=function)
+
+
+@EVERY
+@BOTH
+def test_every_effect_does_something(name, element):
+    model, bare = with_effect(name, element), plain(name, element)
+    p = own_parameters(model, "off")
+    change = [
+        np.abs(outputs(model, f, p)[0] - outputs(bare, f, bare.nominal)[0]).max() for f in OUTPUTS
+    ]
+    assert max(change) > 1e-4
+
+
+@EVERY
+@BOTH
+def test_derivatives_by_parameters_against_finite_differences(name, element):
+    """Of the balance (`sensitivity`), the measured curve and the state."""
+    model = with_effect(name, element)
+    p = own_parameters(model, "off")
+    pairs = {"kkt": ("sensitivity", 0), "observation": ("observation", 2)}
+    pairs["next_rest"] = ("next_rest", 3)
+    for function, (source, index) in pairs.items():
+        exact = outputs(model, source, p)[index]
+        for i, q in enumerate(model.parameters):
+            d = 1e-5 * (q.nominal if q.log else q.scale)
+            step = d * np.eye(len(p))[i]
+            ahead = outputs(model, function, p + step)[0]
+            behind = outputs(model, function, p - step)[0]
+            central = ((ahead - behind) / (2 * d)).ravel()
+            size = max(np.abs(exact[:, i]).max(), 1.0)
+            # Central differences of 1e-5 scales: 1e-10 of the third derivative, and the
+            # rounding of values of order ten over 2 d, d > 1e-8.
+            tolerance = 1e-6 * size + 1e-14 / d
+            np.testing.assert_allclose(
+                central, exact[:, i], rtol=0, atol=tolerance, err_msg=f"{function} by {q.name}"
+            )
+
+
+ELASTIC = sorted(k for k, kind in EFFECTS.items() if issubclass(kind, SectionLaw | Kinematics))
+
+
+@pytest.mark.parametrize("name", ELASTIC)
+@BOTH
+def test_elastic_effects_do_not_feel_rigid_motion(name, element):
+    """Board, gravity and cable turned together by 1.1 rad and moved: the same energy and shape."""
+    model = with_effect(name, element)
+    angle, shift = 1.1, np.array([0.3, -0.7])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    gravity = tuple(float(g) for g in turn @ np.array(model.gravity))
+    turned = replace(model, gravity=gravity)
+    p = own_parameters(model, "off")
+    phi, lam, rest = state(model, "random")
+    start, end = ENDS[:2], ENDS[2:4]
+    ends = np.concatenate([turn @ start + shift, turn @ end + shift, ENDS[4:] + angle])
+    energy, nodes = model.energy(phi, lam, p, rest, ENDS, STILL)
+    new_energy, new_nodes = turned.energy(phi + angle, turn @ lam, p, rest, ends, STILL)
+    fall = -CABLE.mass * np.array(gravity) @ shift  # the weight has been moved, too
+    # Rounding of a few dozen terms of order one.
+    assert float(new_energy) - fall == pytest.approx(float(energy), abs=1e-11)
+    np.testing.assert_allclose(np.array(new_nodes), np.array(nodes) @ turn.T + shift, atol=1e-11)
+    balance, _ = model.kkt(phi, lam, p, rest, ENDS, STILL)
+    new_balance, _ = turned.kkt(phi + angle, turn @ lam, p, rest, ends, STILL)
+    headings = model.chain.n_headings
+    np.testing.assert_allclose(
+        np.array(new_balance)[:headings], np.array(balance)[:headings], atol=1e-11
+    )
+
+
+# ---- loads -------------------------------------------------------------------------------------
+
+
+def energies(effects: tuple[Effect, ...], p: list[float], gravity=(0.0, -9.81), element="arc"):
+    """Energy [J] and nodes of a random shape that hangs on these loads alone."""
+    model = CableModel(CABLE, n=5, element=element, effects=effects, gravity=gravity)
+    phi, lam, rest = state(model, "random")
+    full = np.array([CABLE.bending_stiffness, *p])
+    energy, nodes = model.energy(phi, lam, full, rest, ENDS, STILL)
+    return float(energy), np.array(nodes)
+
+
+@BOTH
+def test_energy_of_loads(element):
+    """A mass m at node 2 has -m g . r; a force -f . r; a side load -q int x ds."""
+    s = 2 * CABLE.length / 5
+    none, nodes = energies((), [], element=element)
+    mass, _ = energies((LumpedMass(),), [0.3, s], element=element)
+    assert mass - none == pytest.approx(0.3 * 9.81 * nodes[2, 1], abs=1e-12)
+    force, _ = energies((PointForce(),), [0.4, -0.7, s], element=element)
+    assert force - none == pytest.approx(-0.4 * nodes[2, 0] + 0.7 * nodes[2, 1], abs=1e-12)
+    # A side load q acts like gravity q L / m along x.
+    side, _ = energies((SideLoad(),), [0.6], element=element)
+    wind = (0.6 * CABLE.length / CABLE.mass, -9.81)
+    assert side == pytest.approx(energies((), [], wind, element)[0], abs=1e-12)
+
+
+def test_loads_add_and_a_tilt_turns_every_weight():
+    """Cable and lumped mass feel the turned gravity, a point force does not."""
+    angle, s = 0.2, 0.3
+    parts = (LumpedMass(), PointForce(), LumpedMass(label="clip"))
+    values = [0.3, s, 0.5, 0.1, s, 0.05, 0.6]
+    tilted, _ = energies((*parts, GravityTilt()), [*values, angle])
+    first, _ = energies((GravityTilt(), *parts), [angle, *values])
+    gravity = (9.81 * np.sin(angle), -9.81 * np.cos(angle))
+    by_hand, _ = energies(parts, values, gravity)
+    assert tilted == pytest.approx(by_hand, abs=1e-12)
+    assert first == pytest.approx(tilted, abs=1e-12)
+    none, _ = energies((), [])
+    alone = [
+        energies((part,), part_values)[0] - none
+        for part, part_values in zip(parts, ([0.3, s], [0.5, 0.1, s], [0.05, 0.6]), strict=True)
+    ]
+    together, _ = energies(parts, values)
+    assert together - none == pytest.approx(sum(alone), abs=1e-12)
+
+
+# ---- section laws ------------------------------------------------------------------------------
+
+CELLS = np.array([[0.0, 0.2], [0.2, 0.4], [0.4, 0.6], [0.6, 0.8]])  # m
+
+
+def factors(effect: SectionLaw, values: dict[str, float], bend=(1.0, 1.0, 1.0, 1.0)) -> np.ndarray:
+    params = {key: ca.SX(value) for key, value in values.items()}
+    return number(ca.SX.ones(4) * effect.factor(ca.SX(ca.DM(bend)), CELLS, CABLE, params))
+
+
+def test_taper_in_each_cell():
+    """EI (1 + a (2 s/L - 1)) averages to its value in the middle: s/L = 1/8, 3/8, 5/8, 7/8."""
+    np.testing.assert_allclose(
+        factors(StiffnessGradient(), {"slope": 0.4}), [0.7, 0.9, 1.1, 1.3], rtol=1e-13
+    )
+
+
+def test_stiff_section_averages_compliances():
+    """Four times as stiff over halves of cells 1 and 3 and all of cell 2: 1 / (1/2 + 1/8), 4."""
+    found = factors(StiffSection(), {"start": 0.3, "end": 0.7, "factor": 4.0})
+    covered = (1 - 1 / found) / (1 - 1 / 4.0)
+    # The edges are rounded over r = a quarter of a cell: half a cell d away from an edge,
+    # (sqrt(d^2 + r^2) - d) / 2 = 3 % of a cell is still on the wrong side of the cell's border.
+    np.testing.assert_allclose(covered, [0.0, 0.5, 1.0, 0.5], atol=0.06)
+    # What one cell loses its neighbours gain; far away 0.5 % of a cell falls off the cable.
+    assert covered.sum() == pytest.approx(2.0, abs=0.05)
+    np.testing.assert_allclose(
+        factors(StiffSection(), {"start": 0.3, "end": 0.3, "factor": 4.0}), 1.0, atol=1e-15
+    )
+
+
+def test_moment_of_a_softening_section():
+    """M = EI k / (1 + |k| c'), c' the softness, from the energy by central differences."""
+    softness, d = 0.2, 1e-5
+    k = np.array([-6.0, -1.0, 0.5, 8.0])
+
+    def energy(bend):
+        return bend**2 / 2 * factors(BendingSoftening(), {"softness": softness}, bend)
+
+    moment = (energy(k + d) - energy(k - d)) / (2 * d)
+    # |k| is rounded by 1e-3 of a turn per length (0.008 1/m), which the softness turns into a
+    # share of 0.2 * 0.008 = 1.6e-3.
+    np.testing.assert_allclose(moment, k / (1 + np.abs(k) * softness), rtol=2e-3)
+    assert np.all(np.diff(moment) > 0)
+
+
+# ---- boundaries, measurement, state ------------------------------------------------------------
+
+
+def test_springs_pull_towards_their_heading():
+    """V = k (phi - heading)^2 / 2 at the first or last heading."""
+    for kind, index in ((StartSpring, 0), (EndSpring, -1)):
+        model = CableModel(CABLE, n=5, effects=(kind(),))
+        bare = CableModel(CABLE, n=5)
+        phi, lam, rest = state(model, "random")
+        p = np.array([0.05, 0.7, -0.4])
+        with_it, _ = model.energy(phi, lam, p, rest, ENDS, STILL)
+        without, _ = bare.energy(phi, lam, p[:1], rest, ENDS, STILL)
+        exact = 0.7 * (phi[index] + 0.4) ** 2 / 2
+        assert float(with_it - without) == pytest.approx(exact, abs=1e-12)
+
+
+def test_fixtures_are_where_the_boundary_effects_put_them():
+    pose = Pose((0.0, 0.0), (0.5, 0.0))
+    model = CableModel(CABLE, n=8, effects=(EndOffset(),))
+    p = np.array([0.05, 0.01, -0.02])
+    found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), pose)
+    np.testing.assert_allclose(found.points[-1], [0.51, -0.02], atol=1e-8)  # IPOPT's tol
+
+    model = CableModel(CABLE, n=8, start="clamped", end="clamped", effects=(ClampAngle(),))
+    pose = Pose((0.0, 0.0), (0.5, 0.0), start_heading=-0.5, end_heading=0.5)
+    p = np.array([0.05, 0.1, -0.2])
+    found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), pose)
+    np.testing.assert_allclose(found.phi[[0, -1]], [-0.4, 0.3], atol=1e-8)
+
+
+def test_clamp_angles_of_one_end_only():
+    one = ClampAngle(start=False)
+    assert [q.name for q in one.parameters(CABLE)] == ["end_heading_error"]
+    model = CableModel(CABLE, n=4, start="pinned", end="clamped", effects=(one,))
+    assert model.names == ("bending_stiffness", "clamp_angle.end_heading_error")
+
+
+def test_measurement_maps():
+    """Scale about the start; radial distortion about the image centre, by hand."""
+    point, start = ca.SX(ca.DM([0.5, 0.2])), ca.SX(ca.DM([0.1, 0.0]))
+    scaled = ImageScale().observe(point, start, {"factor": ca.SX(1.1)})
+    np.testing.assert_allclose(number(scaled), [0.54, 0.22], rtol=1e-14)
+    lens = ImageDistortion(center=(0.2, -0.2))
+    moved = lens.observe(point, start, {"coefficient": ca.SX(0.4)})
+    # Arm (0.3, 0.4), length 0.5: factor 1 + 0.4 * 0.25 = 1.1.
+    np.testing.assert_allclose(number(moved), [0.53, 0.24], rtol=1e-14)
+
+
+def test_drift_moves_the_rest_curvature_towards_the_bend():
+    rest, curvature = ca.SX(ca.DM([1.0, -2.0])), ca.SX(ca.DM([3.0, 2.0]))
+    after = RestCurvatureDrift().next_rest(rest, curvature, {"rate": ca.SX(0.25)})
+    np.testing.assert_allclose(number(after), [1.5, -1.0], rtol=1e-14)
+
+
+def test_an_effect_without_its_slot_says_so():
+    with pytest.raises(TypeError, match="Bare declares no parameters"):
+        type("Bare", (Effect,), {"name": "bare"})().parameters(CABLE)
