@@ -105,7 +105,7 @@ class Chain:
         return self.n + 1 if self.element == "arc" else self.n
 
     @property
-    def cells(self) -> NDArray[np.float64]:
+    def cells(self) -> NDArray[np.floating]:
         """Bending cells (n_cells, 2) [m]: where each discrete curvature acts, from s0 to s1."""
         if self.element == "arc":
             edges = np.linspace(0.0, self.length, self.n + 1)
@@ -122,7 +122,7 @@ class Chain:
         return len(self.cells)
 
     @property
-    def heading_places(self) -> NDArray[np.float64]:
+    def heading_places(self) -> NDArray[np.floating]:
         """Arc lengths (n_headings,) [m] at which the headings are the cable's direction."""
         if self.element == "arc":
             return np.linspace(0.0, self.length, self.n + 1)

@@ -48,7 +48,7 @@ class Declared:
     fixed: tuple[str, ...]
     tolerances: Tolerances
 
-    def start_values(self) -> NDArray[np.float64]:
+    def start_values(self) -> NDArray[np.floating]:
         """Parameter vector at the declared values."""
         p = self.model.nominal.copy()
         for name, value in self.values.items():
@@ -73,7 +73,7 @@ def nuisances(model: CableModel, tolerances: Tolerances) -> CableModel:
         priors = {
             f"{side}_heading_error": tolerances.heading for side, held in sides.items() if held
         }
-        found.append((ClampAngle(**sides), priors))
+        found.append((ClampAngle(sides["start"], sides["end"]), priors))
     present = {effect.label for effect in model.effects}
     for effect, priors in found:
         if effect.label not in present:

@@ -15,7 +15,7 @@ from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, clamped_headings
 from dlo_casadi.model import DEVIATIONS, CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
 
 # No joint bends by more than this between neighbouring headings (Eq. 8; joints only).

@@ -33,7 +33,9 @@ class ConfigError(DloError):
     """
 
     def __init__(self, message: str, file: Path | None = None, line: int | None = None) -> None:
-        place = "" if file is None else f"{file}" + ("" if line is None else f", line {line}") + ": "
+        place = (
+            "" if file is None else f"{file}" + ("" if line is None else f", line {line}") + ": "
+        )
         super().__init__(place + message)
         self.file = file
         self.line = line

@@ -62,8 +62,8 @@ def read_poses(
 def conditions(pose: DeclaredPose) -> Pose:
     """End conditions of a configured pose."""
     return Pose(
-        start=tuple(pose.start),
-        end=None if pose.end is None else tuple(pose.end),
+        start=(pose.start[0], pose.start[1]),
+        end=None if pose.end is None else (pose.end[0], pose.end[1]),
         start_heading=pose.start_heading,
         end_heading=pose.end_heading,
         branch=pose.branch,

@@ -37,7 +37,7 @@ from dlo_casadi.rest import RestCurvature
 
 StartKind = Literal["pinned", "clamped"]
 EndKind = Literal["pinned", "clamped", "free"]
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # ln(1000): a prior of the stiffness may be off by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))

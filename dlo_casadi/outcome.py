@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dlo_casadi.config import Config
 from dlo_casadi.estimation.fit import Fit
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
 Verdict = Literal["complete", "effect_found", "unexplained"]
 

@@ -26,17 +26,17 @@ class RestCurvature:
     n_coefficients: int
 
     @property
-    def _knots(self) -> NDArray[np.float64]:
+    def _knots(self) -> NDArray[np.floating]:
         inner = np.linspace(0.0, self.length, self.n_coefficients - _DEGREE + 1)
         return np.concatenate([[0.0] * _DEGREE, inner, [self.length] * _DEGREE])
 
-    def basis(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def basis(self, s: NDArray[np.floating]) -> NDArray[np.floating]:
         """Values (len(s), n_coefficients) of the basis functions at arc lengths s [m]."""
         if self.n_coefficients == 0:
             return np.zeros((len(s), 0))
         return BSpline(self._knots, np.eye(self.n_coefficients), _DEGREE)(s)
 
-    def cell_means(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    def cell_means(self, cells: NDArray[np.floating]) -> NDArray[np.floating]:
         """Means (n_cells, n_coefficients) of the basis functions over cells (n_cells, 2) [m].
 
         The mean, not the value in the middle, makes int (kappa - kappa_0)^2 ds of a curve of
@@ -48,6 +48,6 @@ class RestCurvature:
         return (primitive(cells[:, 1]) - primitive(cells[:, 0])) / np.diff(cells, axis=1)
 
     @property
-    def roughness(self) -> NDArray[np.float64]:
+    def roughness(self) -> NDArray[np.floating]:
         """Second differences (n_coefficients - 2, n_coefficients) of the coefficients."""
         return np.diff(np.eye(self.n_coefficients), n=2, axis=0)

@@ -13,6 +13,7 @@ import numpy as np
 
 from dlo_casadi.config import Config
 from dlo_casadi.declared import Declared, declared_model, straight
+from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import Fit, fit_model, refine_mesh
@@ -20,6 +21,7 @@ from dlo_casadi.estimation.mesh import discretization_error
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import stiffness_interval
 from dlo_casadi.estimation.stiffness import fit_stiffness
+from dlo_casadi.findings import candidate_rows, effect_rows, next_pose_row, unexplained_row
 from dlo_casadi.measure import read_poses
 from dlo_casadi.model import CableModel
 from dlo_casadi.outcome import Discretization, MeasurementSummary, Outcome, PoseInput, Stage
@@ -118,7 +120,7 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     stages.append(fit_stage("batch", fit, measured, stiffness_interval(fit), reported))
     clock.lap("fit")
     warnings += _fit_warnings(fit, error)
-    return Outcome(
+    outcome = Outcome(
         config=config,
         poses=inputs,
         measurement=_summary(config, measured, fit),
@@ -128,6 +130,63 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
         fit=fit,
         warnings=tuple(warnings),
         versions=versions(),
+    )
+    if not config.diagnosis.enabled:
+        return outcome
+    return close_the_loop(outcome, measured, reported, _center(inputs), clock, progress)
+
+
+def close_the_loop(
+    outcome: Outcome,
+    measured: Sequence[MeasuredPose],
+    reported: Sequence[str],
+    center: tuple[float, float] | None,
+    clock: _Clock,
+    progress: Progress,
+) -> Outcome:
+    """Diagnose the declared model's residual and add what is missing.
+
+    Parameters
+    ----------
+    reported : sequence of str
+        Parameters of effects that the configuration declares.
+    """
+    options = outcome.config.diagnosis
+    diagnosis = diagnose(
+        outcome.fit,
+        center=center,
+        exclude=options.exclude,
+        significance=options.significance,
+        max_effects=options.max_effects,
+        step=progress.step,
+    )
+    fit, stages, mesh = diagnosis.after, list(outcome.stages), outcome.discretization
+    if diagnosis.added:
+        fit, error = fine_enough(fit, fit.model.n)
+        mesh = Discretization(fit.model.n, fit.model.element, error)
+        diagnosis = replace(diagnosis, after=fit)
+    interval = stiffness_interval(fit)
+    if diagnosis.added:
+        labels = {item.candidate.effect.label for item in diagnosis.added}
+        names = [name for name in fit.model.names if name.split(".")[0] in labels]
+        stages.append(fit_stage("closed", fit, measured, interval, [*reported, *names]))
+    elif diagnosis.pull is None:
+        # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
+        stages[-1] = fit_stage("batch", fit, measured, interval, reported)
+    clock.lap("diagnosis")
+    return replace(
+        outcome,
+        fit=fit,
+        measurement=_summary(outcome.config, measured, fit),
+        stages=tuple(stages),
+        discretization=mesh,
+        timing=clock.total(),
+        verdict=diagnosis.verdict,
+        effects=effect_rows(diagnosis),
+        candidates=candidate_rows(diagnosis),
+        unexplained=unexplained_row(diagnosis),
+        next_pose=next_pose_row(diagnosis),
+        diagnosis=diagnosis,
     )
 
 
@@ -145,16 +204,24 @@ def fit_declared(
     fit = fit_model(
         model, measured, declared.tolerances, std, free=free, values=declared.start_values()
     )
-    size = finest or 2 * FIRST_MESH
+    if finest:
+        fit = refine_mesh(fit, finest, estimate=std is None)
+        return fit, discretization_error(fit)
+    return fine_enough(fit, 2 * FIRST_MESH)
+
+
+def fine_enough(fit: Fit, n: int) -> tuple[Fit, float]:
+    """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
+
+    Where an effect is missing, the mesh need not be finer than what is missing.
+    """
     while True:
-        if size != fit.model.n:
-            fit = refine_mesh(fit, size, estimate=std is None)
+        if n != fit.model.n:
+            fit = refine_mesh(fit, n, estimate=not fit.noise.declared)
         error = discretization_error(fit)
-        # Where an effect is missing, the mesh need not be finer than what is missing.
-        worth = max(fit.noise.std, fit.residual_rms)
-        if finest or error <= MESH_SHARE * worth or size >= FINEST_MESH:
+        if error <= MESH_SHARE * max(fit.noise.std, fit.residual_rms) or n >= FINEST_MESH:
             return fit, error
-        size *= 2
+        n *= 2
 
 
 def before_stages(

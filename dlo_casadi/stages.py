@@ -23,7 +23,7 @@ from dlo_casadi.outcome import (
     StageName,
 )
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 _CURVE_POINTS = 201
 _REST_POINTS = 41

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi.effects import EFFECTS, ClampAngle, Effect, ImageDistortion
 from dlo_casadi.model import CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # Places along the cable at which local effects are tried, as shares of its length.
 PLACES = np.linspace(0.06, 0.94, 23)

@@ -23,7 +23,7 @@ from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.sweep import Shapes
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # Stretches into which the arc of a single pose is cut.
 STRETCHES = 5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,8 @@ from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_o
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import Fit, fit_model, settle
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
+Verdict = Literal["complete", "effect_found", "unexplained"]
 
 # Candidates that are refitted at most in one step, and the share of the leading score below
 # which one is not worth a refit.
@@ -93,7 +95,7 @@ class Diagnosis:
     proposal_for: tuple[str, ...] = field(default_factory=tuple)
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Verdict:
         """Whether the model is complete, an effect was found, or structure is left."""
         if self.pull is not None:
             return "unexplained"

@@ -11,7 +11,7 @@ from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.prediction import predict_poses
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # End poses that are tried, drawn within the reach that the session has explored.
 TRIED = 30

@@ -13,7 +13,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import Fit, fit_model
 from dlo_casadi.model import DEVIATIONS
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # Places kept from the scan for a full fit, and the rise of twice the objective that bounds the
 # interval (95 % of chi-square with one degree of freedom).

@@ -27,11 +27,11 @@ from scipy.stats import chi2, f
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.sweep import Shapes
+from dlo_casadi.estimation.sweep import Shapes, Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # Directions whose information is below this share of what it was before projection are not
 # told apart from the fit's own.
@@ -90,7 +90,7 @@ class Screen:
         for name, value in zip(fit.model.names, fit.p, strict=True):
             p[self.model.names.index(name)] = value
         self.p = p
-        self.sweep = None
+        self.sweep: Sweep | None = None
 
     def normal(self, scan: dict[str, float]) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
         """Normal equations of the extended model with the scanned parameters set."""

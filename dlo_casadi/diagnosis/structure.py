@@ -11,8 +11,9 @@ from scipy.stats import chi2, f, norm
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.noise import smooth_modes
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
+NO_DEVIATION = (np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
 # Slow sines per pose in which a missing effect would show.
 MODES = 6
 
@@ -64,14 +65,14 @@ def structure_of(fit: Fit) -> Structure:
     problem, lin, normal = fit.problem, fit.linearization, fit.normal
     model = fit.model
     coefficients, own, arms = [], [], []
-    inner = normal.inner or [None] * len(problem.used)
+    inner = normal.inner or [NO_DEVIATION] * len(problem.used)
     for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
         modes = smooth_modes(s, model.cable.length, MODES, model.end == "free")
         basis, _ = np.linalg.qr(problem.whitening(j, s) @ modes)
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
         covariance = np.eye(basis.shape[1])
         block = inner[k]
-        if block is not None:
+        if block is not NO_DEVIATION:
             solved = np.linalg.solve(block[0], np.column_stack([b.T, block[1]]))
             covariance -= b @ solved[:, : len(b)]
             a = a - b @ solved[:, len(b) :]
@@ -82,9 +83,9 @@ def structure_of(fit: Fit) -> Structure:
     arm = np.concatenate(arms)
     covariance = -arm @ fit.covariance @ arm.T
     at = 0
-    for block in own:
-        covariance[at : at + len(block), at : at + len(block)] += block
-        at += len(block)
+    for part in own:
+        covariance[at : at + len(part), at : at + len(part)] += part
+        at += len(part)
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     kept = values > 0.05
     along = vectors[:, kept].T @ stacked

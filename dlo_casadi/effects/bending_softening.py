@@ -41,9 +41,10 @@ class BendingSoftening(SectionLaw):
         return (Parameter("softness", "m", scale=0.1 * cable.length, lower=0.0, upper=1e3),)
 
     def factor(
-        self, bend: ca.SX, cells: NDArray[np.float64], cable: Cable, params: Params
+        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
     ) -> ca.SX:
         """Energy over EI k^2 / 2: 2 int_0^1 t / (1 + t |k|/c) dt, by quadrature in t."""
         delta = _ROUNDING * cable.curvature_scale
         ratio = params["softness"] * (ca.sqrt(bend * bend + delta**2) - delta)
-        return sum(2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True))
+        terms = [2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)]
+        return sum(terms, start=ca.SX.zeros(bend.shape))

@@ -101,7 +101,7 @@ class SectionLaw(Effect):
     slot: ClassVar[str] = "section"
 
     def factor(
-        self, bend: ca.SX, cells: NDArray[np.float64], cable: Cable, params: Params
+        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
     ) -> ca.SX:
         """Factor on the bending energy EI/2 (curvature - rest curvature)^2 of each cell.
 

@@ -30,15 +30,15 @@ class StiffSection(SectionLaw):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the section's ends and its factor."""
-        place = {"scale": 0.05 * cable.length, "lower": 0.0, "upper": cable.length}
+        length = cable.length
         return (
-            Parameter("start", "m", nominal=0.45 * cable.length, scan=True, **place),
-            Parameter("end", "m", nominal=0.55 * cable.length, scan=True, **place),
+            Parameter("start", "m", 0.45 * length, 0.05 * length, 0.0, length, scan=True),
+            Parameter("end", "m", 0.55 * length, 0.05 * length, 0.0, length, scan=True),
             Parameter("factor", nominal=1.0, scale=0.5, lower=0.02, upper=100.0),
         )
 
     def factor(
-        self, bend: ca.SX, cells: NDArray[np.float64], cable: Cable, params: Params
+        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
     ) -> ca.SX:
         """Harmonic mean of the stiffness over each cell."""
         low, high = ca.DM(cells[:, 0]), ca.DM(cells[:, 1])

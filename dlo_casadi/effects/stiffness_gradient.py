@@ -28,7 +28,7 @@ class StiffnessGradient(SectionLaw):
         return (Parameter("slope", scale=0.2, lower=-0.95, upper=0.95),)
 
     def factor(
-        self, bend: ca.SX, cells: NDArray[np.float64], cable: Cable, params: Params
+        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
     ) -> ca.SX:
         """Mean of the linear stiffness over each cell."""
         return 1 + params["slope"] * ca.DM(cells.mean(axis=1) * 2 / cable.length - 1)

@@ -19,6 +19,7 @@ Hessian is exact.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -28,9 +29,9 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import NodeCurve, normal_rows
 from dlo_casadi.estimation.sweep import Shapes
-from dlo_casadi.model import DEVIATIONS
+from dlo_casadi.model import DEVIATIONS, CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # Feet that move less than this share of the noise between solves have settled.
 FEET_TOLERANCE = 1e-3
@@ -195,8 +196,8 @@ class _BatchNlp:
         )
 
     @staticmethod
-    def _n_z(model: object) -> int:
-        return int(model.shape.size1_out(0))  # type: ignore[attr-defined]
+    def _n_z(model: CableModel) -> int:
+        return int(model.shape.size1_out(0))
 
     def _split(self, own: ca.SX, n_dev: int) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         a, b, c = self.n_phi, self.n_phi + self.n_lam, self.n_phi + self.n_lam + n_dev
@@ -204,7 +205,7 @@ class _BatchNlp:
 
     def solve(
         self, point: Point, rows: tuple[FloatArray, ...], targets: tuple[FloatArray, ...]
-    ) -> tuple[FloatArray, dict[str, object], float]:
+    ) -> tuple[FloatArray, dict[str, Any], float]:
         """One IPOPT run with frozen feet."""
         problem = self.problem
         rests = problem.sweep.rests(

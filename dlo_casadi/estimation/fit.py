@@ -24,7 +24,7 @@ from dlo_casadi.estimation.sweep import Shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # Decades about the prior stiffness from which fits are started.
 DECADES = (0, -1, 1, -2, 2, -3, 3)

@@ -24,7 +24,10 @@ from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve, normal_ro
 from dlo_casadi.estimation.sweep import Sensitivities, Shapes, Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
+
+# Precision in scaled units below which a direction counts as undetermined.
+NO_INFORMATION = 1e-6
 
 
 @dataclass(frozen=True)
@@ -215,7 +218,7 @@ class BatchProblem:
         p, rest = self.unknowns.p(point.theta), self.unknowns.rest(point.theta)
         z, by_x, by_p, by_dev = self.sweep.observe(point.shapes, p, rest)
         columns = self.sweep.used_deviations
-        out: tuple[list[FloatArray], ...] = ([], [], [], [], [])
+        out = Linearization([], [], [], [], [], sens)
         for j, s in zip(self.used, point.feet, strict=True):
             curve = NodeCurve.of(self.unknowns.model.chain, z[j])
             normals = curve.normals(s)
@@ -224,21 +227,21 @@ class BatchProblem:
             d = ((self.measured[j].points - curve.at(s)) * normals).sum(axis=1)
             theta_z = by_x[j] @ sens.theta[j] + by_p[j] @ slopes
             deviation_z = (by_x[j] @ sens.deviation[j] + by_dev[j])[:, columns]
-            out[0].append(white @ d)
+            out.residuals.append(white @ d)
             directions = -rows @ np.concatenate([theta_z, deviation_z], axis=1)
             whitened = white @ directions
-            out[1].append(whitened[:, : slopes.shape[1]])
-            out[2].append(whitened[:, slopes.shape[1] :])
-            out[3].append(d)
-            out[4].append(directions)
-        return Linearization(*out, shapes=sens)
+            out.by_theta.append(whitened[:, : slopes.shape[1]])
+            out.by_deviation.append(whitened[:, slopes.shape[1] :])
+            out.raw.append(d)
+            out.raw_directions.append(directions)
+        return out
 
     def normal_equations(self, point: Point, lin: Linearization) -> Normal:
         """Gauss-Newton normal equations of theta, deviations eliminated."""
         gap = point.theta - self.mean
         hessian = self.precision.copy()
         gradient = self.precision @ gap
-        inner = []
+        inner: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         precision = np.diag(1 / self.deviation_std**2)
         columns = self.sweep.used_deviations
         for k, j in enumerate(self.used):
@@ -259,7 +262,8 @@ class BatchProblem:
         """Damped step of theta within its bounds, and the deviations that go with it."""
         lower, upper = self.unknowns.bounds
         scale = np.maximum(np.diag(normal.hessian), 1e-12)
-        matrix = normal.hessian + damping * np.diag(scale)
+        # A direction without any information (the place of a mass of zero) must not move.
+        matrix = normal.hessian + damping * np.diag(scale) + NO_INFORMATION * np.eye(len(scale))
         step = -np.linalg.solve(matrix, normal.gradient)
         new = point.theta + step
         if np.any(new < lower) or np.any(new > upper):

@@ -10,7 +10,7 @@ from dlo_casadi.estimation.fit import Fit, on_other_mesh
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 
 def on_mesh(fit: Fit, n: int) -> tuple[Sweep, Shapes, FloatArray, bool]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 Kernel = Literal["exponential", "matern", "gaussian"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi.chain import Chain
 from dlo_casadi.equilibrium import Pose
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.model import DEVIATIONS, CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from dlo_casadi.estimation.observation import (
 from dlo_casadi.estimation.sweep import Shapes
 from dlo_casadi.model import DEVIATIONS, CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 _KINEMATIC_STEPS = 8
 
@@ -39,7 +39,7 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     m = len(problem.measured)
     flat = np.zeros(chain.n_cells)
     phi = np.array([guesses(model, item.pose, flat)[0] for item in problem.measured])
-    feet = []
+    feet: list[FloatArray] = []
     for j in used:
         places = chord_places(problem.measured[j], chain.length)
         phi[j] = _polyline_headings(problem.measured[j], model, places)
@@ -75,7 +75,7 @@ def _kinematic_step(
     rough = penalty * 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
     axes = [np.tile(axis, (len(s), 1)) for axis in ([1.0, 0.0], [0.0, 1.0])]
     system = [normal_rows(curve, s, axis) @ slopes for axis in axes] + [rough]
-    target = [gap[:, 0], gap[:, 1], -rough @ phi]
+    target: list[FloatArray] = [gap[:, 0], gap[:, 1], -rough @ phi]
     if item.pose.end is not None:
         system.append(10 * slopes[[chain.n, 2 * chain.n + 1]])
         target.append(10 * (np.array(item.pose.end) - curve.nodes[-1]))

@@ -14,7 +14,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 from dlo_casadi.model import DEVIATIONS, CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 # Steps per decade of the first search, over three decades to both sides of the prior.
 _PER_DECADE = 3

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose, is_stable
 from dlo_casadi.model import DEVIATIONS, CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ class Shapes:
 class Sensitivities:
     """Derivatives of the stacked equilibria.
 
-    `theta` (m, N, size) by the unknowns, `deviation` (m, N, len(DEVIATIONS)) by each pose's own deviation;
-    N counts headings and multipliers.
+    `theta` (m, N, size) by the unknowns, `deviation` (m, N, len(DEVIATIONS)) by each pose's own
+    deviation; N counts headings and multipliers.
     """
 
     theta: FloatArray
@@ -61,8 +62,12 @@ class _Mapped:
 
     def __init__(self, function: ca.Function, m: int) -> None:
         self._function = function if m == 1 else function.map(m)
+        # Any: CasADi's stubs do not know that a buffer takes NumPy's memory.
+        self._buffer: Any
         self._buffer, self._run = self._function.buffer()
-        self._inputs = [np.zeros((m, function.size1_in(i))) for i in range(function.n_in())]
+        self._inputs: list[Any] = [
+            np.zeros((m, function.size1_in(i))) for i in range(function.n_in())
+        ]
         self._shapes = [
             (m, function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
         ]
@@ -73,9 +78,9 @@ class _Mapped:
         """Arguments (m, rows) or (rows,) for all alike -> outputs (m, rows, columns)."""
         for block, value in zip(self._inputs, arguments, strict=True):
             block[...] = value
-        outputs = [np.zeros(shape) for shape in self._shapes]
-        for i, block in enumerate(outputs):
-            self._buffer.set_res(i, memoryview(block))
+        outputs: list[Any] = [np.zeros(shape) for shape in self._shapes]
+        for i, out in enumerate(outputs):
+            self._buffer.set_res(i, memoryview(out))
         self._run()
         return [block.transpose(0, 2, 1) for block in outputs]
 

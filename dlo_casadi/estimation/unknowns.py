@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.model import CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
 
 # A weak prior of the rest curvature: a turn per length, one standard deviation.

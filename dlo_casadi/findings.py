@@ -1,0 +1,96 @@
+"""A diagnosis in the report's own terms: effects, candidates, what is unexplained, what next."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dlo_casadi.diagnosis.diagnose import AddedEffect, Diagnosis
+from dlo_casadi.estimation.fit import Fit
+
+
+def effect_rows(diagnosis: Diagnosis) -> tuple[dict[str, Any], ...]:
+    """Effects that were added, as in report.json."""
+    return tuple(_effect_row(item, diagnosis.after) for item in diagnosis.added)
+
+
+def _effect_row(item: AddedEffect, fit: Fit) -> dict[str, Any]:
+    return {
+        "name": item.candidate.name,
+        "parameters": effect_parameters(fit, item.candidate.effect.label),
+        "p_value": item.p_value,
+        "rmse_cross_validated_before": item.before.rmse,
+        "rmse_cross_validated_after": item.after.rmse,
+        "indistinguishable_from": [rival.candidate.name for rival in item.rivals],
+    }
+
+
+def effect_parameters(fit: Fit, label: str) -> dict[str, dict[str, Any]]:
+    """Value, standard deviation and unit of an effect's parameters.
+
+    Parameters that vanish at infinity are estimated as their inverse; both are given.
+    """
+    rows: dict[str, dict[str, Any]] = {}
+    for parameter in fit.model.parameters:
+        if not parameter.name.startswith(f"{label}."):
+            continue
+        short = parameter.name.split(".", 1)[1]
+        value, std = fit.value(parameter.name), fit.std(parameter.name)
+        rows[short] = {"value": value, "std": std, "unit": parameter.unit}
+        inverse = INVERSES.get((label, short))
+        if inverse is not None:
+            name, unit = inverse
+            known = value > 0
+            rows[name] = {
+                "value": 1 / value if known else None,
+                "std": std / value**2 if known else None,
+                "unit": unit,
+            }
+    return rows
+
+
+# Estimated parameter -> the name and unit under which its inverse is known.
+INVERSES = {
+    ("bending_softening", "softness"): ("curvature_scale", "1/m"),
+    ("axial_stretch", "compliance"): ("axial_stiffness", "N"),
+}
+
+
+def candidate_rows(diagnosis: Diagnosis) -> tuple[dict[str, Any], ...]:
+    """All candidates that were tried, ranked."""
+    return tuple(
+        {
+            "name": row.name,
+            "score": row.score,
+            "p_value": row.p_value,
+            "rmse_cross_validated": row.rmse_cross_validated,
+        }
+        for row in diagnosis.ranked
+    )
+
+
+def unexplained_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
+    """The load that assumes no cause, or None."""
+    pull = diagnosis.pull
+    if pull is None:
+        return None
+    problem = pull.fit.problem
+    return {
+        "force": [float(x) for x in pull.force_per_pose.mean(axis=0)],
+        "force_per_pose": np.asarray(pull.force_per_pose).tolist(),
+        "poses": [problem.measured[j].pose.name for j in problem.used],
+        "position": pull.position,
+        "interval_95": [pull.interval[0], pull.interval[1]],
+    }
+
+
+def next_pose_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
+    """The pose that separates rival explanations, or None."""
+    if diagnosis.proposal is None:
+        return None
+    return {
+        "end": list(diagnosis.proposal.end),
+        "separates": list(diagnosis.proposal_for),
+        "expected_difference_m": diagnosis.proposal.difference,
+    }
