@@ -22,6 +22,8 @@ Branch = Literal["ccw", "cw"]
 JOINT_BOUND = np.pi / 2
 # Largest violation of an end condition [m or rad] of an accepted equilibrium.
 END_TOLERANCE = 1e-8
+# Largest imbalance, relative to the tangent matrix, at which tiny steps are rounding.
+ROUNDING = 1e-12
 
 
 class Status(Enum):
@@ -293,11 +295,16 @@ def _from_start(
     residual = float(gap.max()) if gap.size else 0.0
     arguments = (phi, lam, p, rest, ends, deviation)
     energy, nodes = model.energy(*arguments)
-    _, matrix = model.kkt(*arguments)
+    force, matrix = (np.array(block) for block in model.kkt(*arguments))
+    # On fine meshes of stiff cables IPOPT's tolerance lies below rounding: it stops at the
+    # minimum all the same, and complains of its tiny steps.
+    stalled = stats["return_status"] == "Search_Direction_Becomes_Too_Small"
+    balanced = np.abs(force).max() <= ROUNDING * np.abs(matrix).max()
+    solved = stats["success"] or (stalled and balanced)
     bend = float(np.abs(np.diff(phi)).max())
-    if not stats["success"] or residual > END_TOLERANCE or not np.isfinite(float(energy)):
+    if not solved or residual > END_TOLERANCE or not np.isfinite(float(energy)):
         status = Status.FAILED
-    elif is_stable(np.array(matrix), model.n_conditions) or bend > JOINT_BOUND - 1e-6:
+    elif is_stable(matrix, model.n_conditions) or bend > JOINT_BOUND - 1e-6:
         status = Status.STABLE
     else:
         status = Status.UNSTABLE

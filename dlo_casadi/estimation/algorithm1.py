@@ -35,7 +35,7 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.initial import arc_headings
 from dlo_casadi.model import CableModel
 
-FloatArray = NDArray[np.float64]
+FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
 Inner = Literal["ipopt", "cobyla"]
 
@@ -418,7 +418,8 @@ def run_algorithm1(
     shapes = [
         problem.first_guess(item.pose, target) for item, target in zip(used, targets, strict=True)
     ]
-    k_theta, theta_0 = cable.bending_stiffness / problem.chain.h, np.zeros(n - 1)
+    k_theta = cable.bending_stiffness / problem.chain.h
+    theta_0: FloatArray = np.zeros(n - 1)
     history = [k_theta]
     calm, failed = 0, 0
     status: Algorithm1Status | None = None

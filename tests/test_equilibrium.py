@@ -1,0 +1,426 @@
+"""Equilibria against closed forms, the paper's table, an independent integrator and balances."""
+
+import csv
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy.integrate import solve_bvp
+from scipy.optimize import brentq
+from scipy.special import ellipe, ellipk
+
+from dlo_casadi.config import load_config
+from dlo_casadi.effects import AxialStretch, Cable, EndSpring, LumpedMass, PointForce
+from dlo_casadi.equilibrium import Equilibrium, Pose, Status, solve_equilibrium
+from dlo_casadi.errors import EquilibriumError
+from dlo_casadi.model import CableModel
+
+DATA = Path(__file__).parent / "data"
+BOTH = pytest.mark.parametrize("element", ["arc", "link"])
+WEIGHTLESS = (0.0, 0.0)  # m/s^2
+MESHES = (10, 20, 40)
+
+
+def solve(model: CableModel, stiffness: float, pose: Pose, rest: float = 0.0, **extra):
+    """Equilibrium of a cable of constant rest curvature [1/m] without effects."""
+    return solve_equilibrium(
+        model, np.array([stiffness]), np.full(model.chain.n_cells, rest), pose, **extra
+    )
+
+
+def orders(errors: list) -> np.ndarray:
+    return np.log2(np.divide(errors[:-1], errors[1:]))
+
+
+# ---- the paper's table -------------------------------------------------------------------------
+
+
+def test_energies_of_table_4():
+    """All twelve V(theta^0, alpha^0) of Quartaro et al. 2025, printed with two decimals.
+
+    Ends on a grid of one inch, a cable of 0.8125 m, k_theta = 949.56 N m/rad, ten links, turning
+    counter-clockwise; the last one starts steeper than -pi/2.
+    """
+    length, n, k_theta = 0.8125, 10, 949.56
+    stiffness = k_theta * length / n
+    model = CableModel(Cable(length, 0.23, 0.0128, stiffness), n=n, element="link")
+    with (DATA / "paper" / "table4.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 12
+    for row in rows:
+        end = (0.0254 * float(row["grid_x"]), 0.0254 * float(row["grid_y"]))
+        found = solve(model, stiffness, Pose((0.0, 0.0), end, branch="ccw"))
+        assert found.stable
+        # The print gives 0.005 J, COBYLA's end point the rest: within 0.03 J on all twelve.
+        assert found.energy == pytest.approx(float(row["V_theta0_alpha0_J"]), abs=0.04), end
+
+
+# ---- closed forms, and the order of both elements ----------------------------------------------
+
+
+@BOTH
+def test_limp_cable_converges_to_the_catenary(element):
+    """L = 2a sinh(s/2a), sag = a (cosh(s/2a) - 1), H = w a  [Irvine, Cable Structures, 1981]."""
+    span, length, weight = 0.6, 1.0, 0.5  # m, m, N/m
+    stiffness = 1e-8  # N m^2: changes sag and H by about EI / (w a^2 L) = 1e-7
+    a = brentq(lambda a: 2 * a * np.sinh(span / (2 * a)) - length, 0.05, 10.0)
+    exact = np.array([a * (np.cosh(span / (2 * a)) - 1), weight * a])  # sag [m], H [N]
+    errors = []
+    # Arcs are of fourth order here and would reach the effect of EI at n = 64.
+    for n in (16, 32, 64) if element == "link" else (8, 16, 32):
+        model = CableModel(Cable(length, weight * length / 9.81, 0.005, stiffness), n, element)
+        hung = solve(model, stiffness, Pose((0.0, 0.0), (span, 0.0), branch="ccw"))
+        assert hung.stable
+        errors.append(np.abs([-hung.points[:, 1].min(), -hung.lam[0]] - exact))
+    # The end's pin is pulled inwards, and down by half of the weight (exact on any mesh).
+    assert hung.lam == pytest.approx([-exact[1], -weight * length / 2], rel=1e-3)
+    assert np.all(orders(errors) > 1.9), f"measured orders {orders(errors)}"
+
+
+def cantilever(stiffness: float, weight: float, length: float, heading: float):
+    """Heavy rod clamped at its start: EI phi'' = w (L - s) cos phi, phi(0) given, phi'(L) = 0."""
+
+    def slope(s, y):
+        moment_slope = weight * (length - s) * np.cos(y[0])
+        return np.array([y[1], moment_slope / stiffness, np.cos(y[0]), np.sin(y[0])])
+
+    s = np.linspace(0.0, length, 101)
+    guess = np.array([heading - s, -1 + 0 * s, s, -0.3 * s])
+    found = solve_bvp(
+        slope,
+        lambda a, b: np.array([a[0] - heading, b[1], a[2], a[3]]),
+        s,
+        guess,
+        tol=1e-10,
+        max_nodes=10000,
+    )
+    assert found.success
+    return found.sol
+
+
+@BOTH
+def test_heavy_cantilever_against_an_integrator(element):
+    """Shape at the middle and at the end, bending moment at the clamp; w L^3 / EI = 20."""
+    stiffness, weight, length, heading = 0.05, 2.0, 0.8, 0.3  # N m^2, N/m, m, rad
+    exact = cantilever(stiffness, weight, length, heading)
+    errors = []
+    for n in MESHES:
+        cable = Cable(length, weight * length / 9.81, 0.01, stiffness)
+        model = CableModel(cable, n, element, start="clamped", end="free")
+        bent = solve(model, stiffness, Pose((0.0, 0.0), start_heading=heading))
+        assert bent.stable
+        np.testing.assert_allclose(bent.lam, 0.0)
+        gaps = [np.hypot(*(bent.points[k] - exact(k * length / n)[2:])) for k in (n // 2, n)]
+        if element == "arc":  # the clamp's moment: force times lever of the weight
+            lever = weight * np.trapezoid(exact(np.linspace(0, length, 4001))[2], dx=length / 4000)
+            gaps.append(abs(abs(bent.moments[0]) - lever))
+        errors.append(gaps)
+    assert np.all(orders(errors) > 1.9), f"measured orders {orders(errors)}"
+
+
+def elastica(slope: float, length: float, stiffness: float) -> tuple[float, float, float]:
+    """Span [m], sag [m] and thrust [N] of a weightless strip that leaves its pins at `slope`.
+
+    k = sin(slope/2), P = EI (2K/L)^2, span = L (2E/K - 1), sag = L k/K  [Love, 1927, art. 263].
+    """
+    m = np.sin(slope / 2) ** 2
+    k, e = ellipk(m), ellipe(m)
+    thrust = stiffness * (2 * k / length) ** 2
+    return length * (2 * e / k - 1), length * np.sqrt(m) / k, thrust
+
+
+@BOTH
+@pytest.mark.parametrize("slope", [0.3, 1.0, 2.0])  # rad; at 2.0 the pins are close together
+def test_pinned_elastica(element, slope):
+    length, stiffness = 1.0, 0.3
+    span, sag, thrust = elastica(slope, length, stiffness)
+    errors = []
+    for n in MESHES:
+        model = CableModel(Cable(length, 0.1, 0.01, stiffness), n, element, gravity=WEIGHTLESS)
+        bent = solve(model, stiffness, Pose((0.0, 0.0), (span, 0.0), branch="ccw"))
+        assert bent.stable
+        assert bent.lam[1] == pytest.approx(0.0, abs=1e-8)  # IPOPT's tol, times EI / L^2
+        errors.append([abs(bent.lam[0] - thrust), abs(-bent.points[n // 2, 1] - sag)])
+    assert np.all(orders(errors) > 1.9), f"measured orders {orders(errors)}"
+
+
+def test_rest_curvature_alone_is_a_circle():
+    """Nothing loads the cable: arcs are exact, chords of links converge at second order."""
+    length, stiffness, kappa = 0.8, 0.05, 3.0
+    tip = np.array([np.sin(kappa * length), 1 - np.cos(kappa * length)]) / kappa
+    errors: dict[str, list[float]] = {"arc": [], "link": []}
+    for element, gaps in errors.items():
+        for n in MESHES:
+            model = CableModel(
+                Cable(length, 0.1, 0.01, stiffness), n, element, "clamped", "free", WEIGHTLESS
+            )
+            bent = solve(model, stiffness, Pose((0.0, 0.0), start_heading=0.0), kappa)
+            assert bent.energy == pytest.approx(0.0, abs=1e-12)
+            assert bent.min_bend_radius == pytest.approx(1 / kappa, rel=1e-6)
+            gaps.append(float(np.hypot(*(bent.points[-1] - tip))))
+    # An arc's three Gauss points: n h d^6 / 2e6 with elements that turn by d = 0.24.
+    assert max(errors["arc"]) < 1e-9
+    assert np.all(orders(errors["link"]) > 1.9), f"measured orders {orders(errors['link'])}"
+
+
+def test_end_moment_gives_constant_curvature():
+    """M = k (heading - phi(L)) and kappa = M / EI:  kappa = k heading / (EI + k L)."""
+    length, stiffness, spring, heading = 0.8, 0.05, 0.2, 1.5
+    kappa = spring * heading / (stiffness + spring * length)
+    cable = Cable(length, 0.1, 0.01, stiffness)
+    model = CableModel(cable, 6, "arc", "clamped", "free", WEIGHTLESS, effects=(EndSpring(),))
+    p = np.array([stiffness, spring, heading])
+    bent = solve_equilibrium(model, p, np.zeros(6), Pose((0.0, 0.0), start_heading=0.0))
+    np.testing.assert_allclose(bent.curvature, kappa, rtol=1e-9)
+    moment = stiffness * kappa
+    assert abs(bent.moments[0]) == pytest.approx(moment, rel=1e-9)
+
+
+# ---- bench poses against a fine mesh -----------------------------------------------------------
+
+
+@cache
+def bench(name: str, n: int, element: str) -> list[np.ndarray]:
+    """Nodes of all poses of a session with its true stiffness and rest curvature, no effects."""
+    config = load_config(DATA / "bench" / name / "session.yaml")
+    truth = yaml.safe_load((DATA / "bench_truth" / name / "truth.yaml").read_text())
+    data, stiffness = config.cable, truth["bending_stiffness"]
+    cable = Cable(data.length, data.mass, data.diameter, stiffness)
+    model = CableModel(cable, n, element, gravity=config.experiment.gravity)
+    places, kappa = (np.array(truth["rest_curvature"][key]) for key in ("s", "kappa"))
+    rest = []
+    for low, high in model.chain.cells:
+        s = np.linspace(low, high, 101)
+        rest.append(np.trapezoid(np.interp(s, places, kappa), s) / (high - low))
+    shapes = []
+    for item in config.experiment.poses:
+        pose = Pose(item.start, item.end, branch="ccw", name=item.name)
+        shapes.append(solve_equilibrium(model, np.array([stiffness]), np.array(rest), pose).points)
+    return shapes
+
+
+def node_error(name: str, n: int, element: str) -> float:
+    """Largest error of a node [m] over all poses, against 320 arcs at the same arc lengths."""
+    fine = bench(name, 320, "arc")
+    pairs = zip(bench(name, n, element), fine, strict=True)
+    return max(np.hypot(*(coarse - exact[:: 320 // n]).T).max() for coarse, exact in pairs)
+
+
+def test_ten_arcs_are_five_times_closer_than_ten_links():
+    """On the eighteen poses of the bench cable, as its session without effects has them."""
+    arc, link = node_error("clean", 10, "arc"), node_error("clean", 10, "link")
+    assert arc < link / 5, f"arc {arc * 1e3:.3f} mm, link {link * 1e3:.3f} mm"
+    assert arc < 3e-4  # a third of the links' best
+
+
+@pytest.mark.parametrize("name", ["taper", "orange"])
+def test_both_elements_converge_on_bench_poses(name):
+    """Rest curvature with features as short as an element: second order, arcs twice as close."""
+    errors = {e: [node_error(name, n, e) for n in (10, 20, 40)] for e in ("arc", "link")}
+    assert errors["arc"][0] < errors["link"][0] / 1.8
+    for element, gaps in errors.items():
+        measured = np.log2(gaps[0] / gaps[-1]) / 2
+        assert measured > 1.9, f"{element}: mean order {measured:.2f}, errors {gaps}"
+
+
+def test_stiff_cable_on_a_fine_mesh():
+    """EI/h = 30000 N m: IPOPT stops at rounding, which is no failure."""
+    fine, coarse = bench("weightless_fit", 320, "arc"), bench("weightless_fit", 80, "arc")
+    # Second order: 0.3 mm at n = 10 leaves 0.005 mm at n = 80.
+    for one, other in zip(fine, coarse, strict=True):
+        np.testing.assert_allclose(one[::4], other, atol=1e-5)
+
+
+# ---- balances ----------------------------------------------------------------------------------
+
+HEAVY = Cable(length=0.8, mass=0.25, diameter=0.01, bending_stiffness=0.1)
+
+
+def hold(element: str, start=(0.0, 0.0), end=(0.5, 0.1)) -> Equilibrium:
+    effects = (LumpedMass(), PointForce())
+    model = CableModel(HEAVY, 10, element, effects=effects)
+    p = np.array([0.1, 0.05, 0.3, 0.2, 0.4, 0.55])
+    rest = np.full(model.chain.n_cells, 0.7)
+    return solve_equilibrium(model, p, rest, Pose(start, end, branch="ccw"))
+
+
+@BOTH
+def test_reactions_are_slopes_of_the_energy(element):
+    """-lam = dV/d(end), -lam_start = dV/d(start), by central differences of solved energies."""
+    held, d = hold(element), 1e-4
+    assert held.stable
+    for axis in (0, 1):
+        step = d * np.eye(2)[axis]
+        ends = [hold(element, end=tuple(np.array([0.5, 0.1]) + x)).energy for x in (step, -step)]
+        starts = [hold(element, start=tuple(x)).energy for x in (step, -step)]
+        # Third derivatives of order EI / L^4 ~ 0.1 to 10 N/m^2 times d^2 / 6, and energies good
+        # to 1e-10 J over 2 d.
+        assert -(ends[0] - ends[1]) / (2 * d) == pytest.approx(held.lam[axis], abs=2e-6)
+        assert -(starts[0] - starts[1]) / (2 * d) == pytest.approx(held.lam_start[axis], abs=2e-6)
+
+
+@BOTH
+def test_weight_and_reactions_sum_to_zero(element):
+    """The holders carry what hangs on the cable: its weight, the lump's, the point force."""
+    held = hold(element)
+    loads = np.array([0.2, 0.4 - 9.81 * (HEAVY.mass + 0.05)])
+    np.testing.assert_allclose(held.lam + held.lam_start, loads, atol=1e-10)
+
+
+@BOTH
+def test_moments_about_the_start_sum_to_zero(element):
+    """Pins hold no moment: that of the weight is that of the end's reaction."""
+    model = CableModel(HEAVY, 16, element)
+    held = solve(model, 0.1, Pose((0.0, 0.0), (0.6, -0.1)), rest=0.7)
+    middles = (held.points[1:] + held.points[:-1]) / 2
+    center = middles.mean(axis=0)
+    if element == "arc":  # Simpson's rule between neighbouring nodes
+        x = held.points[:, 0]
+        center = np.array([(x[0] + x[-1] + 4 * x[1::2].sum() + 2 * x[2:-1:2].sum()) / 48, 0.0])
+    weight_moment = -9.81 * HEAVY.mass * center[0]
+    end_moment = held.points[-1, 0] * held.lam[1] - held.points[-1, 1] * held.lam[0]
+    # Links: exact up to IPOPT's tol. Arcs: Simpson's rule over 16 elements, h^4 x''' L / 180.
+    assert end_moment == pytest.approx(weight_moment, abs=1e-8 if element == "link" else 1e-4)
+
+
+def test_a_turned_board_gives_a_turned_shape():
+    """Gravity, ends and shape turn together."""
+    angle = 0.9
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    model = CableModel(HEAVY, 12)
+    gravity = turn @ np.array(model.gravity)
+    turned = CableModel(HEAVY, 12, gravity=(float(gravity[0]), float(gravity[1])))
+    end = turn @ np.array([0.5, 0.1])
+    one = solve(model, 0.1, Pose((0.0, 0.0), (0.5, 0.1), branch="ccw"), 0.7)
+    other = solve(turned, 0.1, Pose((0.0, 0.0), (float(end[0]), float(end[1])), branch="ccw"), 0.7)
+    np.testing.assert_allclose(other.points, one.points @ turn.T, atol=1e-8)  # IPOPT's tol
+    np.testing.assert_allclose(other.lam, turn @ one.lam, atol=1e-7)
+    assert other.energy == pytest.approx(one.energy, abs=1e-9)
+
+
+# ---- stability and branches --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("share", "status"), [(0.97, Status.STABLE), (1.03, Status.UNSTABLE)])
+def test_straight_strut_about_the_euler_load(share, status):
+    """A strut that can shorten stays straight below P = pi^2 EI / L^2 and buckles above it.
+
+    EA = 1000 times that load: shortening changes it by 0.1 %, twenty arcs by 0.2 %.
+    """
+    length, stiffness = 1.0, 0.2
+    euler = np.pi**2 * stiffness / length**2
+    model = CableModel(
+        Cable(length, 0.1, 0.01, stiffness), 20, gravity=WEIGHTLESS, effects=(AxialStretch(),)
+    )
+    p = np.array([stiffness, 1 / (1000 * euler)])
+    end = (length * (1 - share / 1000), 0.0)
+    straight = solve_equilibrium(
+        model, p, np.zeros(20), Pose((0.0, 0.0), end), phi_init=np.zeros(21)
+    )
+    np.testing.assert_allclose(straight.phi, 0.0, atol=1e-8)
+    assert straight.lam[0] == pytest.approx(share * euler, rel=1e-6)
+    assert straight.status is status
+
+
+def test_second_mode_is_flagged_and_avoided():
+    """A strip bent to an S is in balance but not stable; on its own the solver bends it to a C."""
+    model = CableModel(Cable(1.0, 0.1, 0.01, 0.3), 16, gravity=WEIGHTLESS)
+    pose = Pose((0.0, 0.0), (0.8, 0.0))
+    s = model.chain.heading_places
+    double = solve(model, 0.3, pose, phi_init=0.9 * np.cos(2 * np.pi * s))
+    assert double.status is Status.UNSTABLE
+    assert not double.stable
+    np.testing.assert_allclose(double.points[8], [0.4, 0.0], atol=1e-6)  # odd about its middle
+    single = solve(model, 0.3, pose)
+    assert single.stable
+    # The second mode thrusts four times as hard as the first; both bend equally far, nearly.
+    assert double.lam[0] > 3.5 * single.lam[0]
+    assert double.energy > 3.5 * single.energy
+
+
+def test_two_branches_of_a_stiff_curved_cable():
+    """Bowed along its rest curvature or against it: both in balance, the first one lower."""
+    model = CableModel(Cable(0.8, 0.05, 0.01, 2.0), 16)
+    ends = {"start": (0.0, 0.0), "end": (0.6, 0.1)}
+    along, against = (solve(model, 2.0, Pose(**ends, branch=b), 0.8) for b in ("ccw", "cw"))
+    assert along.stable
+    assert against.stable
+    assert along.phi[-1] > along.phi[0]
+    assert against.phi[-1] < against.phi[0]
+    assert along.energy < against.energy
+    free = solve(model, 2.0, Pose(**ends), 0.8)
+    assert free.energy == pytest.approx(along.energy, abs=1e-9)  # the lower of the two
+
+
+# ---- special poses -----------------------------------------------------------------------------
+
+
+def test_clamped_loop_of_a_real_wire():
+    """White electric wire: 1.5 m from clamp to clamp, turning once clockwise on its way."""
+    stiffness = 1.2e-4
+    model = CableModel(
+        Cable(1.5, 0.0261, 0.0027, stiffness), 40, "arc", start="clamped", end="clamped"
+    )
+    pose = Pose((0.0, 0.0), (-0.12, 0.0), start_heading=0.0, end_heading=-2 * np.pi)
+    loop = solve(model, stiffness, pose)
+    assert loop.stable
+    np.testing.assert_allclose(loop.phi[[0, -1]], [0.0, -2 * np.pi], atol=1e-8)
+    np.testing.assert_allclose(loop.points[-1], pose.end, atol=1e-8)
+    # It mirrors about the middle between the clamps, and hangs below them.
+    mirrored = loop.points[::-1] * [-1, 1] + [-0.12, 0.0]
+    np.testing.assert_allclose(loop.points, mirrored, atol=1e-6)
+    assert -0.75 < loop.points[:, 1].min() < -0.5
+    # Uniform rest curvature multiplies the fixed turning: it drops out of the shape.
+    other = solve(model, stiffness, pose, rest=-3.0)
+    np.testing.assert_allclose(other.points, loop.points, atol=1e-6)
+
+
+@BOTH
+def test_both_ends_at_one_place(element):
+    """A loop that hangs from one nail, symmetric about the vertical through it."""
+    model = CableModel(Cable(0.8, 0.2, 0.01, 0.01), 20, element)
+    loop = solve(model, 0.01, Pose((0.2, 0.1), (0.2, 0.1)))
+    assert loop.stable
+    np.testing.assert_allclose(loop.points[-1], [0.2, 0.1], atol=1e-8)
+    np.testing.assert_allclose(
+        loop.points, loop.points[::-1] * [-1, 1] + [0.4, 0.0], atol=1e-6
+    )  # a tangent matrix of condition 1e3 times IPOPT's tol
+    assert loop.points[:, 1].min() < 0.1 - 0.25
+
+
+@BOTH
+def test_free_cable_hangs_straight_down(element):
+    model = CableModel(HEAVY, 8, element, end="free")
+    hung = solve(model, 0.1, Pose((0.3, 0.5)))
+    assert hung.stable
+    np.testing.assert_allclose(hung.points[:, 0], 0.3, atol=1e-8)
+    np.testing.assert_allclose(hung.points[-1], [0.3, 0.5 - HEAVY.length], atol=1e-8)
+    np.testing.assert_array_equal(hung.lam, 0.0)
+    np.testing.assert_allclose(hung.lam_start, [0.0, -9.81 * HEAVY.mass], atol=1e-12)
+
+
+def test_a_joint_at_its_bound_is_reported():
+    """Five links whose rest shape folds up are stopped at a right angle, by a moment."""
+    model = CableModel(HEAVY, 5, "link", "clamped", "free", WEIGHTLESS)
+    folded = solve(model, 0.1, Pose((0.0, 0.0), start_heading=0.0), rest=2.5 * np.pi / 2 / 0.16)
+    np.testing.assert_allclose(np.abs(folded.theta[1:]), np.pi / 2, atol=1e-6)
+    assert np.all(np.abs(folded.bound_multipliers) > 0.1)
+    relaxed = solve(model, 0.1, Pose((0.0, 0.0), start_heading=0.0), rest=1.0)
+    np.testing.assert_allclose(relaxed.bound_multipliers, 0.0, atol=1e-6)
+
+
+# ---- messages ----------------------------------------------------------------------------------
+
+
+def test_unreachable_pose_is_named_with_numbers():
+    model = CableModel(HEAVY, 8)
+    pose = Pose((0.0, 0.0), (0.6, 0.6), name="pose_07")
+    with pytest.raises(EquilibriumError, match=r"pose_07: no equilibrium") as caught:
+        solve(model, 0.1, pose)
+    assert "(0.6000, 0.6000) m is 0.8485 m from the start" in str(caught.value)
+    assert "the cable is 0.8000 m long" in str(caught.value)
+    assert "Try:" in str(caught.value)
+    assert caught.value.pose == "pose_07"
+    assert caught.value.p_des == (0.6, 0.6)
