@@ -11,10 +11,11 @@ from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.curve import SmoothCurve, chord_length, fit_curve
 from dlo_casadi.vision.refine import (
     Crossings,
+    EdgeShape,
     average,
     cable_direction,
     edge_shape,
-    fit_profiles,
+    find_edges,
     sample_profiles,
 )
 from dlo_casadi.vision.search import find_cable
@@ -23,7 +24,6 @@ from dlo_casadi.vision.workplane import rectify
 
 _MOST_POINTS = 400
 _SPACING = 0.0025  # m
-_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -93,21 +93,8 @@ def extract_centerline(
     plane = rectify(image, view, start=first, end=last, diameter=diameter, length=length)
     chain = find_cable(plane, start=first, end=last, diameter=diameter, length=length).chain
     curve, t = _first_curve(chain.strands, diameter, first, last)
-    bright = image.astype(np.float32)
-    profiles = sample_profiles(bright, view, curve, t, diameter)
-    good = profiles.inside & (t > t[0] + 2 * diameter) & (t < t[-1] - 2 * diameter)
-    direction = cable_direction(profiles, good, diameter)
-    shape = edge_shape(profiles, direction, good, diameter, 0.7 / view.scale)
-    for along, known in ((0.15, False), (0.15, False), (0.5, True)):
-        raw = sample_profiles(bright, view, curve, t, diameter)
-        profiles = average(raw, good if known else raw.inside, along * diameter)
-        crossings = fit_profiles(profiles, direction, good, shape)
-        sound = _sound(crossings, raw.inside, diameter)
-        good = good & sound if known else sound
-        if good.sum() < 10:
-            raise VisionError("no cable found")
-        points = curve.position(t) + crossings.offset[:, None] * curve.normal(t)
-        curve = fit_curve(t, points, good.astype(float), 2 * diameter, 0.5 * diameter)
+    curve, t, crossings, good = _refine(image, view, curve, t, diameter)
+    points = curve.position(t) + crossings.offset[:, None] * curve.normal(t)
     kept = np.nonzero(good)[0]
     step = max(_SPACING, (t[-1] - t[0]) / _MOST_POINTS)
     kept = kept[np.unique(np.floor(t[kept] / step), return_index=True)[1]]
@@ -118,13 +105,41 @@ def extract_centerline(
     coverage = min(1.0, seen / length)
     return Centerline(
         points,
-        np.maximum(crossings.std[kept], 0.03 / view.scale),
+        np.full(len(kept), 0.06 / view.scale),
         view.to_pixels(points),
         coverage,
         gaps,
         float(np.clip(coverage * good.mean(), 0, 1)),
         (),
     )
+
+
+def _refine(
+    image: NDArray[np.uint8], view: View, curve: SmoothCurve, t: Array, diameter: float
+) -> tuple[SmoothCurve, Array, Crossings, NDArray[np.bool_]]:
+    """Move the curve onto the middle between the cable's edges; tell which profiles show them."""
+    bright = image.astype(np.float32)
+    profiles = sample_profiles(bright, view, curve, t, diameter)
+    good = profiles.inside & (t > t[0] + 2 * diameter) & (t < t[-1] - 2 * diameter)
+    direction = cable_direction(profiles, good, diameter)
+    shape = EdgeShape(diameter, 0.8 / view.scale)
+    for along, trusting in ((0.15, False), (0.15, False), (ALONG, True)):
+        raw = sample_profiles(bright, view, curve, t, diameter)
+        profiles = average(raw, good if trusting else raw.inside, along * diameter)
+        shape = edge_shape(profiles, direction, good, EdgeShape(diameter, 0.8 / view.scale))
+        crossings = find_edges(profiles, direction, shape)
+        sound = raw.inside & _sound(crossings, good, diameter)
+        good = good & sound if trusting else sound
+        if good.sum() < 10:
+            raise VisionError("no cable found")
+        points = curve.position(t) + crossings.offset[:, None] * curve.normal(t)
+        moved = fit_curve(t, points, good.astype(float), 2 * diameter, 0.5 * diameter)
+        if not trusting:
+            curve = moved
+    return curve, t, crossings, good
+
+
+ALONG = 0.7
 
 
 def _first_curve(
@@ -160,12 +175,12 @@ def _extension(
     return ahead if 0 < ahead < 4 * diameter else 0.0
 
 
-def _sound(crossings: Crossings, inside: NDArray[np.bool_], diameter: float) -> NDArray[np.bool_]:
-    """Profiles that show the cable and nothing else."""
-    usual = np.median(crossings.misfit[inside])
+def _sound(crossings: Crossings, usual: NDArray[np.bool_], diameter: float) -> NDArray[np.bool_]:
+    """Profiles that show the cable and nothing else: usual in height, width and place."""
+    height = float(np.median(crossings.height[usual]))
+    width = float(np.median(crossings.width[usual]))
     return (
-        inside
-        & (np.abs(crossings.contrast - 1) < 0.4)
+        (np.abs(crossings.height / height - 1) < 0.4)
+        & (np.abs(crossings.width / width - 1) < 0.3)
         & (np.abs(crossings.offset) < 0.4 * diameter)
-        & (crossings.misfit < 3 * usual)
     )

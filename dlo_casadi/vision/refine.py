@@ -8,16 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.special import ndtr
 
 from dlo_casadi.vision.curve import SmoothCurve
 from dlo_casadi.vision.view import Array, View
 
-_BESIDE = 0.75  # how far a profile reaches beyond the cable's edges, in widths
-_SKEW_PRIOR = 0.05  # of the cable's height: the light from one side is this uneven
-_BOW_PRIOR = 1.0
-_NOISE = 0.02  # of the cable's height
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
+_BESIDE = 2.2  # where the surroundings begin, in blurs beyond the edge
+_CORE = 0.2  # half of the part in the middle that gives the cable's own level, in widths
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,7 @@ class Profiles:
     offset : (M,) [m]
         Where across it, positive to the left.
     values : (K, M, 3)
-        Colours, averaged along the curve.
+        Colours.
     inside : (K,) bool
         The whole profile lies in the photograph.
     """
@@ -49,7 +46,7 @@ class EdgeShape:
     Parameters
     ----------
     width, blur : scalar [m]
-        Distance of the edges and standard deviation of their blur.
+        Distance of the two edges, and standard deviation of an edge's blur.
     """
 
     width: float
@@ -63,22 +60,19 @@ class Crossings:
     Parameters
     ----------
     offset : (K,) [m]
-        Centre of the cable relative to the curve.
-    std : (K,) [m]
-        From the noise of the profile.
-    contrast : (K,)
-        Height of the cable's step relative to the typical one: 1 on the cable, 0 beside it.
-    misfit : (K,)
-        Residual of the profile relative to that height.
-    shape : EdgeShape
-        Width and blur common to all profiles.
+        Middle between the two edges, relative to the curve.
+    width : (K,) [m]
+        Distance of the two edges.
+    rise : (K,) [m]
+        Blur of the edges, as a standard deviation.
+    height : (K,)
+        Step of brightness from the surroundings to the cable [grey levels].
     """
 
     offset: Array
-    std: Array
-    contrast: Array
-    misfit: Array
-    shape: EdgeShape
+    width: Array
+    rise: Array
+    height: Array
 
 
 def sample_profiles(
@@ -89,7 +83,7 @@ def sample_profiles(
     Profiles that leave the photograph are marked, and hold the colours of its border.
     """
     pixel = 1.0 / view.scale
-    half = (0.5 * 1.25 + _BESIDE * 1.25) * diameter + 1.5 * pixel
+    half = 1.2 * diameter + 3 * pixel
     count = int(np.clip(2 * half / min(0.5 * pixel, diameter / 10), 24, 64))
     offset = np.linspace(-half, half, count)
     centre, normal = curve.position(t), curve.normal(t)
@@ -148,89 +142,70 @@ def cable_direction(profiles: Profiles, trusted: NDArray[np.bool_], diameter: fl
     return fisher / np.linalg.norm(fisher)
 
 
-def edge_shape(
-    profiles: Profiles, direction: Array, trusted: NDArray[np.bool_], diameter: float, blur: float
-) -> EdgeShape:
-    """Width and blur that leave the smallest residual on some fifty profiles.
+def find_edges(profiles: Profiles, direction: Array, shape: EdgeShape) -> Crossings:
+    """Find both edges of every profile, and the middle between them.
 
-    A cable only a few pixels wide tells the one from the other poorly, and needs not: the centre
-    hardly depends on which of the two explains its profile.
-    """
-    rows = np.nonzero(trusted)[0]
-    data = (profiles.values @ direction)[rows[:: max(1, len(rows) // 50)]]
-    width = diameter
-    for scale in (0.12, 0.05):
-        trials = [
-            (float(np.median(_fit_rows(profiles.offset, data, w, s, rounds=4).cost)), w, s)
-            for w in width * (1 + scale * np.arange(-2, 3))
-            for s in blur * (1 + 2 * scale * np.arange(-2, 3))
-        ]
-        _, width, blur = min(trials)
-    return EdgeShape(width, blur)
+    An edge is where the brightness is half-way between the cable and its surroundings, those of
+    its own side and close by: a shadow that falls beside the cable changes the level of one side,
+    not the place of the edge. Instead of one crossing the mean over all levels from 1/4 to 3/4 is
+    taken; with q the share of the way from surroundings (0) to cable (1),
 
+        x_edge = integral_0^out clip(2 q(x) - 1/2, 0, 1) dx
 
-def fit_profiles(
-    profiles: Profiles, direction: Array, trusted: NDArray[np.bool_], shape: EdgeShape
-) -> Crossings:
-    """Fit the profile of a blurred cable to every cross-section.
-
-    With x the offset, x0 the wanted centre, w the width, s the blur, Phi the normal distribution,
-
-        f(x) = l (1 - A) + r B + (c_0 + c_1 y + c_2 y^2) (A - B),     y = (x - x0) / w
-        A = Phi((x - x0 + w/2) / s),   B = Phi((x - x0 - w/2) / s)
-
-    Each side has its own level, so that a shadow on one side does not pull the centre; the
-    parabola takes up shading and a highlight. Its skew c_1 and the centre look alike on a thin
-    cable; a weak prior on it leaves the decision to the edges where they are sharp enough to
-    tell. The levels are linear and x0 is found by Gauss-Newton, all profiles at once.
+    which also passes over a highlight in the middle.
     """
     data = profiles.values @ direction
-    fit = _fit_rows(profiles.offset, data, shape.width, shape.blur)
-    typical = float(np.median(fit.height[trusted]))
+    centre = np.zeros(len(data))
+    out = 0.5 * shape.width + _BESIDE * shape.blur
+    reach = np.linspace(0.0, out, 64)
+    step = reach[1]
+    middle = max(1, int(_CORE * shape.width / step))
+    for _ in range(3):
+        left = _interpolate(profiles.offset, data, centre[:, None] - reach)
+        right = _interpolate(profiles.offset, data, centre[:, None] + reach)
+        core = 0.5 * (left[:, :middle].mean(axis=1) + right[:, :middle].mean(axis=1))
+        sides = [(side, side[:, -3:].mean(axis=1)) for side in (left, right)]
+        places = [_mean_crossing(side, core, around, step) for side, around in sides]
+        move = np.clip(0.5 * (places[1][0] - places[0][0]), -0.3 * shape.width, 0.3 * shape.width)
+        centre = np.clip(centre + move, -0.5 * shape.width, 0.5 * shape.width)
     return Crossings(
-        fit.centre, fit.std, fit.height / typical, np.sqrt(fit.cost) / abs(typical), shape
+        centre,
+        places[0][0] + places[1][0],
+        0.5 * (places[0][1] + places[1][1]),
+        core - 0.5 * (sides[0][1] + sides[1][1]),
     )
 
 
-@dataclass(frozen=True)
-class _RowFits:
-    centre: Array
-    std: Array
-    height: Array
-    cost: Array
+def edge_shape(
+    profiles: Profiles, direction: Array, trusted: NDArray[np.bool_], first: EdgeShape
+) -> EdgeShape:
+    """Width and blur that are typical of the trusted profiles, from a first guess of both."""
+    shape = first
+    for _ in range(2):
+        found = find_edges(profiles, direction, shape)
+        width = float(np.clip(np.median(found.width[trusted]), 0.4 * first.width, None))
+        rise = float(np.clip(np.median(found.rise[trusted]), 0.5 * first.blur, 0.5 * first.width))
+        shape = EdgeShape(min(width, 1.4 * first.width), rise)
+    return shape
 
 
-def _fit_rows(x: Array, data: Array, width: float, blur: float, rounds: int = 6) -> _RowFits:
-    """Gauss-Newton for all rows (K, M) at once; five levels and a centre each."""
-    window = np.abs(x) <= (0.5 + _BESIDE) * width + blur
-    x, data = x[window], data[:, window]
-    centre = np.zeros(len(data))
-    prior = np.diag([1e-9, 1e-9, 1e-9, (_NOISE / _SKEW_PRIOR) ** 2, (_NOISE / _BOW_PRIOR) ** 2])
-    for _ in range(rounds):
-        design, a_density, b_density = _design(x, centre, width, blur)
-        turned = design.transpose(0, 2, 1)
-        gram = turned @ design + prior
-        levels = np.linalg.solve(gram, turned @ data[..., None])
-        residual = data - (design @ levels)[..., 0]
-        left, right, core, skew, bow = levels.transpose(1, 0, 2)
-        slope = (left - core + 0.5 * skew - 0.25 * bow) * a_density
-        slope += (core + 0.5 * skew + 0.25 * bow - right) * b_density
-        slope -= (design @ np.linalg.solve(gram, turned @ slope[..., None]))[..., 0]
-        size = np.maximum((slope**2).sum(axis=1), 1e-12)
-        step = np.clip((slope * residual).sum(axis=1) / size, -0.3 * width, 0.3 * width)
-        centre = np.clip(centre + step, -0.5 * width, 0.5 * width)
-    cost = (residual**2).mean(axis=1)
-    height = (core + bow / 12 - 0.5 * (left + right))[:, 0]
-    return _RowFits(centre, np.sqrt(cost / size), height, cost)
+def _mean_crossing(side: Array, core: Array, around: Array, step: float) -> tuple[Array, Array]:
+    """Distance (K,) [m] from the middle to the edge of one side (K, M), and its blur (K,) [m].
+
+    The levels 1/4 and 3/4 of a blurred step are 1.35 standard deviations apart.
+    """
+    height = core - around
+    height = np.where(np.abs(height) < 3.0, np.copysign(3.0, height), height)
+    share = (side - around[:, None]) / height[:, None]
+    inner = step * np.clip(4 * share - 2, 0, 1).sum(axis=1)  # levels from 1/2 to 3/4
+    outer = step * np.clip(4 * share - 1, 0, 1).sum(axis=1)  # levels from 1/4 to 1/2
+    return 0.5 * (inner + outer), np.maximum(outer - inner, 0.0) / 0.69
 
 
-def _design(x: Array, centre: Array, width: float, blur: float) -> tuple[Array, Array, Array]:
-    """Columns (K, M, 5) of the linear levels, and the two edges' densities (K, M)."""
-    y = x[None, :] - centre[:, None]
-    a, b = (y + width / 2) / blur, (y - width / 2) / blur
-    rise_a, rise_b = ndtr(a), ndtr(b)
-    body = rise_a - rise_b
-    share = y / width
-    norm = 1.0 / (blur * np.sqrt(2 * np.pi))
-    design = np.stack([1 - rise_a, rise_b, body, body * share, body * share**2], axis=2)
-    return design, norm * np.exp(-0.5 * a * a), norm * np.exp(-0.5 * b * b)
+def _interpolate(x: Array, data: Array, at: Array) -> Array:
+    """Values (K, P) of rows of data (K, M), sampled evenly at x (M,), at places (K, P)."""
+    place = np.clip((at - x[0]) / (x[1] - x[0]), 0, len(x) - 1.001)
+    left = place.astype(int)
+    share = place - left
+    rows = np.arange(len(data))[:, None]
+    return data[rows, left] * (1 - share) + data[rows, left + 1] * share

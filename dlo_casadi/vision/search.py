@@ -15,7 +15,7 @@ from dlo_casadi.vision.strands import find_strands
 from dlo_casadi.vision.view import Array
 from dlo_casadi.vision.workplane import WorkPlane
 
-_GOOD = -0.9  # cost per length of a cable that is seen from fixture to fixture
+_GOOD = -0.7  # cost per length of a cable that is seen from fixture to fixture
 _LEAST = 0.25  # share of the length that must be seen
 _TWIN = 0.5  # a second strand this long, relative to the cable, is a second cable
 
