@@ -8,22 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.curve import SmoothCurve, chord_length, fit_curve
-from dlo_casadi.vision.refine import (
-    Crossings,
-    EdgeShape,
-    average,
-    cable_direction,
-    edge_shape,
-    find_edges,
-    sample_profiles,
-)
 from dlo_casadi.vision.search import find_cable
+from dlo_casadi.vision.trace import Trace, trace_cable
 from dlo_casadi.vision.view import Array, View
 from dlo_casadi.vision.workplane import rectify
 
-_MOST_POINTS = 400
 _SPACING = 0.0025  # m
+_MOST_POINTS = 400
+_FAR = 0.2  # of the length: a line that ends so far from a fixture in the picture is not the cable
+_LEAST = 0.2  # of the length: what must be measured
 
 
 @dataclass(frozen=True)
@@ -38,12 +31,12 @@ class Centerline:
         Standard deviation of each point across the cable. Neighbours share their errors.
     pixels : (K, 2) [px]
         The same points in the photograph.
-    coverage : scalar
+    coverage : scalar in 0..1
         Length along the points, without the gaps, over the length of the cable.
     gaps : tuple of int
         Indices of the points after which a stretch is missing.
     confidence : scalar in 0..1
-        Coverage times the share of sound profiles.
+        Share of the line inside the picture that was measured soundly.
     messages : tuple of str
         What a user should know, in plain sentences.
     """
@@ -91,96 +84,93 @@ def extract_centerline(
     first = np.asarray(start, float)
     last = None if end is None else np.asarray(end, float)
     plane = rectify(image, view, start=first, end=last, diameter=diameter, length=length)
-    chain = find_cable(plane, start=first, end=last, diameter=diameter, length=length).chain
-    curve, t = _first_curve(chain.strands, diameter, first, last)
-    curve, t, crossings, good = _refine(image, view, curve, t, diameter)
-    points = curve.position(t) + crossings.offset[:, None] * curve.normal(t)
-    kept = np.nonzero(good)[0]
-    step = max(_SPACING, (t[-1] - t[0]) / _MOST_POINTS)
-    kept = kept[np.unique(np.floor(t[kept] / step), return_index=True)[1]]
-    points = points[kept]
-    jumps = np.diff(t[kept])
-    gaps = tuple(int(i) for i in np.nonzero(jumps > 3 * step)[0])
-    seen = float(jumps[jumps <= 3 * step].sum())
-    coverage = min(1.0, seen / length)
+    chain = find_cable(plane, start=first, end=last, diameter=diameter, length=length)
+    trace = trace_cable(image, view, chain.strands, start=first, end=last, diameter=diameter)
+
+    step = max(_SPACING, float(trace.t[-1] - trace.t[0]) / _MOST_POINTS)
+    kept = np.nonzero(trace.sound)[0]
+    kept = kept[np.unique(np.floor(trace.t[kept] / step), return_index=True)[1]]
+    jumps = np.diff(trace.t[kept])
+    missing = jumps > max(2.5 * step, 0.5 * diameter)
+    seen = float(jumps[~missing].sum())
+    if seen < _LEAST * length:
+        raise VisionError(
+            f"no cable found: a line of {chain.supported:.3f} m was found, but only {seen:.3f} m "
+            f"of it look like a cable of {1e3 * diameter:.1f} mm with an edge on both sides. "
+            "Try: the right diameter; a sharper photograph; a plainer background; more contrast."
+        )
+    points = trace.points[kept]
+    gaps = tuple(int(i) for i in np.nonzero(missing)[0])
+    _check_fixtures(points, view, first, last, length)
     return Centerline(
         points,
-        np.full(len(kept), 0.06 / view.scale),
+        trace.std[kept],
         view.to_pixels(points),
-        coverage,
+        min(1.0, seen / length),
         gaps,
-        float(np.clip(coverage * good.mean(), 0, 1)),
-        (),
+        float(np.clip(trace.sound.sum() / max(1, trace.inside.sum()), 0.0, 1.0)),
+        _messages(trace, kept, gaps, seen, first, last, length),
     )
 
 
-def _refine(
-    image: NDArray[np.uint8], view: View, curve: SmoothCurve, t: Array, diameter: float
-) -> tuple[SmoothCurve, Array, Crossings, NDArray[np.bool_]]:
-    """Move the curve onto the middle between the cable's edges; tell which profiles show them."""
-    bright = image.astype(np.float32)
-    profiles = sample_profiles(bright, view, curve, t, diameter)
-    good = profiles.inside & (t > t[0] + 2 * diameter) & (t < t[-1] - 2 * diameter)
-    direction = cable_direction(profiles, good, diameter)
-    shape = EdgeShape(diameter, 0.8 / view.scale)
-    for along, trusting in ((0.15, False), (0.15, False), (ALONG, True)):
-        raw = sample_profiles(bright, view, curve, t, diameter)
-        profiles = average(raw, good if trusting else raw.inside, along * diameter)
-        shape = edge_shape(profiles, direction, good, EdgeShape(diameter, 0.8 / view.scale))
-        crossings = find_edges(profiles, direction, shape)
-        sound = raw.inside & _sound(crossings, good, diameter)
-        good = good & sound if trusting else sound
-        if good.sum() < 10:
-            raise VisionError("no cable found")
-        points = curve.position(t) + crossings.offset[:, None] * curve.normal(t)
-        moved = fit_curve(t, points, good.astype(float), 2 * diameter, 0.5 * diameter)
-        if not trusting:
-            curve = moved
-    return curve, t, crossings, good
+def _in_picture(point: Array, view: View) -> bool:
+    height, width = view.shape
+    u, v = view.to_pixels(point)[0]
+    return bool(0 <= u <= width - 1 and 0 <= v <= height - 1)
 
 
-ALONG = 0.7
+def _check_fixtures(
+    points: Array, view: View, start: Array, end: Array | None, length: float
+) -> None:
+    """Raise if the line ends far from a fixture that is in the picture."""
+    places = [("start", start, points[0])]
+    if end is not None:
+        places.append(("end", end, points[-1]))
+    for name, fixture, tip in places:
+        away = float(np.linalg.norm(tip - fixture))
+        if away > _FAR * length and _in_picture(fixture, view):
+            raise VisionError(
+                f"the cable does not reach its {name}: the line found ends {away:.3f} m from "
+                f"({fixture[0]:.3f}, {fixture[1]:.3f}) m, at ({tip[0]:.3f}, {tip[1]:.3f}) m. "
+                f"Try: {name} in metres and in the board frame? Is the cable hidden there?"
+            )
 
 
-def _first_curve(
-    strands: tuple[Array, ...], diameter: float, start: Array, end: Array | None
-) -> tuple[SmoothCurve, Array]:
-    """Smooth curve through the strands, extended straight to the fixtures, and its samples t."""
-    points = np.vstack(strands)
-    t = chord_length(points)
-    keep = np.concatenate([[True], np.diff(t) > 0])
-    points, t = points[keep], t[keep]
-    curve = fit_curve(t, points, np.ones(len(t)), 2 * diameter, diameter)
-    head = _extension(points[0], curve, t[0], start, diameter, -1.0)
-    tail = 0.0 if end is None else _extension(points[-1], curve, t[-1], end, diameter, 1.0)
-    samples = np.arange(t[0], t[-1], diameter / 8)
-    line = curve.position(samples)
-    ahead = line[0] + np.arange(-head, 0.0, diameter / 8)[:, None] * _slope(curve, t[0])
-    beyond = line[-1] + np.arange(diameter / 8, tail, diameter / 8)[:, None] * _slope(curve, t[-1])
-    line = np.vstack([ahead, line, beyond])
-    t = chord_length(line)
-    return fit_curve(t, line, np.ones(len(t)), 2 * diameter, 0.5 * diameter), t
-
-
-def _slope(curve: SmoothCurve, t: float) -> Array:
-    slope = np.asarray(curve.spline(t, 1))
-    return slope / np.linalg.norm(slope)
-
-
-def _extension(
-    tip: Array, curve: SmoothCurve, t: float, fixture: Array, diameter: float, sign: float
-) -> float:
-    """How far the fixture lies ahead of the tip [m], if it is near."""
-    ahead = float(sign * (fixture - tip) @ _slope(curve, t))
-    return ahead if 0 < ahead < 4 * diameter else 0.0
-
-
-def _sound(crossings: Crossings, usual: NDArray[np.bool_], diameter: float) -> NDArray[np.bool_]:
-    """Profiles that show the cable and nothing else: usual in height, width and place."""
-    height = float(np.median(crossings.height[usual]))
-    width = float(np.median(crossings.width[usual]))
-    return (
-        (np.abs(crossings.height / height - 1) < 0.4)
-        & (np.abs(crossings.width / width - 1) < 0.3)
-        & (np.abs(crossings.offset) < 0.4 * diameter)
-    )
+def _messages(
+    trace: Trace,
+    kept: NDArray[np.intp],
+    gaps: tuple[int, ...],
+    seen: float,
+    start: Array,
+    end: Array | None,
+    length: float,
+) -> tuple[str, ...]:
+    """Sentences on what is missing and what does not fit."""
+    messages = []
+    points = trace.points[kept]
+    for i in gaps:
+        wide = float(np.linalg.norm(points[i + 1] - points[i]))
+        hidden = trace.inside[kept[i] : kept[i + 1]].all()
+        what = "hidden" if hidden else "outside the picture"
+        messages.append(
+            f"the cable is {what} for about {wide:.3f} m, "
+            f"{trace.t[kept[i]]:.3f} m along the measured line"
+        )
+    ends = [("start", start, 0)]
+    if end is not None:
+        ends.append(("end", end, -1))
+    for name, fixture, k in ends:
+        away = float(np.linalg.norm(points[k] - fixture))
+        if away > max(0.03 * length, 0.01):
+            messages.append(f"the measured line stops {away:.3f} m before the {name} fixture")
+    whole = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    if end is not None:
+        whole += float(np.linalg.norm(points[0] - start) + np.linalg.norm(points[-1] - end))
+    if whole > 1.03 * length:
+        messages.append(
+            f"the measured line is {whole:.3f} m long, {100 * (whole / length - 1):.1f} % longer "
+            "than the cable: check the scale and the length"
+        )
+    elif end is None and seen < 0.9 * length:
+        messages.append(f"only {seen:.3f} m of {length:g} m were measured")
+    return tuple(messages)

@@ -96,7 +96,9 @@ def thresholds(candidate: NDArray[np.float32], area_px: float) -> tuple[float, .
 
 
 def _upper_level(values: NDArray[np.float32], area: float) -> float:
-    """Value that is exceeded in `area` pixels."""
-    flat = values.ravel()
-    rank = int(np.clip(area, 1, flat.size - 1))
-    return float(np.partition(flat, flat.size - rank)[flat.size - rank])
+    """Value that is exceeded in `area` pixels; zero where nothing significant is left."""
+    high = values[values > _SIGNIFICANT]
+    rank = int(max(area, 1))
+    return (
+        float(np.partition(high, high.size - rank)[high.size - rank]) if high.size >= rank else 0.0
+    )

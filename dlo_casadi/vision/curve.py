@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
+from scipy.sparse import csr_array, diags_array
 
 from dlo_casadi.vision.view import Array
 
@@ -30,7 +31,7 @@ class SmoothCurve:
         return np.asarray(self.spline(t))
 
     def normal(self, t: Array) -> Array:
-        """Unit normals (K, 2), to the left of the direction of travel."""
+        """Give the unit normals (K, 2), to the left of the direction of travel."""
         slope = np.asarray(self.spline(t, 1))
         slope /= np.linalg.norm(slope, axis=1, keepdims=True)
         return np.column_stack([-slope[:, 1], slope[:, 0]])
@@ -45,10 +46,10 @@ def chord_length(points: Array) -> Array:
 def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: float) -> SmoothCurve:
     """Fit a spline that bends no more than the points ask for.
 
-        minimise  sum_k w_k |r(t_k) - p_k|^2  +  (mean w) (smooth / knot)^4 n sum_i |D^2 c_i|^2 / n_c
+        minimise  sum_k w_k |r(t_k) - p_k|^2  +  W (smooth / knot)^4 sum_i |D^2 c_i|^2
 
-    with knots every `knot` metres and second differences D^2 of the coefficients c. Gaps need no
-    special case: there the curve is the one of least bending.
+    with knots every `knot` metres, second differences D^2 of the coefficients c, and W the sum of
+    the weights per coefficient. Gaps need no special case: there the curve bends least.
 
     Parameters
     ----------
@@ -68,14 +69,13 @@ def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: floa
     step = (upper - lower) / count
     knots = lower + step * np.arange(-_DEGREE, count + _DEGREE + 1)
     inside = np.clip(t, lower, upper - 1e-12 * (upper - lower))
-    basis = BSpline.design_matrix(inside, knots, _DEGREE)
-    size = basis.shape[1]
-    weighted = basis.multiply(weights[:, None]).tocsr()
-    normal = (basis.T @ weighted).todia()
+    basis = csr_array(BSpline.design_matrix(inside, knots, _DEGREE))
+    size = len(knots) - _DEGREE - 1
+    weighted = diags_array(weights) @ basis
+    normal = basis.T @ weighted
     banded = np.zeros((_DEGREE + 1, size))
-    for offset, row in zip(normal.offsets, normal.data, strict=True):
-        if 0 <= offset <= _DEGREE:
-            banded[_DEGREE - offset, offset:] = row[offset:size]
+    for offset in range(min(_DEGREE, size - 1) + 1):
+        banded[_DEGREE - offset, offset:] = normal.diagonal(offset)
     penalty = (smooth / step) ** 4 * max(float(weights.sum()), 1e-12) / size
     for offset, row in enumerate(_second_differences(size)):
         banded[_DEGREE - offset, offset:] += penalty * row

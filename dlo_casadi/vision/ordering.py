@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.vision.view import Array
 
+_State: TypeAlias = tuple[float, tuple[int, ...], float, float]  # cost, path, seen, total
 _BEAM = 40
 _LENGTH_TOLERANCE = 0.05  # relative; two clicked reference points are no better than this
 
@@ -45,7 +47,8 @@ def order_strands(
 
     The cost of a chain, in metres,
 
-        J = -seen + gaps + sum_links d (4 a^2 + 2 b^2) + 10 L max(0, |total / L - 1| - 0.02)^2 / 0.05
+        J = -seen + gaps + sum_links d (4 a^2 + 2 b^2)
+            + 0.5 L (max(0, |total / L - 1| - 0.02) / 0.05)^2
 
     prefers long seen stretches, short gaps, and links that go on in the direction of the strand:
     a is the difference of the turns into and out of the gap (0 on a circle), b the whole turn.
@@ -71,15 +74,15 @@ def order_strands(
 
     to_first = np.linalg.norm(first - start, axis=1)
     to_end = np.zeros(len(ways)) if end is None else np.linalg.norm(last - end, axis=1)
-    states = [
+    states: list[_State] = [
         (float(to_first[w] - seen[w]), (w,), float(seen[w]), float(seen[w] + to_first[w]))
         for w in range(len(ways))
         if to_first[w] < 0.6 * length
     ]
-    best: tuple[float, tuple[int, ...], float, float] | None = None
+    best: _State | None = None
     for _ in range(len(strands)):
         states.sort(key=lambda state: state[0])
-        following = []
+        following: list[_State] = []
         for cost, path, supported, total in states[:_BEAM]:
             tip = path[-1]
             whole = total + to_end[tip]
@@ -106,7 +109,7 @@ def order_strands(
 
 
 def _tangent(line: Array, diameter: float) -> Array:
-    """Unit direction at the first point of a line, over its first two diameters."""
+    """Give the unit direction at the first point of a line, over its first two diameters."""
     away = np.linalg.norm(line - line[0], axis=1)
     far = int(np.argmax(away > 2 * diameter)) or len(line) - 1
     step = line[far] - line[min(1, far - 1)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,40 +12,43 @@ from scipy.ndimage import gaussian_filter1d
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.contrast import candidate_maps, local_contrast, thresholds
 from dlo_casadi.vision.ordering import Chain, order_strands
-from dlo_casadi.vision.strands import find_strands
+from dlo_casadi.vision.strands import Strand, find_strands
 from dlo_casadi.vision.view import Array
 from dlo_casadi.vision.workplane import WorkPlane
 
-_GOOD = -0.7  # cost per length of a cable that is seen from fixture to fixture
+_GOOD = -0.7  # cost per length of a cable that is seen nearly from fixture to fixture
 _LEAST = 0.25  # share of the length that must be seen
-_TWIN = 0.5  # a second strand this long, relative to the cable, is a second cable
+_TWIN = 0.5  # other strands this long, relative to the cable, are a second cable
+_TWIN_CONTRAST = 0.6  # ... if they stand out as well, relative to the cable
 
 
 @dataclass(frozen=True)
-class Finding:
-    """The best chain, and the strands of the same picture that it does not use.
+class _Line:
+    """A strand in metres, and how much it stands out."""
 
-    Parameters
-    ----------
-    chain : Chain
-        The cable, coarsely.
-    others : tuple of (K, 2) [m]
-        Strands left over.
-    """
+    points: Array
+    level: float
 
+    @property
+    def length(self) -> float:
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True)
+class _Finding:
     chain: Chain
-    others: tuple[Array, ...]
+    lines: list[_Line]
 
 
 def find_cable(
     plane: WorkPlane, *, start: Array, end: Array | None, diameter: float, length: float
-) -> Finding:
+) -> Chain:
     """Try the candidate pictures in turn and keep the chain of least cost.
 
     Raises
     ------
     VisionError
-        If no chain shows a quarter of the cable, or if a second strand is as long as half of it.
+        If no chain shows a quarter of the cable, or if what is left over shows a second cable.
     """
     width_px = diameter / plane.pixel
     area_px = length * diameter / plane.pixel**2
@@ -53,73 +57,92 @@ def find_cable(
             "no cable found: almost nothing of the place that it can reach is in the picture. "
             "Try: start, end and length in metres and in the board frame?"
         )
+    fixtures = [start] if end is None else [start, end]
     contrast = local_contrast(plane.image, plane.reachable, width_px)
-    best: Finding | None = None
+    best: _Finding | None = None
     longest = 0.0
     for candidate in candidate_maps(contrast, area_px):
         for cut in thresholds(candidate, area_px):
-            found = find_strands(candidate > cut, width_px)
-            lines = [_smooth(plane.to_board(strand.points), width_px) for strand in found]
-            lines = [line for line in lines if len(line) > 2]
-            longest = max([longest, *(_length(line) for line in lines)])
-            chain = order_strands(lines, start=start, end=end, diameter=diameter, length=length)
+            strands = find_strands(candidate > cut, width_px)
+            lines = [
+                part
+                for strand in strands
+                for part in _lines(strand, candidate, plane, fixtures, diameter)
+            ]
+            longest = max([longest, *(line.length for line in lines)])
+            chain = order_strands(
+                [line.points for line in lines],
+                start=start,
+                end=end,
+                diameter=diameter,
+                length=length,
+            )
             if chain is not None and (best is None or chain.cost < best.chain.cost):
-                used = set(chain.used)
-                rest = tuple(line for i, line in enumerate(lines) if i not in used)
-                best = Finding(chain, rest)
+                best = _Finding(chain, lines)
         if best is not None and best.chain.cost < _GOOD * length:
             break
     if best is None or best.chain.supported < _LEAST * length:
-        raise VisionError(_nothing(plane, contrast.noise, best, longest, diameter, length))
-    twins = [_length(line) for line in best.others if _length(line) > _TWIN * length]
-    if twins:
+        seen = 0.0 if best is None else best.chain.supported
         raise VisionError(
-            f"two cables: beside the strand of {best.chain.supported:.3f} m there is another of "
-            f"{max(twins):.3f} m and of the same width and colour (the cable is {length:g} m "
+            f"no cable found: {_light(plane)}the best chain of lines shows {seen:.3f} m of "
+            f"{length:g} m, the longest single line {longest:.3f} m (wanted: {1e3 * diameter:.1f} "
+            f"mm wide; noise {contrast.noise.mean():.1f} grey levels). Try: is the cable in the "
+            "picture and in focus? start, end, length and diameter right? a background of another "
+            "brightness or colour?"
+        )
+    _refuse_twins(best, diameter, length)
+    return best.chain
+
+
+def _lines(
+    strand: Strand,
+    candidate: NDArray[np.float32],
+    plane: WorkPlane,
+    fixtures: list[Array],
+    diameter: float,
+) -> list[_Line]:
+    """Turn a strand into metres, without its staircase, cut where it passes a fixture.
+
+    What lies beyond a fixture, a tail of the cable, is then not taken for the measured part.
+    """
+    columns, rows = strand.points.astype(int).T
+    level = float(np.median(candidate[rows, columns]))
+    smooth = gaussian_filter1d(strand.points, 0.5 * diameter / plane.pixel, axis=0, mode="nearest")
+    points = plane.to_board(smooth[1:-1:2])
+    margin = max(2, round(diameter / plane.pixel))
+    cuts = [0, len(points)]
+    for fixture in fixtures:
+        away = np.linalg.norm(points - fixture, axis=1)
+        nearest = int(np.argmin(away)) if len(away) else 0
+        if margin <= nearest < len(points) - margin and away[nearest] < diameter:
+            cuts.append(nearest)
+    cuts.sort()
+    parts = [points[a:b] for a, b in pairwise(cuts)]
+    return [_Line(part, level) for part in parts if len(part) > 2]
+
+
+def _refuse_twins(best: _Finding, diameter: float, length: float) -> None:
+    """Raise if the strands that the chain leaves out look like a second cable."""
+    used = set(best.chain.used)
+    usual = float(np.median([best.lines[i].level for i in used]))
+    others = [
+        line.length
+        for i, line in enumerate(best.lines)
+        if i not in used and line.length > 5 * diameter and line.level > _TWIN_CONTRAST * usual
+    ]
+    if sum(others) > _TWIN * length:
+        raise VisionError(
+            f"two cables: beside the strand of {best.chain.supported:.3f} m there are others of "
+            f"the same width and colour, {sum(others):.3f} m together (the cable is {length:g} m "
             "long). Try: leave one cable in the picture, or cover the other."
         )
-    return best
 
 
-def _smooth(line: Array, width_px: float) -> Array:
-    """Take the staircase out of a line of pixels; its ends stay."""
-    smooth = gaussian_filter1d(line, 0.5 * width_px, axis=0, mode="nearest")
-    return smooth[1:-1:2]
-
-
-def _length(line: Array) -> float:
-    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-
-
-def _nothing(
-    plane: WorkPlane,
-    noise: NDArray[np.float64],
-    best: Finding | None,
-    longest: float,
-    diameter: float,
-    length: float,
-) -> str:
-    """Say what was seen instead of a cable."""
-    seen = plane.image[plane.reachable]
-    mean = float(seen.mean())
+def _light(plane: WorkPlane) -> str:
+    """What is wrong with the light, if anything."""
+    mean = float(plane.image[plane.reachable].mean())
     if mean < 15:
-        light = f"the picture is too dark (mean brightness {mean:.0f} of 255): try more light. "
-    elif mean > 245:
-        light = f"the picture is overexposed (mean brightness {mean:.0f} of 255): try less light. "
-    else:
-        light = ""
-    if best is None:
-        what = (
-            f"the longest line of its width that begins near a fixture is none of {longest:.3f} m"
-        )
-        what = f"the longest line of about its width is {longest:.3f} m long"
-    else:
-        what = (
-            f"the best chain of lines shows {best.chain.supported:.3f} m of {length:g} m, "
-            f"the longest single line is {longest:.3f} m"
-        )
-    return (
-        f"no cable found: {light}{what} (wanted: {1e3 * diameter:.1f} mm wide; noise "
-        f"{noise.mean():.1f} grey levels). Try: is the cable in the picture and in focus? start, "
-        "end, length and diameter right? a background of another brightness or colour?"
-    )
+        return f"the picture is too dark (mean brightness {mean:.0f} of 255, try more light), "
+    if mean > 245:
+        return f"the picture is overexposed (mean brightness {mean:.0f} of 255, try less light), "
+    return ""

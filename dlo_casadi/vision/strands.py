@@ -60,7 +60,7 @@ def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[Strand]:
         left, top, wide, high = stats[label, :4]
         window = labels[top : top + high, left : left + wide] == label
         rows, columns = np.nonzero(window)
-        points = _walk(np.column_stack([columns, rows])) + [left, top]
+        points = _walk(np.column_stack([columns + left, rows + top]))
         width = 2 * float(np.median(depth[points[:, 1], points[:, 0]]))
         if width > _NARROWEST * width_px:
             strands.append(Strand(points.astype(float), width))

@@ -177,7 +177,7 @@ def undistort(pixels: Array, camera: Camera) -> Array:
     return ray
 
 
-def _apply(homography: Array, points: Array) -> Array:
+def _apply(homography: NDArray[np.floating], points: Array) -> Array:
     mapped = points @ homography[:, :2].T + homography[:, 2]
     return mapped[:, :2] / mapped[:, 2:]
 

@@ -1,0 +1,161 @@
+"""From coarse strands to the middle of the cable, profile by profile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, gaussian_filter1d, label
+
+from dlo_casadi.vision.curve import SmoothCurve, chord_length, fit_curve
+from dlo_casadi.vision.refine import (
+    Crossings,
+    EdgeShape,
+    average,
+    cable_direction,
+    edge_shape,
+    find_edges,
+    sample_profiles,
+)
+from dlo_casadi.vision.view import Array, View
+
+_STEP = 1 / 8  # of the diameter: between profiles
+_RAW, _FINE = 0.15, 0.7  # of the diameter: average along the cable, to judge and to measure
+_FLOOR_PX = 0.06  # what the sampling and compression of a photograph leave, along centimetres
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Middle of the cable at closely spaced profiles.
+
+    Parameters
+    ----------
+    t : (K,) [m]
+        Length along the line, gaps included.
+    points : (K, 2) [m]
+        Middle of the two edges.
+    std : (K,) [m]
+        Standard deviation across the cable.
+    sound : (K,) bool
+        Whether the profile shows the cable and nothing else.
+    inside : (K,) bool
+        Whether it lies in the photograph.
+    """
+
+    t: Array
+    points: Array
+    std: Array
+    sound: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+
+
+def trace_cable(
+    image: NDArray[np.uint8],
+    view: View,
+    strands: tuple[Array, ...],
+    *,
+    start: Array,
+    end: Array | None,
+    diameter: float,
+) -> Trace:
+    """Lay a smooth curve through the strands and move it onto the middle between the edges.
+
+    Two rounds on nearly raw profiles tell which of them show the cable; a last one measures on
+    profiles that are averaged along the cable, over sound ones only.
+    """
+    curve, t = _first_curve(strands, diameter, start, end)
+    bright = image.astype(np.float32)
+    profiles = sample_profiles(bright, view, curve, t, diameter)
+    usual = profiles.inside & (t > t[0] + 2 * diameter) & (t < t[-1] - 2 * diameter)
+    if usual.sum() < 8:
+        usual = profiles.inside
+    if usual.sum() < 8:
+        none = np.zeros(len(t), bool)
+        return Trace(t, curve.position(t), np.zeros(len(t)), none, profiles.inside)
+    direction = cable_direction(profiles, usual, diameter)
+    guess = EdgeShape(diameter, 0.8 / view.scale)
+    for _ in range(2):
+        raw = sample_profiles(bright, view, curve, t, diameter)
+        raw = average(raw, raw.inside, _RAW * diameter)
+        shape = edge_shape(raw, direction, usual, guess)
+        rough = find_edges(raw, direction, shape)
+        sound = raw.inside & _is_usual(rough, usual, diameter)
+        if sound.sum() < 8:
+            return Trace(t, curve.position(t), np.zeros(len(t)), sound, raw.inside)
+        points = curve.position(t) + rough.offset[:, None] * curve.normal(t)
+        curve = fit_curve(t, points, sound.astype(float), 2 * diameter, 0.5 * diameter)
+        usual = sound
+    raw = sample_profiles(bright, view, curve, t, diameter)
+    rough = find_edges(average(raw, raw.inside, _RAW * diameter), direction, shape)
+    fine = find_edges(average(raw, sound, _FINE * diameter), direction, shape)
+    sound = _without_rims(
+        raw.inside & _is_usual(rough, sound, diameter) & _is_usual(fine, sound, diameter)
+    )
+    points = curve.position(t) + fine.offset[:, None] * curve.normal(t)
+    return Trace(t, points, _std(rough.offset, fine.offset, sound, view), sound, raw.inside)
+
+
+def _first_curve(
+    strands: tuple[Array, ...], diameter: float, start: Array, end: Array | None
+) -> tuple[SmoothCurve, Array]:
+    """Smooth curve through the strands, extended straight to near fixtures, and its samples t."""
+    points = np.vstack(strands)
+    t = chord_length(points)
+    keep = np.concatenate([[True], np.diff(t) > 0])
+    points, t = points[keep], t[keep]
+    curve = fit_curve(t, points, np.ones(len(t)), 2 * diameter, diameter)
+    step = _STEP * diameter
+    line = curve.position(np.arange(t[0], t[-1], step))
+    forwards = [curve.spline(at, 1) / np.linalg.norm(curve.spline(at, 1)) for at in (t[0], t[-1])]
+    head = float((line[0] - start) @ forwards[0])
+    if 0 < head < 4 * diameter:
+        line = np.vstack([line[0] + np.arange(-head, 0, step)[:, None] * forwards[0], line])
+    tail = 0.0 if end is None else float((end - line[-1]) @ forwards[1])
+    if 0 < tail < 4 * diameter:
+        line = np.vstack([line, line[-1] + np.arange(step, tail, step)[:, None] * forwards[1]])
+    t = chord_length(line)
+    return fit_curve(t, line, np.ones(len(t)), 2 * diameter, 0.5 * diameter), t
+
+
+def _is_usual(found: Crossings, usual: NDArray[np.bool_], diameter: float) -> NDArray[np.bool_]:
+    """Profiles that are usual in height, width and place of the cable."""
+    height = float(np.median(found.height[usual]))
+    width = float(np.median(found.width[usual]))
+    return (
+        (np.abs(found.height / height - 1) < 0.4)
+        & (np.abs(found.width / width - 1) < 0.3)
+        & (np.abs(found.offset) < 0.4 * diameter)
+    )
+
+
+def _without_rims(sound: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Leave out short sound stretches, and the rims of long unsound ones.
+
+    Beside a holder, a pin or an occluder its colour leaks into the profile before that shows.
+    """
+    rim = round(0.35 / _STEP)
+    regions, count = label(~sound)
+    sizes = np.bincount(regions, minlength=count + 1)
+    long = ~sound & (sizes[regions] > rim)
+    kept = sound & ~binary_dilation(long, iterations=rim)
+    regions, count = label(kept)
+    sizes = np.bincount(regions, minlength=count + 1)
+    return kept & (sizes[regions] > 1.5 / _STEP)
+
+
+def _std(rough: Array, fine: Array, sound: NDArray[np.bool_], view: View) -> Array:
+    """Standard deviation of each point (K,) [m].
+
+    The scatter of the rough places about the fine ones, over two diameters, falls with the square
+    root of the length of the averages. To it are added what the photograph's sampling leaves, and
+    the error of the board's pose: corner error over the root of the number of corners, times 1.5
+    for the lever to the cable.
+    """
+    deviation = 2.0 / _STEP
+    weight = gaussian_filter1d(sound.astype(float), deviation)
+    spread = gaussian_filter1d(np.where(sound, rough - fine, 0.0) ** 2, deviation)
+    scatter = np.sqrt(spread / np.maximum(weight, 1e-6) * _RAW / _FINE)
+    corners = max(1, 4 * len(view.markers))
+    board = 1.5 * view.reprojection_error / np.sqrt(corners)
+    return np.sqrt(scatter**2 + (_FLOOR_PX**2 + board**2) / view.scale**2)
