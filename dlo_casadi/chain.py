@@ -208,6 +208,14 @@ class Curve:
         return ca.horzcat(*points).T
 
     @property
+    def node_headings(self) -> ca.SX:
+        """Direction of the cable at the nodes (n + 1,) [rad]; of links, the mean of neighbours."""
+        if self.chain.element == "arc":
+            return self.phi
+        last = self.chain.n - 1
+        return ca.vertcat(self.phi[0], (self.phi[1:] + self.phi[:-1]) / 2, self.phi[last])
+
+    @property
     def node_slopes(self) -> ca.SX:
         """Derivative of position by s at the nodes of a chain of arcs (n + 1, 2) [1]."""
         ratio = ca.vertcat(

@@ -13,6 +13,7 @@ from dlo_casadi.effects import (
     EFFECTS,
     Cable,
     ClampAngle,
+    EdgeBias,
     Effect,
     EndOffset,
     ImageDistortion,
@@ -26,6 +27,8 @@ from dlo_casadi.model import CableModel
 # Elements of the declared model's mesh; refined from the data.
 MESH = 40
 REST_COEFFICIENTS = 13
+# Standard deviation of each harmonic of the edges' bias, in pixels.
+EDGE_BIAS_PIXELS = 0.05
 
 
 @dataclass(frozen=True)
@@ -56,16 +59,21 @@ class Declared:
         return p
 
 
-def nuisances(model: CableModel, tolerances: Tolerances) -> CableModel:
+def nuisances(model: CableModel, tolerances: Tolerances, pixel: float | None = None) -> CableModel:
     """Return the model with what lies within the declared tolerances as nuisances.
 
     Length, scale, position of the end fixture and directions of clamps get a Gaussian prior
-    with the tolerance as standard deviation.
+    with the tolerance as standard deviation; photographs with pixels of the size `pixel` [m]
+    also a bias of edges.
     """
     found: list[tuple[Effect, dict[str, float]]] = [
         (LengthError(), {"length_difference": tolerances.length}),
         (ImageScale(), {"factor": tolerances.scale}),
     ]
+    if pixel is not None:
+        bias = EdgeBias()
+        names = [q.name for q in bias.parameters(model.cable)]
+        found.append((bias, dict.fromkeys(names, EDGE_BIAS_PIXELS * pixel)))
     if model.end != "free":
         found.append((EndOffset(), {"dx": tolerances.end, "dy": tolerances.end}))
     sides = {"start": model.start == "clamped", "end": model.end == "clamped"}
@@ -92,13 +100,19 @@ def make_effect(name: str, model: CableModel, center: tuple[float, float] | None
     return EFFECTS[name]()
 
 
-def declared_model(config: Config, center: tuple[float, float] | None = None) -> Declared:
+def declared_model(
+    config: Config,
+    center: tuple[float, float] | None = None,
+    pixel: float | None = None,
+) -> Declared:
     """Build the declared model.
 
     Parameters
     ----------
     center : (float, float), optional [m]
         Middle of the photographs in the board frame, for `image_distortion`.
+    pixel : float, optional [m]
+        Size of a pixel on the board, for photographs.
 
     Raises
     ------
@@ -145,7 +159,7 @@ def declared_model(config: Config, center: tuple[float, float] | None = None) ->
         _check_name(name, "diagnosis.exclude", config)
     declared = experiment.tolerances
     tolerances = Tolerances(declared.length, declared.end, declared.heading, declared.scale)
-    return Declared(nuisances(model, tolerances), values, tuple(fixed), tolerances)
+    return Declared(nuisances(model, tolerances, pixel), values, tuple(fixed), tolerances)
 
 
 def _check_name(name: str, where: str, config: Config) -> None:

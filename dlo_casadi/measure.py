@@ -101,6 +101,7 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
         pixels=line.pixels[kept],
         to_pixels=view.to_pixels,
         center=tuple(view.to_board([[image.shape[1] / 2, image.shape[0] / 2]])[0]),
+        pixel=1.0 / view.scale,
         weight=(line.std / np.median(line.std))[kept],
         coverage=line.coverage,
         confidence=line.confidence,

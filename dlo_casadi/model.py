@@ -373,15 +373,18 @@ class CableModel:
         nodes = curve.nodes
         maps = self._slot(MeasurementEffect)
         rows = []
-        point, slope = ca.SX.sym("point", 2), ca.SX.sym("slope", 2)
+        point, slope, heading = ca.SX.sym("point", 2), ca.SX.sym("slope", 2), ca.SX.sym("heading")
         image = point
         for effect, local in maps:
-            image = effect.observe(image, self._ends[:2], local)
+            image = effect.observe(image, heading, self._ends[:2], local)
         pushed = ca.jtimes(image, point, slope) if maps else slope
-        move = ca.Function("move", [point, slope, self._p, self._ends], [image, pushed])
+        move = ca.Function("move", [point, slope, heading, self._p, self._ends], [image, pushed])
+        headings = curve.node_headings
         slopes = curve.node_slopes if self.element == "arc" else ca.SX.zeros(self.n + 1, 2)
         for i in range(self.n + 1):
-            position, direction = move(nodes[i, :].T, slopes[i, :].T, self._p, self._ends)
+            position, direction = move(
+                nodes[i, :].T, slopes[i, :].T, headings[i], self._p, self._ends
+            )
             rows.append(ca.horzcat(position.T, direction.T))
         table = ca.vertcat(*rows)
         return ca.densify(ca.vec(table if self.element == "arc" else table[:, :2]))

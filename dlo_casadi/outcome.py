@@ -126,6 +126,8 @@ class PoseInput:
         Why the pose could not be read, if so.
     center : (float, float), optional [m]
         Middle of the photograph in the board frame.
+    pixel : float, optional [m]
+        Size of a pixel on the board.
     weight : (K,), optional
         Relative standard deviations of the points.
     coverage, confidence : float, optional
@@ -142,6 +144,7 @@ class PoseInput:
     to_pixels: Any = None
     problem: str = ""
     center: tuple[float, float] | None = None
+    pixel: float | None = None
     weight: FloatArray | None = None
     coverage: float | None = None
     confidence: float | None = None

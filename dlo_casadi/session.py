@@ -100,7 +100,7 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     inputs, measured = read_poses(config, lambda name, k, m: progress.step(f"read {name}", k, m))
     clock.lap("vision")
     warnings = [*config.warnings, *_reading_warnings(inputs)]
-    declared = declared_model(config, _center(inputs))
+    declared = declared_model(config, _center(inputs), _pixel(inputs))
 
     progress.step("fit the declared model", 0, 1)
     fit, error = fit_declared(config, declared, measured)
@@ -285,6 +285,11 @@ def _center(inputs: Sequence[PoseInput]) -> tuple[float, float] | None:
         return None
     middle = np.mean(centers, axis=0)
     return float(middle[0]), float(middle[1])
+
+
+def _pixel(inputs: Sequence[PoseInput]) -> float | None:
+    sizes = [item.pixel for item in inputs if item.pixel is not None]
+    return float(np.median(sizes)) if sizes else None
 
 
 def _declared_names(config: Config, model: CableModel) -> list[str]:

@@ -3,6 +3,7 @@
 from dlo_casadi.effects.axial_stretch import AxialStretch
 from dlo_casadi.effects.bending_softening import BendingSoftening
 from dlo_casadi.effects.clamp_angle import ClampAngle
+from dlo_casadi.effects.edge_bias import EdgeBias
 from dlo_casadi.effects.effect import (
     BoundaryEffect,
     Cable,
@@ -57,6 +58,7 @@ __all__ = [
     "BoundaryEffect",
     "Cable",
     "ClampAngle",
+    "EdgeBias",
     "Effect",
     "EndConditions",
     "EndOffset",

@@ -163,12 +163,20 @@ class BoundaryEffect(Effect):
 
 
 class MeasurementEffect(Effect):
-    """Slot `measurement`: a smooth map of the plane from true to measured points."""
+    """Slot `measurement`: from true points of the cable to measured ones."""
 
     slot: ClassVar[str] = "measurement"
 
-    def observe(self, point: ca.SX, start: ca.SX, params: Params) -> ca.SX:
-        """Where the camera believes the true point (2,) [m] to be. Maps apply in order."""
+    def observe(self, point: ca.SX, heading: ca.SX, start: ca.SX, params: Params) -> ca.SX:
+        """Where the camera believes the true point (2,) [m] to be. Maps apply in order.
+
+        Parameters
+        ----------
+        heading : scalar [rad]
+            Direction of the cable at the point.
+        start : (2,) [m]
+            The start fixture.
+        """
         raise TypeError(f"{self.name} has no measurement map")
 
 

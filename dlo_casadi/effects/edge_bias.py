@@ -1,0 +1,46 @@
+"""Where a camera sees an edge depends a little on the edge's direction."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params
+from dlo_casadi.parameters import Parameter
+
+# Harmonics of the cable's direction: light from one side has one, the pixel grid four.
+HARMONICS = range(1, 7)
+
+
+class EdgeBias(MeasurementEffect):
+    """The middle between two edges is off by a share of a pixel that depends on their direction.
+
+        measured = true + N(phi) sum_k (a_k cos k phi + b_k sin k phi)
+
+    with the normal N to the left of the cable's direction phi. Light from one side, the grid of
+    pixels and the sharpening of a camera do that. It is a nuisance of every photograph, the same
+    in all of them, and never blamed for a residual.
+
+    Parameters
+    ----------
+    a1, b1, ..., a6, b6 : scalar [m]
+        Vanish at 0.
+    """
+
+    name = "edge_bias"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare two coefficients for each harmonic."""
+        return tuple(
+            Parameter(f"{kind}{k}", "m", scale=1e-4) for k in HARMONICS for kind in ("a", "b")
+        )
+
+    def observe(self, point: ca.SX, heading: ca.SX, start: ca.SX, params: Params) -> ca.SX:
+        """Move the point along the cable's normal."""
+        offset = sum(
+            (
+                params[f"a{k}"] * ca.cos(k * heading) + params[f"b{k}"] * ca.sin(k * heading)
+                for k in HARMONICS
+            ),
+            start=ca.SX(0),
+        )
+        return point + offset * ca.vertcat(-ca.sin(heading), ca.cos(heading))
