@@ -99,6 +99,12 @@ def extract_centerline(
             f"of it look like a cable of {1e3 * diameter:.1f} mm with an edge on both sides. "
             "Try: the right diameter; a sharper photograph; a plainer background; more contrast."
         )
+    if not 0.45 * diameter < trace.width < max(1.7 * diameter, diameter + 2.5 / view.scale):
+        raise VisionError(
+            f"no cable found: a line of {chain.supported:.3f} m was found, but it is "
+            f"{1e3 * trace.width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm. "
+            "Try: the right diameter, in metres; is the cable in the picture?"
+        )
     points = trace.points[kept]
     gaps = tuple(int(i) for i in np.nonzero(missing)[0])
     _check_fixtures(points, view, first, last, length)

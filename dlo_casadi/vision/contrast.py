@@ -64,9 +64,8 @@ def candidate_maps(contrast: Contrast, area_px: float) -> Iterator[NDArray[np.fl
         Area that the whole cable covers.
     """
     strength = np.linalg.norm(contrast.difference, axis=2)
-    strength[~contrast.reachable] = 0.0
-    level = _upper_level(strength, 3.0 * area_px)
-    strong = strength > max(level, _SIGNIFICANT)
+    level = _upper_level(strength[contrast.reachable], 3.0 * area_px)
+    strong = contrast.reachable & (strength > max(level, _SIGNIFICANT))
     vectors = contrast.difference[strong].astype(float)
     weight = strength[strong].astype(float)
     total = weight.sum()
@@ -77,20 +76,18 @@ def candidate_maps(contrast: Contrast, area_px: float) -> Iterator[NDArray[np.fl
             mean = (weight * (units @ direction > 0.8)) @ units
             direction = mean / np.linalg.norm(mean)
         alike = units @ direction > 0.7
-        projected = contrast.difference @ direction.astype(np.float32)
-        projected[~contrast.reachable] = 0.0
-        yield projected
+        yield contrast.difference @ direction.astype(np.float32)
         vectors, weight = vectors[~alike], weight[~alike]
     yield strength
 
 
-def thresholds(candidate: NDArray[np.float32], area_px: float) -> tuple[float, ...]:
-    """Levels at which to cut a candidate picture, from the area that a cable should cover.
+def thresholds(values: NDArray[np.float32], area_px: float) -> tuple[float, ...]:
+    """Levels at which to cut the values of a candidate picture, from the area of a cable.
 
     The level P is exceeded by 0.4 of the cable's area, and so is typical of its core: its rim lies
     near P / 2. A lower cut recovers a cable beside stronger objects.
     """
-    core = _upper_level(candidate, 0.4 * area_px)
+    core = _upper_level(values, 0.4 * area_px)
     cuts = (0.5 * core, 0.3 * core)
     return tuple(max(cut, _SIGNIFICANT) for cut in cuts if core > _SIGNIFICANT)
 

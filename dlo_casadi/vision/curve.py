@@ -71,8 +71,8 @@ def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: floa
     inside = np.clip(t, lower, upper - 1e-12 * (upper - lower))
     basis = csr_array(BSpline.design_matrix(inside, knots, _DEGREE))
     size = len(knots) - _DEGREE - 1
-    weighted = diags_array(weights) @ basis
-    normal = basis.T @ weighted
+    weighted = csr_array(diags_array(weights) @ basis)
+    normal = csr_array(basis.T @ weighted)
     banded = np.zeros((_DEGREE + 1, size))
     for offset in range(min(_DEGREE, size - 1) + 1):
         banded[_DEGREE - offset, offset:] = normal.diagonal(offset)
@@ -80,7 +80,7 @@ def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: floa
     for offset, row in enumerate(_second_differences(size)):
         banded[_DEGREE - offset, offset:] += penalty * row
     banded[_DEGREE] += 1e-12 * banded[_DEGREE].max()
-    coefficients = solveh_banded(banded, weighted.T @ points)
+    coefficients = solveh_banded(banded, np.asarray(weighted.T @ points))
     return SmoothCurve(BSpline(knots, coefficients, _DEGREE))
 
 

@@ -14,7 +14,8 @@ from dlo_casadi.vision.view import Array, View
 
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
 _BESIDE = 2.2  # where the surroundings begin, in blurs beyond the edge
-_CORE = 0.2  # half of the part in the middle that gives the cable's own level, in widths
+_BODY = 0.4  # half of the part in the middle that shows the cable's own level, in widths
+_BARE = 0.35  # share of it that no highlight reaches
 
 
 @dataclass(frozen=True)
@@ -148,31 +149,33 @@ def find_edges(profiles: Profiles, direction: Array, shape: EdgeShape) -> Crossi
     An edge is where the brightness is half-way between the cable and its surroundings, those of
     its own side and close by: a shadow that falls beside the cable changes the level of one side,
     not the place of the edge. Instead of one crossing the mean over all levels from 1/4 to 3/4 is
-    taken; with q the share of the way from surroundings (0) to cable (1),
+    taken; with q the share of the way from surroundings (0) to cable (1), and Q(x) the largest q
+    from x outwards, which passes over a highlight wherever it lies,
 
-        x_edge = integral_0^out clip(2 q(x) - 1/2, 0, 1) dx
+        x_edge = integral_0^out clip(2 Q(x) - 1/2, 0, 1) dx
 
-    which also passes over a highlight in the middle.
+    The cable's level is the one that differs most from the surroundings, over a third of it.
     """
     data = profiles.values @ direction
     centre = np.zeros(len(data))
     out = 0.5 * shape.width + _BESIDE * shape.blur
     reach = np.linspace(0.0, out, 64)
     step = reach[1]
-    middle = max(1, int(_CORE * shape.width / step))
+    body = max(2, int(_BODY * shape.width / step))
     for _ in range(3):
         left = _interpolate(profiles.offset, data, centre[:, None] - reach)
         right = _interpolate(profiles.offset, data, centre[:, None] + reach)
-        core = 0.5 * (left[:, :middle].mean(axis=1) + right[:, :middle].mean(axis=1))
         sides = [(side, side[:, -3:].mean(axis=1)) for side in (left, right)]
-        places = [_mean_crossing(side, core, around, step) for side, around in sides]
+        around = 0.5 * (sides[0][1] + sides[1][1])
+        core = _own_level(np.hstack([left[:, :body], right[:, :body]]), around)
+        places = [_mean_crossing(side, core, level, step) for side, level in sides]
         move = np.clip(0.5 * (places[1][0] - places[0][0]), -0.3 * shape.width, 0.3 * shape.width)
         centre = np.clip(centre + move, -0.5 * shape.width, 0.5 * shape.width)
     return Crossings(
         centre,
         places[0][0] + places[1][0],
         0.5 * (places[0][1] + places[1][1]),
-        core - 0.5 * (sides[0][1] + sides[1][1]),
+        core - around,
     )
 
 
@@ -189,6 +192,18 @@ def edge_shape(
     return shape
 
 
+def _own_level(body: Array, around: Array) -> Array:
+    """Level (K,) of the cable in the middle of each profile (K, P), beside any highlight.
+
+    Whether it is darker or brighter than its surroundings is the same for all profiles; the
+    outer thirds of the body tell, which a highlight seldom reaches.
+    """
+    half = body.shape[1] // 2
+    outer = np.hstack([body[:, half // 2 : half], body[:, half + half // 2 :]])
+    brighter = np.median(outer.mean(axis=1) - around) > 0
+    return np.asarray(np.quantile(body, 1 - _BARE if brighter else _BARE, axis=1))
+
+
 def _mean_crossing(side: Array, core: Array, around: Array, step: float) -> tuple[Array, Array]:
     """Distance (K,) [m] from the middle to the edge of one side (K, M), and its blur (K,) [m].
 
@@ -197,6 +212,7 @@ def _mean_crossing(side: Array, core: Array, around: Array, step: float) -> tupl
     height = core - around
     height = np.where(np.abs(height) < 3.0, np.copysign(3.0, height), height)
     share = (side - around[:, None]) / height[:, None]
+    share = np.maximum.accumulate(share[:, ::-1], axis=1)[:, ::-1]
     inner = step * np.clip(4 * share - 2, 0, 1).sum(axis=1)  # levels from 1/2 to 3/4
     outer = step * np.clip(4 * share - 1, 0, 1).sum(axis=1)  # levels from 1/4 to 1/2
     return 0.5 * (inner + outer), np.maximum(outer - inner, 0.0) / 0.69

@@ -8,11 +8,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.contrast import candidate_maps, local_contrast, thresholds
 from dlo_casadi.vision.ordering import Chain, order_strands
-from dlo_casadi.vision.strands import Strand, find_strands
+from dlo_casadi.vision.strands import find_strands
 from dlo_casadi.vision.view import Array
 from dlo_casadi.vision.workplane import WorkPlane
 
@@ -24,9 +25,10 @@ _TWIN_CONTRAST = 0.6  # ... if they stand out as well, relative to the cable
 
 @dataclass(frozen=True)
 class _Line:
-    """A strand in metres, and how much it stands out."""
+    """A strand in metres, its width in pixels, and how much it stands out."""
 
     points: Array
+    width: float
     level: float
 
     @property
@@ -36,8 +38,11 @@ class _Line:
 
 @dataclass(frozen=True)
 class _Finding:
+    """A chain, and the picture and level in which it was found."""
+
     chain: Chain
-    lines: list[_Line]
+    candidate: NDArray[np.float32]
+    cut: float
 
 
 def find_cable(
@@ -62,13 +67,9 @@ def find_cable(
     best: _Finding | None = None
     longest = 0.0
     for candidate in candidate_maps(contrast, area_px):
-        for cut in thresholds(candidate, area_px):
-            strands = find_strands(candidate > cut, width_px)
-            lines = [
-                part
-                for strand in strands
-                for part in _lines(strand, candidate, plane, fixtures, diameter)
-            ]
+        for cut in thresholds(candidate[plane.reachable], area_px):
+            mask = (candidate > cut) & plane.reachable
+            lines = _lines(mask, candidate, plane, fixtures, diameter)
             longest = max([longest, *(line.length for line in lines)])
             chain = order_strands(
                 [line.points for line in lines],
@@ -78,7 +79,7 @@ def find_cable(
                 length=length,
             )
             if chain is not None and (best is None or chain.cost < best.chain.cost):
-                best = _Finding(chain, lines)
+                best = _Finding(chain, candidate, cut)
         if best is not None and best.chain.cost < _GOOD * length:
             break
     if best is None or best.chain.supported < _LEAST * length:
@@ -90,52 +91,82 @@ def find_cable(
             "picture and in focus? start, end, length and diameter right? a background of another "
             "brightness or colour?"
         )
-    _refuse_twins(best, diameter, length)
+    _refuse_twins(best, plane, fixtures, diameter, length)
     return best.chain
 
 
 def _lines(
-    strand: Strand,
+    mask: NDArray[np.bool_],
     candidate: NDArray[np.float32],
     plane: WorkPlane,
     fixtures: list[Array],
     diameter: float,
 ) -> list[_Line]:
-    """Turn a strand into metres, without its staircase, cut where it passes a fixture.
+    """Strands of a mask in metres, without their staircase, cut where they pass a fixture.
 
     What lies beyond a fixture, a tail of the cable, is then not taken for the measured part.
     """
-    columns, rows = strand.points.astype(int).T
-    level = float(np.median(candidate[rows, columns]))
-    smooth = gaussian_filter1d(strand.points, 0.5 * diameter / plane.pixel, axis=0, mode="nearest")
-    points = plane.to_board(smooth[1:-1:2])
-    margin = max(2, round(diameter / plane.pixel))
-    cuts = [0, len(points)]
-    for fixture in fixtures:
-        away = np.linalg.norm(points - fixture, axis=1)
-        nearest = int(np.argmin(away)) if len(away) else 0
-        if margin <= nearest < len(points) - margin and away[nearest] < diameter:
-            cuts.append(nearest)
-    cuts.sort()
-    parts = [points[a:b] for a, b in pairwise(cuts)]
-    return [_Line(part, level) for part in parts if len(part) > 2]
+    width_px = diameter / plane.pixel
+    margin = max(2, round(width_px))
+    lines = []
+    for strand in find_strands(mask, width_px):
+        columns, rows = strand.points.astype(int).T
+        level = float(np.median(candidate[rows, columns]))
+        smooth = gaussian_filter1d(strand.points, 0.5 * width_px, axis=0, mode="nearest")
+        points = plane.to_board(smooth[1:-1:2])
+        cuts = [0, len(points)]
+        for fixture in fixtures:
+            away = np.linalg.norm(points - fixture, axis=1)
+            nearest = int(np.argmin(away)) if len(away) else 0
+            if margin <= nearest < len(points) - margin and away[nearest] < diameter:
+                cuts.append(nearest)
+        parts = [points[a:b] for a, b in pairwise(sorted(cuts))]
+        lines += [_Line(part, strand.width, level) for part in parts if len(part) > 2]
+    return lines
 
 
-def _refuse_twins(best: _Finding, diameter: float, length: float) -> None:
-    """Raise if the strands that the chain leaves out look like a second cable."""
-    used = set(best.chain.used)
-    usual = float(np.median([best.lines[i].level for i in used]))
-    others = [
-        line.length
-        for i, line in enumerate(best.lines)
-        if i not in used and line.length > 5 * diameter and line.level > _TWIN_CONTRAST * usual
-    ]
-    if sum(others) > _TWIN * length:
+def _refuse_twins(
+    best: _Finding, plane: WorkPlane, fixtures: list[Array], diameter: float, length: float
+) -> None:
+    """Raise if strands away from the chain look like a second cable.
+
+    Within reach of the fixtures all of them count together; beyond, where the cable cannot be
+    anyway, only one long strand does.
+    """
+    lines = _lines(
+        (best.candidate > best.cut) & plane.inside, best.candidate, plane, fixtures, diameter
+    )
+    along = np.vstack(best.chain.strands)
+    tree = cKDTree(along)
+    apart = [float(np.median(tree.query(line.points)[0])) for line in lines]
+    ours = [line for line, away in zip(lines, apart, strict=True) if away < diameter]
+    if not ours:
+        return
+    level = float(np.median([line.level for line in ours]))
+    width = float(np.median([line.width for line in ours]))
+    near, far = 0.0, 0.0
+    for line, away in zip(lines, apart, strict=True):
+        if min(away - 1.5 * diameter, line.length - 5 * diameter) < 0:
+            continue
+        if line.level < _TWIN_CONTRAST * level or not 0.6 < line.width / width < 1.6:
+            continue
+        if _reachable(line.points, plane):
+            near += line.length
+        else:
+            far = max(far, line.length)
+    second = max(near, far)
+    if second > _TWIN * length:
         raise VisionError(
-            f"two cables: beside the strand of {best.chain.supported:.3f} m there are others of "
-            f"the same width and colour, {sum(others):.3f} m together (the cable is {length:g} m "
-            "long). Try: leave one cable in the picture, or cover the other."
+            f"two cables: beside the strand of {best.chain.supported:.3f} m there is "
+            f"{second:.3f} m of the same width and colour (the cable is {length:g} m long). "
+            "Try: leave one cable in the picture, or cover the other."
         )
+
+
+def _reachable(points: Array, plane: WorkPlane) -> bool:
+    """Whether most of these points are within reach of the cable."""
+    columns, rows = ((points - plane.origin) / plane.pixel * [1.0, -1.0]).round().astype(int).T
+    return bool(plane.reachable[rows, columns].mean() > 0.5)
 
 
 def _light(plane: WorkPlane) -> str:

@@ -41,6 +41,8 @@ class Trace:
         Whether the profile shows the cable and nothing else.
     inside : (K,) bool
         Whether it lies in the photograph.
+    width : scalar [m]
+        Typical distance of the two edges; 0 where no edges were found.
     """
 
     t: Array
@@ -48,6 +50,7 @@ class Trace:
     std: Array
     sound: NDArray[np.bool_]
     inside: NDArray[np.bool_]
+    width: float
 
 
 def trace_cable(
@@ -71,8 +74,7 @@ def trace_cable(
     if usual.sum() < 8:
         usual = profiles.inside
     if usual.sum() < 8:
-        none = np.zeros(len(t), bool)
-        return Trace(t, curve.position(t), np.zeros(len(t)), none, profiles.inside)
+        return _nothing(curve, t, profiles.inside)
     direction = cable_direction(profiles, usual, diameter)
     guess = EdgeShape(diameter, 0.8 / view.scale)
     for _ in range(2):
@@ -82,7 +84,7 @@ def trace_cable(
         rough = find_edges(raw, direction, shape)
         sound = raw.inside & _is_usual(rough, usual, diameter)
         if sound.sum() < 8:
-            return Trace(t, curve.position(t), np.zeros(len(t)), sound, raw.inside)
+            return _nothing(curve, t, raw.inside)
         points = curve.position(t) + rough.offset[:, None] * curve.normal(t)
         curve = fit_curve(t, points, sound.astype(float), 2 * diameter, 0.5 * diameter)
         usual = sound
@@ -93,7 +95,13 @@ def trace_cable(
         raw.inside & _is_usual(rough, sound, diameter) & _is_usual(fine, sound, diameter)
     )
     points = curve.position(t) + fine.offset[:, None] * curve.normal(t)
-    return Trace(t, points, _std(rough.offset, fine.offset, sound, view), sound, raw.inside)
+    std = _std(rough.offset, fine.offset, sound, view)
+    return Trace(t, points, std, sound, raw.inside, shape.width)
+
+
+def _nothing(curve: SmoothCurve, t: Array, inside: NDArray[np.bool_]) -> Trace:
+    """Trace without a sound profile."""
+    return Trace(t, curve.position(t), np.zeros(len(t)), np.zeros(len(t), bool), inside, 0.0)
 
 
 def _first_curve(
@@ -123,7 +131,8 @@ def _is_usual(found: Crossings, usual: NDArray[np.bool_], diameter: float) -> ND
     height = float(np.median(found.height[usual]))
     width = float(np.median(found.width[usual]))
     return (
-        (np.abs(found.height / height - 1) < 0.4)
+        (found.height / height > 0.35)
+        & (found.height / height < 2.5)
         & (np.abs(found.width / width - 1) < 0.3)
         & (np.abs(found.offset) < 0.4 * diameter)
     )
@@ -132,9 +141,12 @@ def _is_usual(found: Crossings, usual: NDArray[np.bool_], diameter: float) -> ND
 def _without_rims(sound: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Leave out short sound stretches, and the rims of long unsound ones.
 
-    Beside a holder, a pin or an occluder its colour leaks into the profile before that shows.
+    Beside a holder, a pin or an occluder its colour leaks into the profile before that shows. The
+    line's ends, at the fixtures, are such rims too.
     """
     rim = round(0.35 / _STEP)
+    sound = sound.copy()
+    sound[:rim] = sound[-rim:] = False
     regions, count = label(~sound)
     sizes = np.bincount(regions, minlength=count + 1)
     long = ~sound & (sizes[regions] > rim)

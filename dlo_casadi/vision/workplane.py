@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -12,7 +13,9 @@ from dlo_casadi.vision.view import Array, View
 
 CABLE_PX = 6.0  # width of the cable in this picture
 _MAX_PIXELS = 3.0e6
-_MAX_ENLARGEMENT = 2.0
+_MAX_ENLARGEMENT = 1.5
+_AROUND = 0.3  # of the length: how far beyond its reach other cables are looked for
+_MARKER_MARGIN = 1.45  # of the marker: its white margin is one cell of six or more
 
 
 @dataclass(frozen=True)
@@ -27,13 +30,16 @@ class WorkPlane:
         Side of one of its pixels.
     origin : (2,) [m]
         Board coordinates of the centre of its first pixel.
+    inside : (h, w) bool
+        Inside the photograph and off the markers.
     reachable : (h, w) bool
-        Inside the photograph and near enough to the fixtures for a cable of this length.
+        Of that, near enough to the fixtures for a cable of this length.
     """
 
     image: NDArray[np.uint8]
     pixel: float
     origin: Array
+    inside: NDArray[np.bool_]
     reachable: NDArray[np.bool_]
 
     def to_board(self, at: Array) -> Array:
@@ -58,22 +64,10 @@ def rectify(
     """
     height, width = image.shape[:2]
     reach = 1.08 * length + 2 * diameter
-    frame = np.stack(
-        np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33)), axis=-1
-    )
-    seen = view.to_board(frame.reshape(-1, 2))
-    if end is None:
-        lower, upper = start - reach, start + reach
-    else:
-        lower, upper = np.minimum(start, end), np.maximum(start, end)
-        slack = reach - np.linalg.norm(end - start) / 2
-        lower, upper = np.maximum(lower, upper - reach), np.minimum(upper, lower + reach)
-        lower, upper = (
-            np.minimum(lower, (start + end) / 2 - slack),
-            np.maximum(upper, (start + end) / 2 + slack),
-        )
-    lower = np.maximum(lower, seen.min(axis=0))
-    upper = np.minimum(upper, seen.max(axis=0))
+    centre, half = _reachable_box(start, end, reach)
+    half = half + _AROUND * length
+    lower = np.maximum(centre - half, _seen(view, np.min))
+    upper = np.minimum(centre + half, _seen(view, np.max))
     size = np.maximum(upper - lower, diameter)
     pixel = max(
         diameter / CABLE_PX,
@@ -94,12 +88,49 @@ def rectify(
     maps = ((at + 0.5) * factor - 0.5).astype(np.float32)
     flat = cv2.remap(small, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
+    inside &= ~_marker_mask(view, origin, pixel, int(rows), int(columns))
     x = origin[0] + pixel * np.arange(columns, dtype=np.float32)
     y = origin[1] - pixel * np.arange(rows, dtype=np.float32)[:, None]
     far = np.hypot(x - start[0], y - start[1])
     if end is not None:
         far = far + np.hypot(x - end[0], y - end[1])
-    return WorkPlane(np.asarray(flat, np.uint8), pixel, origin, inside & (far <= reach))
+    return WorkPlane(np.asarray(flat, np.uint8), pixel, origin, inside, inside & (far <= reach))
+
+
+def _reachable_box(start: Array, end: Array | None, reach: float) -> tuple[Array, Array]:
+    """Centre (2,) and half sides (2,) [m] of the box about all that the cable can reach.
+
+    An ellipse with the foci +-c and the long half axis a has the half sides
+    sqrt(a^2 - |c|^2 + c_i^2).
+    """
+    if end is None:
+        return start, np.full(2, reach)
+    focus = (end - start) / 2
+    spare = max((reach / 2) ** 2 - float(focus @ focus), 0.0)
+    return (start + end) / 2, np.sqrt(spare + focus**2)
+
+
+def _seen(view: View, extreme: Callable[..., Array]) -> Array:
+    """Extreme board coordinates (2,) [m] along the border of the photograph."""
+    height, width = view.shape
+    share = np.linspace(0.0, 1.0, 33)
+    zero, one = np.zeros_like(share), np.ones_like(share)
+    u = np.concatenate([share, one, share, zero]) * (width - 1)
+    v = np.concatenate([zero, share, one, share]) * (height - 1)
+    return extreme(view.to_board(np.column_stack([u, v])), axis=0)
+
+
+def _marker_mask(
+    view: View, origin: Array, pixel: float, rows: int, columns: int
+) -> NDArray[np.bool_]:
+    """Where the board's markers, with their white margin, are seen."""
+    mask = np.zeros((rows, columns), np.uint8)
+    for marker in view.markers:
+        corners = (view.to_board(marker) - origin) / pixel * [1.0, -1.0]
+        middle = corners.mean(axis=0)
+        margin = middle + _MARKER_MARGIN * (corners - middle)
+        cv2.fillConvexPoly(mask, np.round(margin).astype(np.int32), 1)
+    return mask > 0
 
 
 def _sources(view: View, origin: Array, pixel: float, rows: int, columns: int) -> Array:
