@@ -81,7 +81,7 @@ def nuisances(model: CableModel, tolerances: Tolerances, pixel: float | None = N
         priors = {
             f"{side}_heading_error": tolerances.heading for side, held in sides.items() if held
         }
-        found.append((ClampAngle(sides["start"], sides["end"]), priors))
+        found.append((ClampAngle(start=sides["start"], end=sides["end"]), priors))
     present = {effect.label for effect in model.effects}
     for effect, priors in found:
         if effect.label not in present:
@@ -94,9 +94,9 @@ def nuisances(model: CableModel, tolerances: Tolerances, pixel: float | None = N
 def make_effect(name: str, model: CableModel, center: tuple[float, float] | None) -> Effect:
     """Return the effect of that name for this cable's boundaries and camera."""
     if name == "clamp_angle":
-        return ClampAngle(model.start == "clamped", model.end == "clamped")
+        return ClampAngle(start=model.start == "clamped", end=model.end == "clamped")
     if name == "image_distortion":
-        return ImageDistortion(center or (0.0, 0.0))
+        return ImageDistortion(center=center or (0.0, 0.0))
     return EFFECTS[name]()
 
 

@@ -31,7 +31,9 @@ from dlo_casadi.stages import algorithm1_stage, fit_stage, initial_stage, stiffn
 FIRST_MESH = 20
 # The mesh is refined until its error is below this share of the noise.
 MESH_SHARE = 0.1
-FINEST_MESH = 320
+FINEST_MESH = 160
+# The search for missing effects, a hundred refits, runs on at most so many elements.
+SEARCH_MESH = 80
 # Huber's constant: points beyond it count with their distance instead of its square.
 HUBER = 1.5
 
@@ -152,19 +154,21 @@ def close_the_loop(
         Parameters of effects that the configuration declares.
     """
     options = outcome.config.diagnosis
+    searched = outcome.fit
+    if searched.model.n > SEARCH_MESH and not outcome.config.model.n:
+        searched = refine_mesh(searched, SEARCH_MESH, estimate=not searched.noise.declared)
     diagnosis = diagnose(
-        outcome.fit,
+        searched,
         center=center,
         exclude=options.exclude,
         significance=options.significance,
         max_effects=options.max_effects,
         step=progress.step,
     )
-    fit, stages, mesh = diagnosis.after, list(outcome.stages), outcome.discretization
-    if diagnosis.added:
-        fit, error = fine_enough(fit, fit.model.n)
-        mesh = Discretization(fit.model.n, fit.model.element, error)
-        diagnosis = replace(diagnosis, after=fit)
+    fit, stages = diagnosis.after, list(outcome.stages)
+    fit, error = fine_enough(fit, fit.model.n)
+    mesh = Discretization(fit.model.n, fit.model.element, error)
+    diagnosis = replace(diagnosis, after=fit)
     interval = stiffness_interval(fit)
     if diagnosis.added:
         labels = {item.candidate.effect.label for item in diagnosis.added}

@@ -126,9 +126,9 @@ def _applies(
 
 def _make(name: str, model: CableModel, center: tuple[float, float] | None) -> Effect:
     if name == "clamp_angle":
-        return ClampAngle(model.start == "clamped", model.end == "clamped")
+        return ClampAngle(start=model.start == "clamped", end=model.end == "clamped")
     if name == "image_distortion":
-        return ImageDistortion(center or (0.0, 0.0))
+        return ImageDistortion(center=center or (0.0, 0.0))
     return EFFECTS[name]()
 
 

@@ -14,6 +14,8 @@ from dlo_casadi.estimation.fit import Fit, fit_model
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)
+# Gauss-Newton steps of one refit.
+MOST_STEPS = 25
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
                 free=_free(base, model.names),
                 values=values,
                 start=base,
+                max_iterations=MOST_STEPS,
             )
         except EstimationError:
             continue

@@ -140,7 +140,7 @@ def diagnose(
         significant = [
             item for item, p in zip(screened, corrected, strict=True) if p < significance
         ]
-        confirmed = _confirmed(current, significant)
+        confirmed = _confirmed(current, significant, validation)
         if k == 0:
             ranked = _ranking(screened, corrected, confirmed)
         chosen = _choose(confirmed)
@@ -218,8 +218,10 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
     return _corrected(survival(gain, dof, noise_degrees(closed)), tried)
 
 
-def _confirmed(current: Fit, significant: Sequence[Screened]) -> list[Confirmed]:
-    """Refits of the leading candidates that improve the fit."""
+def _confirmed(
+    current: Fit, significant: Sequence[Screened], validation: CrossValidation
+) -> list[Confirmed]:
+    """Refits of the leading candidates that improve the fit and what it predicts."""
     if not significant:
         return []
     top = max(item.score for item in significant)
@@ -229,7 +231,10 @@ def _confirmed(current: Fit, significant: Sequence[Screened]) -> list[Confirmed]
         if item.score < WORTH * top:
             continue
         tried = confirm(current, item)
-        if tried is not None and tried.bic > 0 and tried.validation.complete:
+        if tried is None or tried.bic <= 0 or not tried.validation.complete:
+            continue
+        # An effect that explains the fitted poses but predicts the others worse is none.
+        if tried.validation.rmse <= validation.rmse:
             out.append(tried)
     return out
 

@@ -67,5 +67,4 @@ def _rest_now(fit: Fit) -> FloatArray:
     """Rest curvature after the session's last pose."""
     if not fit.model.has_state:
         return fit.rest
-    rests = fit.problem.sweep.rests(fit.point.shapes, fit.p, fit.rest)
-    return rests[-1]
+    return fit.problem.sweep.rest_after_last(fit.point.shapes, fit.p, fit.rest)

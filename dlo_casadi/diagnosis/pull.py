@@ -7,17 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.diagnosis.candidates import PLACES
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import Fit, fit_model
-from dlo_casadi.model import DEVIATIONS
+from dlo_casadi.estimation.fit import Fit, fit_model, starting_points
+from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.floating]
 
 # Places kept from the scan for a full fit, and the rise of twice the objective that bounds the
 # interval (95 % of chi-square with one degree of freedom).
 TRIED = 3
+PULL_PLACES = np.linspace(0.1, 0.9, 9)
+COARSE = 20
+# Standard deviation of a pull about the mean of the poses, in weights of the cable.
+PULL_WEIGHTS = 1.0
+# Gauss-Newton steps along the flat valley of stiffness against force.
+MOST_STEPS = 150
 RISE = 3.84
 
 
@@ -47,55 +54,95 @@ class Pull:
 def estimate_pull(base: Fit) -> Pull | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
-    The place is scanned with one Gauss-Newton step each, the best are refitted in full, and the
-    place is refined with everything else.
+    The fit without it may have gone far astray, so that it is no place to start from: on a
+    coarse mesh, stiffnesses over decades and places along the cable are searched anew. The best
+    are refitted in full, the place along with everything else.
     """
     effect = UnknownPull()
+    length = base.model.cable.length
     model = base.model.with_effect(effect)
     name = f"{effect.label}.position"
-    length = base.model.cable.length
-    fixed = set(base.problem.unknowns.model.names) - set(
-        np.array(base.model.names)[base.problem.unknowns.free]
-    )
-    free = [key for key in model.names if key not in fixed and key != name]
-    fits: dict[float, Fit] = {}
-    for share in PLACES:
-        values = model.nominal.copy()
-        values[model.names.index(name)] = share * length
-        fit = _quick(base, model, values, free, steps=1)
-        if fit is not None:
-            fits[float(share * length)] = fit
-    if not fits:
-        return None
-    leading = sorted(fits, key=lambda place: fits[place].point.objective)[:TRIED]
+    unknowns = base.problem.unknowns
+    held = {key for key, free in zip(base.model.names, unknowns.free, strict=True) if not free}
+    free = [key for key in model.names if key not in held and key != name]
+    coarse = _search(base, model.with_mesh(min(COARSE, base.model.n)), free, name)
     best: Fit | None = None
-    for place in leading:
-        refined = _quick(fits[place], model, fits[place].p, [*free, name], steps=40)
-        if refined is not None and (best is None or refined.point.objective < best.point.objective):
+    for fit in coarse:
+        try:
+            refined = fit_model(
+                model,
+                base.problem.measured,
+                base.problem.tolerances,
+                free=[*free, name],
+                values=fit.p,
+                start=fit,
+                max_iterations=MOST_STEPS,
+            )
+        except EstimationError:
+            continue
+        if best is None or refined.point.objective < best.point.objective:
             best = refined
     if best is None:
         return None
-    position = best.value(name)
-    std = max(best.std(name), 1e-4 * length)
     columns = [DEVIATIONS.index(axis) for axis in effect.per_pose]
-    forces = best.point.shapes.deviation[np.ix_(best.problem.used, columns)]
-    half = np.sqrt(RISE) * std
-    interval = (max(0.0, position - half), min(length, position + half))
+    mean = [best.value(f"{effect.label}.{axis}") for axis in ("fx", "fy")]
+    forces = best.point.shapes.deviation[np.ix_(best.problem.used, columns)] + mean
+    position = best.value(name)
+    half = np.sqrt(RISE) * max(best.std(name), 1e-4 * length)
+    interval = (float(max(0.0, position - half)), float(min(length, position + half)))
     gain = 2 * (base.point.objective - best.point.objective)
     return Pull(forces, position, interval, gain, best)
 
 
-def _quick(base: Fit, model, values: FloatArray, free: list[str], steps: int) -> Fit | None:  # type: ignore[no-untyped-def]
-    """Fit with a limited number of steps; None where equilibria are lost."""
-    try:
-        return fit_model(
-            model,
-            base.problem.measured,
-            base.problem.tolerances,
-            free=free,
-            values=values,
-            start=base,
-            max_iterations=steps,
+def _search(base: Fit, model: CableModel, free: list[str], name: str) -> list[Fit]:
+    """Best fits on a coarse mesh with the place held, one for each place, the best first."""
+    problem = base.problem
+    chosen = np.array([key in free for key in model.names])
+    starts: list[tuple[BatchProblem, Point]] = []
+    sweep = None
+    for share in PULL_PLACES:
+        values = base_values(base, model)
+        values[model.names.index(name)] = share * model.cable.length
+        unknowns = Unknowns(model, chosen, values, problem.unknowns.rest_free)
+        trial = BatchProblem(
+            unknowns,
+            problem.measured,
+            problem.noise,
+            problem.tolerances,
+            problem.roughness_std,
+            pull_scatter(base),
+            sweep,
         )
-    except EstimationError:
-        return None
+        sweep = trial.sweep
+        theta = unknowns.pack(values, np.zeros(model.rest.n_coefficients))
+        points = starting_points(trial, theta)
+        starts += [(trial, point) for point in points[:1]]
+    starts = sorted(starts, key=lambda item: item[1].objective)[:TRIED]
+    fits = []
+    for trial, point in starts:
+        trial.refresh(point.feet)
+        fits.append(Fit(trial, *trial.descend(point)))
+    return sorted(fits, key=lambda fit: fit.point.objective)
+
+
+def pull_scatter(base: Fit) -> FloatArray:
+    """Scatter of ends as in the base, of a pull about its mean the cable's weight.
+
+    Shapes tell the ratio of forces to stiffness and, by the weight, how large both are; where
+    the weight hardly shows, a force of a hundred times the weight would fit as well. And a force
+    along a taut cable hardly shows: there it should be like that of the other poses.
+    """
+    cable = base.model.cable
+    weight = cable.mass * float(np.hypot(*base.model.gravity))
+    scatter = base.problem.scatter.copy()
+    scatter[4:] = PULL_WEIGHTS * max(weight, cable.bending_stiffness / cable.length**2)
+    return scatter
+
+
+def base_values(base: Fit, model: CableModel) -> FloatArray:
+    """Nominal values, but what the base keeps fixed."""
+    values = model.nominal.copy()
+    for key, free in zip(base.model.names, base.problem.unknowns.free, strict=True):
+        if not free:
+            values[model.names.index(key)] = base.value(key)
+    return values

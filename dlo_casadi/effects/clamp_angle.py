@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params
 from dlo_casadi.parameters import Parameter
 
 
+@dataclass(frozen=True)
 class ClampAngle(BoundaryEffect):
     """True minus declared heading of the clamps, the same in all poses.
 
@@ -18,13 +21,9 @@ class ClampAngle(BoundaryEffect):
     """
 
     name = "clamp_angle"
+
     start: bool = True
     end: bool = True
-
-    def __init__(self, start: bool = True, end: bool = True, label: str = "") -> None:
-        super().__init__(label)
-        object.__setattr__(self, "start", start)
-        object.__setattr__(self, "end", end)
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the errors of the clamped ends."""

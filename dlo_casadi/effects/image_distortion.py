@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import casadi as ca
 
 from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params
 from dlo_casadi.parameters import Parameter
 
 
+@dataclass(frozen=True)
 class ImageDistortion(MeasurementEffect):
     """Radial distortion about the image centre, in the cable's plane.
 
@@ -29,11 +32,8 @@ class ImageDistortion(MeasurementEffect):
     """
 
     name = "image_distortion"
-    center: tuple[float, float]
 
-    def __init__(self, center: tuple[float, float] = (0.0, 0.0), label: str = "") -> None:
-        super().__init__(label)
-        object.__setattr__(self, "center", center)
+    center: tuple[float, float] = (0.0, 0.0)
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the coefficient."""

@@ -17,7 +17,7 @@ class LumpedMass(Load):
     Parameters
     ----------
     mass : scalar [kg], >= 0
-        Vanishes at 0.
+        Vanishes at 0; at most three times the cable's mass.
     position : scalar [m], in [0, L]
         Arc length s from the start fixture. r(s) is once differentiable in s.
 
@@ -33,7 +33,7 @@ class LumpedMass(Load):
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare mass and position."""
         return (
-            Parameter("mass", "kg", lower=0.0, scale=0.1 * cable.mass, upper=100 * cable.mass),
+            Parameter("mass", "kg", lower=0.0, scale=0.1 * cable.mass, upper=3 * cable.mass),
             Parameter(
                 "position",
                 "m",

@@ -17,7 +17,7 @@ class PointForce(Load):
     Parameters
     ----------
     fx, fy : scalar [N]
-        In the board frame; vanishes at 0.
+        In the board frame; vanishes at 0; at most three times the cable's weight on Earth.
     position : scalar [m], in [0, L]
         Arc length from the start fixture.
     """
@@ -28,8 +28,8 @@ class PointForce(Load):
         """Declare the force and its place."""
         scale = 0.1 * 9.81 * cable.mass
         return (
-            Parameter("fx", "N", scale=scale),
-            Parameter("fy", "N", scale=scale),
+            Parameter("fx", "N", scale=scale, lower=-30 * scale, upper=30 * scale),
+            Parameter("fy", "N", scale=scale, lower=-30 * scale, upper=30 * scale),
             Parameter(
                 "position",
                 "m",

@@ -12,7 +12,7 @@ from dlo_casadi.parameters import Parameter
 class UnknownPull(Load):
     """A force at one place of the cable that may be another one in every pose.
 
-        V_j = - f_j . r(s)                                            [J]
+        V_j = - (f + f_j) . r(s)                                      [J]
 
     It assumes no cause: it tells where and how the cable is pulled when no effect explains the
     residual. The forces are unknowns of the poses, not parameters of the cable, so that nothing
@@ -20,6 +20,8 @@ class UnknownPull(Load):
 
     Parameters
     ----------
+    fx, fy : scalar [N]
+        Mean over the poses; f_j is what each deviates from it.
     position : scalar [m], in [0, L]
     """
 
@@ -27,9 +29,12 @@ class UnknownPull(Load):
     per_pose = ("pull_x", "pull_y")
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
-        """Declare the place."""
+        """Declare the mean force and its place."""
         length = cable.length
+        scale = 9.81 * cable.mass
         return (
+            Parameter("fx", "N", scale=scale),
+            Parameter("fy", "N", scale=scale),
             Parameter(
                 "position", "m", nominal=length / 2, scale=0.1 * length, upper=length, lower=0.0
             ),
@@ -37,5 +42,5 @@ class UnknownPull(Load):
 
     def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
         """Potential energy of the force [J]."""
-        force = ca.vertcat(params["pull_x"], params["pull_y"])
+        force = ca.vertcat(params["fx"] + params["pull_x"], params["fy"] + params["pull_y"])
         return -ca.dot(force, curve.position(params["position"]))

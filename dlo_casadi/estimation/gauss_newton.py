@@ -310,7 +310,9 @@ class BatchProblem:
             damping = damping / 10 if damping > 1e-6 else 0.0
             point = trial
             lin = self.linearize(point)
-            if gain < tolerance and damping < 1e-2:
+            # Where the residual exceeds the noise, so does a standard deviation's decrease.
+            excess = max(1.0, point.data / max(self.n_points, 1))
+            if gain < tolerance * excess and damping < 1e-2:
                 return point, True
         return point, False
 

@@ -15,7 +15,7 @@ from dlo_casadi.estimation.observation import (
     chord_places,
     normal_rows,
 )
-from dlo_casadi.estimation.sweep import Shapes
+from dlo_casadi.estimation.sweep import Sensitivities, Shapes
 from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.floating]
@@ -139,6 +139,8 @@ def all_at_once(
     n_phi = sweep.n_phi
     lower, upper = unknowns.bounds
     moving = ~held
+    columns = sweep.used_deviations
+    own = np.diag(1 / problem.deviation_std**2 + 1e-12)
     for _ in range(iterations):
         p, rest = unknowns.p(theta), unknowns.rest(theta)
         slopes = unknowns.slopes(theta)
@@ -149,24 +151,34 @@ def all_at_once(
         except np.linalg.LinAlgError:
             return None
         point = problem.evaluate(theta, shapes, feet)
-        ahead = _predicted(problem, point, correction, sens.theta, slopes)
+        ahead = _predicted(problem, point, correction, sens, slopes)
         gap = theta - problem.mean
         hessian, gradient = problem.precision.copy(), problem.precision @ gap
-        for e, a in ahead:
-            hessian += a.T @ a
-            gradient += a.T @ e
+        inner = []
+        for j, (e, a, b) in zip(problem.used, ahead, strict=True):
+            block = b.T @ b + own
+            cross, slope = b.T @ a, b.T @ e + own @ shapes.deviation[j, columns]
+            solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+            hessian += a.T @ a - cross.T @ solved[:, :-1]
+            gradient += a.T @ e - cross.T @ solved[:, -1]
+            inner.append(solved)
         damped = hessian[np.ix_(moving, moving)]
         damped = damped + 1e-6 * np.diag(np.diag(damped))
         step = np.zeros_like(theta)
         step[moving] = -np.linalg.solve(damped, gradient[moving])
         step = np.clip(theta + np.clip(step, -3, 3), lower, upper) - theta
-        change = correction + sens.theta @ step
+        deviation = shapes.deviation.copy()
+        for j, solved in zip(problem.used, inner, strict=True):
+            deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
+        moved = (deviation - shapes.deviation)[:, :, None]
+        change = correction + sens.theta @ step + (sens.deviation @ moved)[:, :, 0]
         size = float(np.abs(change[:, :n_phi]).max())
         damp = min(1.0, 0.7 / max(size, 1e-12))
         shapes = replace(
             shapes,
             phi=shapes.phi + damp * change[:, :n_phi],
             lam=shapes.lam + change[:, n_phi:],
+            deviation=deviation,
         )
         theta = theta + step
         feet = point.feet
@@ -182,13 +194,13 @@ def _predicted(
     problem: BatchProblem,
     point: Point,
     correction: FloatArray,
-    by_theta: FloatArray,
+    sens: Sensitivities,
     slopes: FloatArray,
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Whitened residuals after the correction, and their Jacobian by theta."""
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Whitened residuals after the correction, and their Jacobians by theta and deviations."""
     unknowns, sweep = problem.unknowns, problem.sweep
     p, rest = unknowns.p(point.theta), unknowns.rest(point.theta)
-    z, by_x, by_p, _ = sweep.observe(point.shapes, p, rest)
+    z, by_x, by_p, by_dev = sweep.observe(point.shapes, p, rest)
     out = []
     for j, s in zip(problem.used, point.feet, strict=True):
         curve = NodeCurve.of(unknowns.model.chain, z[j])
@@ -197,5 +209,7 @@ def _predicted(
         d = ((problem.measured[j].points - curve.at(s)) * normals).sum(axis=1)
         d = d - rows @ (by_x[j] @ correction[j])
         white = problem.whitening(j, s)
-        out.append((white @ d, -white @ (rows @ (by_x[j] @ by_theta[j] + by_p[j] @ slopes))))
+        theta_z = by_x[j] @ sens.theta[j] + by_p[j] @ slopes
+        deviation_z = (by_x[j] @ sens.deviation[j] + by_dev[j])[:, sweep.used_deviations]
+        out.append((white @ d, -white @ (rows @ theta_z), -white @ (rows @ deviation_z)))
     return out

@@ -138,6 +138,11 @@ class Sweep:
             out.append(self._after(j, shapes, p, out[-1])[0][:, 0])
         return np.array(out)
 
+    def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """Rest curvature (n_cells,) that the last pose leaves behind."""
+        last = self.rests(shapes, p, rest)[-1]
+        return self._after(self.m - 1, shapes, p, last)[0][:, 0]
+
     def _carry(
         self, shapes: Shapes, p: FloatArray, rests: FloatArray
     ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
