@@ -16,7 +16,7 @@ from dlo_casadi.declared import Declared, declared_model, straight
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.batch import solve_batch
-from dlo_casadi.estimation.fit import Fit, fit_model, refine_mesh
+from dlo_casadi.estimation.fit import SETTLED_MODES, SMOOTH_MODES, Fit, fit_model, refine_mesh
 from dlo_casadi.estimation.mesh import discretization_error
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import stiffness_interval
@@ -156,7 +156,7 @@ def close_the_loop(
     options = outcome.config.diagnosis
     searched = outcome.fit
     if searched.model.n > SEARCH_MESH and not outcome.config.model.n:
-        searched = refine_mesh(searched, SEARCH_MESH, estimate=not searched.noise.declared)
+        searched = refine_mesh(searched, SEARCH_MESH)
     diagnosis = diagnose(
         searched,
         center=center,
@@ -166,7 +166,7 @@ def close_the_loop(
         step=progress.step,
     )
     fit, stages = diagnosis.after, list(outcome.stages)
-    fit, error = fine_enough(fit, fit.model.n)
+    fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
     interval = stiffness_interval(fit)
@@ -209,19 +209,19 @@ def fit_declared(
         model, measured, declared.tolerances, std, free=free, values=declared.start_values()
     )
     if finest:
-        fit = refine_mesh(fit, finest, estimate=std is None)
+        fit = refine_mesh(fit, finest)
         return fit, discretization_error(fit)
     return fine_enough(fit, 2 * FIRST_MESH)
 
 
-def fine_enough(fit: Fit, n: int) -> tuple[Fit, float]:
+def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float]:
     """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
 
     Where an effect is missing, the mesh need not be finer than what is missing.
     """
     while True:
         if n != fit.model.n:
-            fit = refine_mesh(fit, n, estimate=not fit.noise.declared)
+            fit = refine_mesh(fit, n, modes)
         error = discretization_error(fit)
         if error <= MESH_SHARE * max(fit.noise.std, fit.residual_rms) or n >= FINEST_MESH:
             return fit, error

@@ -274,7 +274,7 @@ def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> flo
 def scatter_of(problem: BatchProblem, point: Point, lin: Linearization) -> FloatArray:
     """One fixed-point update of the scatter of ends and headings, never above the tolerance."""
     columns = problem.sweep.used_deviations
-    if not columns:
+    if not columns or len(problem.used) == 1:
         return problem.scatter
     normal = problem.normal_equations(point, lin)
     covariance = np.linalg.pinv(normal.hessian, hermitian=True)
@@ -346,7 +346,11 @@ def fit_model(
     if start is not None:
         return _continue(unknowns, measured, tolerances, start, max_iterations)
     noise = NoiseModel(std or FIRST_STD, declared=std is not None)
-    problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START)
+    scatter = tolerances.deviation
+    if sum(item.readable and not item.held_out for item in measured) == 1:
+        # One pose does not deviate from others: what is wrong with it is wrong with the session.
+        scatter = SCATTER_FLOOR * scatter
+    problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.rest.n_coefficients))
     points = starting_points(problem, theta, decades)
     if not points:
@@ -418,13 +422,27 @@ def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shape
     return Shapes(phi, lam, shapes.deviation)
 
 
-def refine_mesh(fit: Fit, n: int, *, estimate: bool) -> Fit:
-    """Fit the same model on another mesh, from a fit's minimum."""
+def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
+    """Fit the same model on another mesh, from a fit's minimum.
+
+    Parameters
+    ----------
+    modes : int
+        Slow displacements kept out of the noise estimate, if the noise is not declared.
+    """
     problem = fit.problem
     model = fit.model.with_mesh(n)
     unknowns = replace(problem.unknowns, model=model)
-    moved = _continue(unknowns, problem.measured, problem.tolerances, fit)
-    problem, point, converged = refine(moved.problem, moved.point, estimate=estimate, rounds=2)
+    try:
+        moved = _continue(unknowns, problem.measured, problem.tolerances, fit)
+    except EstimationError:
+        # The coarse mesh was too far off to be followed: start again from the measured shapes.
+        names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]
+        std = fit.noise.std if fit.noise.declared else None
+        return fit_model(model, problem.measured, problem.tolerances, std, free=names, values=fit.p)
+    problem, point, converged = refine(
+        moved.problem, moved.point, estimate=not fit.noise.declared, rounds=2, modes=modes
+    )
     return Fit(problem, point, converged)
 
 

@@ -1,0 +1,193 @@
+"""Run whole sessions whose truth is known and set the results beside it.
+
+    python scripts/check_bench.py [NAME ...] [--without-true-effect] [--output FILE]
+
+Only this script and the tests read the truth; the toolkit never does. The bench sessions are
+rendered: an independent rod simulator and a camera renderer made them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import yaml
+
+from dlo_casadi.config import load_config
+from dlo_casadi.outcome import Outcome
+from dlo_casadi.session import run_session
+
+ROOT = Path(__file__).resolve().parent.parent
+TRUTH = ROOT / "tests" / "data" / "bench_truth"
+# What the truth calls an effect -> its name here and its parameters by theirs.
+NAMES = {
+    "lump": ("lumped_mass", ("position", "mass")),
+    "taper": ("stiffness_gradient", ("slope",)),
+    "softening": ("bending_softening", ("curvature_scale",)),
+    "length": ("length_error", ("length_difference",)),
+    "creep": ("rest_curvature_drift", ("rate",)),
+    "stiff_section": ("stiff_section", ("start", "end", "factor")),
+    "extens": ("axial_stretch", ("axial_stiffness",)),
+    "clamp_error": ("clamp_angle", ("start_heading_error", "end_heading_error")),
+}
+
+
+def config_of(name: str) -> Path:
+    """Configuration of a bench session."""
+    if name == "connector":
+        return ROOT / "configs" / "cable.yaml"
+    return ROOT / "tests" / "data" / "bench" / name / "session.yaml"
+
+
+def true_effects(name: str) -> dict[str, dict[str, float]]:
+    """Effects that are in a session, by their names here; a tether is on nobody's list."""
+    truth = yaml.safe_load((TRUTH / name / "truth.yaml").read_text())
+    found: dict[str, dict[str, float]] = {}
+    for key, value in truth["effects"].items():
+        if key == "end_spring":
+            k0, h0, k1, h1 = value
+            if k0:
+                found["start_spring"] = {"stiffness": k0, "heading": h0}
+            if k1:
+                found["end_spring"] = {"stiffness": k1, "heading": h1}
+        elif key in NAMES:
+            effect, parameters = NAMES[key]
+            values = value if isinstance(value, list) else [value]
+            found[effect] = dict(zip(parameters, values, strict=True))
+        else:
+            found[key] = {}
+    return found
+
+
+def compare(name: str, outcome: Outcome) -> dict:
+    """Required and measured figures of one session."""
+    truth = yaml.safe_load((TRUTH / name / "truth.yaml").read_text())
+    batch, last = outcome.stage("batch"), outcome.stages[-1]
+    assert batch is not None
+    stiffness = last.parameters["bending_stiffness"]
+    row = {
+        "session": name,
+        "verdict": outcome.verdict,
+        "true": sorted(true_effects(name)),
+        "found": [effect["name"] for effect in outcome.effects],
+        "ties": {e["name"]: e["indistinguishable_from"] for e in outcome.effects},
+        "EI_true": truth["bending_stiffness"],
+        "EI": stiffness.value,
+        "EI_interval_95": stiffness.interval_95,
+        "EI_identifiable": stiffness.identifiable,
+        "noise_mm": 1e3 * outcome.measurement.std,
+        "held_out_batch_mm": _mm(batch.rmse_held_out),
+        "held_out_mm": _mm(last.rmse_held_out),
+        "held_out_over_noise": (last.rmse_held_out or np.nan) / outcome.measurement.std,
+        "chi2_per_dof": last.chi2_per_dof,
+        "seconds": outcome.timing["total"],
+        "diagnosis_seconds": outcome.timing["diagnosis"],
+        "parameters": {},
+    }
+    for effect in outcome.effects:
+        for key, true in true_effects(name).get(effect["name"], {}).items():
+            found = effect["parameters"][key]
+            row["parameters"][f"{effect['name']}.{key}"] = {
+                "true": true,
+                "value": found["value"],
+                "std": found["std"],
+                "deviations": (found["value"] - true) / found["std"],
+                "relative": (found["value"] - true) / true if true else None,
+            }
+    if "tether" in truth["effects"] and outcome.unexplained:
+        row["pull"] = _pull(name, truth["effects"]["tether"], outcome)
+    return row
+
+
+def _mm(value: float | None) -> float | None:
+    return None if value is None else 1e3 * value
+
+
+def _pull(name: str, tether: list[float], outcome: Outcome) -> dict:
+    """The tether's force in each fit pose against the estimate."""
+    s, k, x, y = tether
+    shapes = np.load(TRUTH / name / "truth_shapes.npz")
+    length = outcome.config.cable.length
+    assert outcome.unexplained is not None
+    estimate = np.array(outcome.unexplained["force_per_pose"])
+    true = []
+    for pose in outcome.unexplained["poses"]:
+        curve = shapes[pose]
+        places = np.linspace(0.0, length, len(curve))
+        at = [np.interp(s, places, curve[:, i]) for i in (0, 1)]
+        true.append([k * (x - at[0]), k * (y - at[1])])
+    force = np.array(true)
+    sizes = np.hypot(*estimate.T) / np.hypot(*force.T)
+    angles = np.arctan2(estimate[:, 1], estimate[:, 0]) - np.arctan2(force[:, 1], force[:, 0])
+    angles = np.degrees(np.abs((angles + np.pi) % (2 * np.pi) - np.pi))
+    return {
+        "position": outcome.unexplained["position"],
+        "position_true": s,
+        "median_size_error": float(np.median(np.abs(sizes - 1))),
+        "median_angle_deg": float(np.median(angles)),
+    }
+
+
+def main() -> None:
+    """Run the sessions that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", help="sessions; all by default")
+    parser.add_argument(
+        "--without-true-effect",
+        action="store_true",
+        help="take the true effects out of the library: what is named then?",
+    )
+    parser.add_argument("--output", type=Path, help="JSON file for the table")
+    args = parser.parse_args()
+    names = args.names or sorted(path.name for path in TRUTH.iterdir() if path.is_dir())
+    rows = []
+    for name in names:
+        config = load_config(config_of(name))
+        if args.without_true_effect:
+            hidden = tuple(n for n in true_effects(name) if n != "tether")
+            config = replace(
+                config, diagnosis=config.diagnosis.model_copy(update={"exclude": hidden})
+            )
+        begin = time.perf_counter()
+        row = compare(name, run_session(config))
+        rows.append(row)
+        show(row, time.perf_counter() - begin)
+        if args.output:
+            args.output.write_text(json.dumps(rows, indent=1, default=str))
+
+
+def show(row: dict, seconds: float) -> None:
+    """Print one session."""
+    print(
+        f"{row['session']:15s} {row['verdict']:12s} true {','.join(row['true']) or '-':24s} "
+        f"found {','.join(row['found']) or '-'}  ties {row['ties']}"
+    )
+    low, high = row["EI_interval_95"]
+    bounds = [f"{x:.4g}" if x is not None else "-" for x in (low, high)]
+    print(
+        f"    EI {row['EI']:.4g} [{bounds[0]}, {bounds[1]}] true {row['EI_true']:.4g}   noise "
+        f"{row['noise_mm']:.3f} mm  held out {row['held_out_batch_mm'] or np.nan:.3f} -> "
+        f"{row['held_out_mm'] or np.nan:.3f} mm = {row['held_out_over_noise']:.2f} noise   "
+        f"chi2/dof {row['chi2_per_dof']:.2f}   {seconds:.0f} s "
+        f"(diagnosis {row['diagnosis_seconds']:.0f} s)"
+    )
+    for key, item in row["parameters"].items():
+        relative = "" if item["relative"] is None else f"  {item['relative']:+.0%}"
+        print(
+            f"    {key} {item['value']:.4g} +/- {item['std']:.2g}, true {item['true']:.4g}: "
+            f"{item['deviations']:+.1f} std{relative}"
+        )
+    if "pull" in row:
+        print(f"    pull {row['pull']}")
+    print(end="", flush=True)
+
+
+if __name__ == "__main__":
+    main()
