@@ -76,7 +76,8 @@ def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None =
     found = _detect(image, board)
     places = {marker: board.corners(marker) for marker in found}
     homography, errors = _fit(found, places, board.standoff, camera)
-    while max(errors.values()) > _MAX_ERROR_PX and len(found) > 2:
+    majority = len(found) // 2 + 1
+    while max(errors.values()) > _MAX_ERROR_PX and len(found) > majority:
         found, homography, errors = _without_worst(found, places, board.standoff, camera)
     rms = float(np.sqrt(np.mean(np.square(list(errors.values())))))
     if rms > _MAX_ERROR_PX:

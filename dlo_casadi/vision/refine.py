@@ -31,7 +31,7 @@ class Profiles:
     values : (K, M, 3)
         Colours.
     inside : (K,) bool
-        The whole profile lies in the photograph.
+        The cable and its edges lie in the photograph.
     """
 
     t: Array
@@ -91,7 +91,8 @@ def sample_profiles(
     points = centre[:, None, :] + offset[None, :, None] * normal[:, None, :]
     at = view.to_pixels(points.reshape(-1, 2)).reshape(len(t), count, 2)
     high, wide = view.shape
-    inside = np.all((at >= 0) & (at <= [wide - 1, high - 1]), axis=(1, 2))
+    needed = np.abs(offset) < 0.5 * diameter + 2.5 * pixel
+    inside = np.all((at[:, needed] >= 0) & (at[:, needed] <= [wide - 1, high - 1]), axis=(1, 2))
     values = cv2.remap(
         image, at.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial import cKDTree
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.contrast import candidate_maps, local_contrast, thresholds
@@ -38,9 +38,10 @@ class _Line:
 
 @dataclass(frozen=True)
 class _Finding:
-    """A chain, and the picture and level in which it was found."""
+    """A chain, its strands, and the picture and level in which it was found."""
 
     chain: Chain
+    ours: list[_Line]
     candidate: NDArray[np.float32]
     cut: float
 
@@ -79,7 +80,7 @@ def find_cable(
                 length=length,
             )
             if chain is not None and (best is None or chain.cost < best.chain.cost):
-                best = _Finding(chain, candidate, cut)
+                best = _Finding(chain, [lines[i] for i in chain.used], candidate, cut)
         if best is not None and best.chain.cost < _GOOD * length:
             break
     if best is None or best.chain.supported < _LEAST * length:
@@ -133,24 +134,21 @@ def _refuse_twins(
     Within reach of the fixtures all of them count together; beyond, where the cable cannot be
     anyway, only one long strand does.
     """
-    lines = _lines(
-        (best.candidate > best.cut) & plane.inside, best.candidate, plane, fixtures, diameter
-    )
-    along = np.vstack(best.chain.strands)
-    tree = cKDTree(along)
-    apart = [float(np.median(tree.query(line.points)[0])) for line in lines]
-    ours = [line for line, away in zip(lines, apart, strict=True) if away < diameter]
-    if not ours:
+    rest = ((best.candidate > best.cut) & plane.inside).astype(np.uint8)
+    for strand in best.chain.strands:
+        at = np.round(plane.to_pixels(strand)).astype(np.int32)
+        cv2.polylines(rest, [at], False, 0, round(3 * diameter / plane.pixel))
+    if rest.sum() < 0.5 * _TWIN * length * diameter / plane.pixel**2:
         return
-    level = float(np.median([line.level for line in ours]))
-    width = float(np.median([line.width for line in ours]))
+    level = float(np.median([line.level for line in best.ours]))
+    width = float(np.median([line.width for line in best.ours]))
     near, far = 0.0, 0.0
-    for line, away in zip(lines, apart, strict=True):
-        if min(away - 1.5 * diameter, line.length - 5 * diameter) < 0:
+    for line in _lines(rest > 0, best.candidate, plane, fixtures, diameter):
+        alike = line.level > _TWIN_CONTRAST * level and 0.6 < line.width / width < 1.6
+        if not alike or line.length < 5 * diameter:
             continue
-        if line.level < _TWIN_CONTRAST * level or not 0.6 < line.width / width < 1.6:
-            continue
-        if _reachable(line.points, plane):
+        columns, rows = plane.to_pixels(line.points).round().astype(int).T
+        if plane.reachable[rows, columns].mean() > 0.5:
             near += line.length
         else:
             far = max(far, line.length)
@@ -161,12 +159,6 @@ def _refuse_twins(
             f"{second:.3f} m of the same width and colour (the cable is {length:g} m long). "
             "Try: leave one cable in the picture, or cover the other."
         )
-
-
-def _reachable(points: Array, plane: WorkPlane) -> bool:
-    """Whether most of these points are within reach of the cable."""
-    columns, rows = ((points - plane.origin) / plane.pixel * [1.0, -1.0]).round().astype(int).T
-    return bool(plane.reachable[rows, columns].mean() > 0.5)
 
 
 def _light(plane: WorkPlane) -> str:

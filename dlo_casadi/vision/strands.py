@@ -42,8 +42,14 @@ def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[Strand]:
     shorter than the cable is wide are left out: whether the strands on both sides of a cut
     continue each other is decided by their directions, not by the pixels between them.
     """
+    whole = mask.astype(np.uint8) * 255
+    x, y, wide, high = cv2.boundingRect(whole)
+    if wide == 0:
+        return []
+    x, y = max(x - 2, 0), max(y - 2, 0)
+    part = whole[y : y + high + 4, x : x + wide + 4]
     core = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
-    filled = cv2.morphologyEx(mask.astype(np.uint8) * 255, cv2.MORPH_CLOSE, core)
+    filled = cv2.morphologyEx(part, cv2.MORPH_CLOSE, core)
     thick = _thick(filled, width_px)
     filled[thick > 0] = 0
     depth = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
@@ -63,7 +69,7 @@ def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[Strand]:
         points = _walk(np.column_stack([columns + left, rows + top]))
         width = 2 * float(np.median(depth[points[:, 1], points[:, 0]]))
         if width > _NARROWEST * width_px:
-            strands.append(Strand(points.astype(float), width))
+            strands.append(Strand(points + np.array([x, y], float), width))
     return strands
 
 

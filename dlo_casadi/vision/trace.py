@@ -107,7 +107,7 @@ def _nothing(curve: SmoothCurve, t: Array, inside: NDArray[np.bool_]) -> Trace:
 def _first_curve(
     strands: tuple[Array, ...], diameter: float, start: Array, end: Array | None
 ) -> tuple[SmoothCurve, Array]:
-    """Smooth curve through the strands, extended straight to near fixtures, and its samples t."""
+    """Smooth curve through the strands, extended straight at both ends, and its samples t."""
     points = np.vstack(strands)
     t = chord_length(points)
     keep = np.concatenate([[True], np.diff(t) > 0])
@@ -116,14 +116,22 @@ def _first_curve(
     step = _STEP * diameter
     line = curve.position(np.arange(t[0], t[-1], step))
     forwards = [curve.spline(at, 1) / np.linalg.norm(curve.spline(at, 1)) for at in (t[0], t[-1])]
-    head = float((line[0] - start) @ forwards[0])
-    if 0 < head < 4 * diameter:
-        line = np.vstack([line[0] + np.arange(-head, 0, step)[:, None] * forwards[0], line])
-    tail = 0.0 if end is None else float((end - line[-1]) @ forwards[1])
-    if 0 < tail < 4 * diameter:
-        line = np.vstack([line, line[-1] + np.arange(step, tail, step)[:, None] * forwards[1]])
+    head = _ahead(float((line[0] - start) @ forwards[0]), diameter)
+    tail = _ahead(np.inf if end is None else float((end - line[-1]) @ forwards[1]), diameter)
+    before = line[0] + np.arange(-head, -0.5 * step, step)[:, None] * forwards[0]
+    beyond = line[-1] + np.arange(step, tail, step)[:, None] * forwards[1]
+    line = np.vstack([before, line, beyond])
     t = chord_length(line)
     return fit_curve(t, line, np.ones(len(t)), 2 * diameter, 0.5 * diameter), t
+
+
+def _ahead(away: float, diameter: float) -> float:
+    """How far to extend the line [m] towards a fixture `away` metres ahead.
+
+    To the fixture if it is near. If not, two diameters: a skeleton ends half a width early, and
+    the profiles tell where the cable does.
+    """
+    return max(away, 0.0) if away < 4 * diameter else 2 * diameter
 
 
 def _is_usual(found: Crossings, usual: NDArray[np.bool_], diameter: float) -> NDArray[np.bool_]:

@@ -46,6 +46,10 @@ class WorkPlane:
         """Points (K, 2) [m] of pixels (K, 2) of the working picture."""
         return self.origin + self.pixel * np.asarray(at, float) * [1.0, -1.0]
 
+    def to_pixels(self, points: Array) -> Array:
+        """Pixels (K, 2) of the working picture of points (K, 2) [m]."""
+        return (points - self.origin) / self.pixel * [1.0, -1.0]
+
 
 def rectify(
     image: NDArray[np.uint8],

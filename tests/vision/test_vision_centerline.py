@@ -1,0 +1,166 @@
+"""Centre-lines of drawn cables, whose shape is known to a small part of a pixel."""
+
+import numpy as np
+import pytest
+from drawing import SCALE, arc, draw, normal_distance_px, square_view, to_pixels
+
+from dlo_casadi.errors import VisionError
+from dlo_casadi.vision import extract_centerline
+
+WIDTH_PX = 6.0
+CABLE = arc()
+
+
+def extract(image, truth, width_px=WIDTH_PX, length=None, **fixtures):
+    steps = np.linalg.norm(np.diff(truth, axis=0), axis=1)
+    fixtures = {"start": truth[0], "end": truth[-1], **fixtures}
+    return extract_centerline(
+        image,
+        square_view(image.shape),
+        diameter=width_px / SCALE,
+        length=steps.sum() if length is None else length,
+        **fixtures,
+    )
+
+
+# RMS [px] allowed: a drawn cable without a trick is found to 0.02 px; noise and shadow cost more
+LOOKS = {
+    "dark": ({}, 0.05),
+    "bright": ({"cable": (230, 230, 230), "board": (50, 50, 50), "shadow": 0.5}, 0.05),
+    "red on green of the same luminance": (
+        {"cable": (60, 60, 220), "board": (60, 155, 30)},
+        0.05,
+    ),
+    "highlight brighter than the board": ({"highlight": 200}, 0.05),
+    "shadow beside it": ({"shadow": 0.4}, 0.3),
+    "blurred and noisy": ({"blur": 2.5, "noise": 10}, 0.15),
+    "thin": ({"width_px": 3.0}, 0.05),
+    "moved while exposed": ({"motion": 9}, 0.05),
+    "uneven light": ({"gradient": 0.6}, 0.05),
+    "low contrast": ({"cable": (165, 160, 155), "noise": 3}, 0.1),
+}
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_a_drawn_cable_is_found_whatever_it_looks_like(look):
+    style, allowed = LOOKS[look]
+    line = extract(draw(CABLE, **style), CABLE, style.get("width_px", WIDTH_PX))
+    miss = normal_distance_px(line.points, CABLE)
+    assert np.sqrt(np.mean(miss**2)) < allowed
+    assert miss.max() < 1.0
+    assert line.coverage > 0.97
+    assert line.gaps == ()
+    assert np.all(np.sum(np.diff(line.points, axis=0) * np.diff(CABLE[::3], axis=0)[0], 1)[:5] > 0)
+
+
+def test_the_result_is_ordered_spaced_and_consistent():
+    line = extract(draw(CABLE), CABLE)
+    steps = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
+    assert np.linalg.norm(line.points[0] - CABLE[0]) < np.linalg.norm(line.points[0] - CABLE[-1])
+    assert steps.max() < 2 * np.median(steps)
+    assert 0.0015 < np.median(steps) < 0.0035
+    assert len(line.points) <= 401
+    assert line.pixels == pytest.approx(to_pixels(line.points), abs=1e-6)
+    assert line.std.shape == (len(line.points),)
+    assert np.all((line.std > 0) & (line.std < 0.5 / SCALE))
+    assert line.messages == ()
+
+
+def test_reversed_fixtures_reverse_the_points():
+    image = draw(CABLE)
+    forwards, backwards = extract(image, CABLE), extract(image, CABLE[::-1])
+    assert np.linalg.norm(backwards.points[0] - forwards.points[-1]) < 0.005
+
+
+def test_a_loop_that_crosses_itself_is_followed_straight_on():
+    loop = arc(length=1.2, turn=2 * np.pi + 3.0, heading=-0.3, start=(0.15, -0.5))
+    line = extract(draw(loop, shape=(500, 560)), loop)
+    assert normal_distance_px(line.points, loop).max() < 1.0
+    assert line.coverage > 0.97
+    s = np.searchsorted(np.linspace(0, 1, len(loop)), np.linspace(0.05, 0.95, len(line.points)))
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line.points, axis=0), axis=1))])
+    assert along[-1] == pytest.approx(1.2, abs=0.04)  # no shortcut at the crossing
+    assert np.linalg.norm(line.points - loop[s], axis=1).max() < 0.08
+
+
+@pytest.mark.parametrize("colour", [(40, 60, 200), (45, 45, 45)])
+def test_behind_an_occluder_is_a_gap_and_order_survives(colour):
+    image = draw(CABLE)
+    u, v = to_pixels(CABLE)[200].astype(int)
+    image[v - 20 : v + 20, u - 20 : u + 20] = colour
+    line = extract(image, CABLE)
+    assert len(line.gaps) == 1
+    assert normal_distance_px(line.points, CABLE).max() < 1.0
+    assert 0.75 < line.coverage < 0.9
+    assert "hidden" in line.messages[0]
+
+
+def test_a_cable_that_leaves_the_picture_and_returns_is_one_cable():
+    bow = arc(length=0.8, turn=-2.8, heading=1.4, start=(0.1, -0.3))
+    image = draw(bow)
+    top = 110  # the bow's highest part lies above this row
+    cut = image[top:]
+    view = square_view(cut.shape)
+    moved = bow + np.array([0.0, top / SCALE])
+    line = extract_centerline(
+        cut, view, start=moved[0], end=moved[-1], diameter=WIDTH_PX / SCALE, length=0.8
+    )
+    assert normal_distance_px(line.points, moved).max() < 1.0
+    assert len(line.gaps) == 1
+    assert "outside the picture" in line.messages[0]
+    inside = np.all(to_pixels(moved) >= 0, axis=1).mean()
+    assert line.coverage > 0.88 * inside  # it meets the border at a slant, and two rims are lost
+
+
+def test_a_holder_of_the_cables_colour_is_not_followed():
+    image = draw(CABLE)
+    u, v = to_pixels(CABLE)[0].astype(int)
+    image[v - 40 : v + 5, u - 40 : u + 40] = (40, 40, 40)
+    line = extract(image, CABLE)
+    assert normal_distance_px(line.points, CABLE).max() < 1.0
+    assert line.coverage > 0.93
+
+
+def test_a_thinner_line_beside_the_cable_is_ignored():
+    image = draw(CABLE, onto=draw(CABLE + np.array([0.0, 0.06]), width_px=2.0))
+    line = extract(image, CABLE)
+    assert normal_distance_px(line.points, CABLE).max() < 1.0
+
+
+def test_a_free_end_is_found_without_a_fixture():
+    line = extract(draw(CABLE), CABLE, end=None)
+    assert line.coverage > 0.97
+    assert np.linalg.norm(line.points[-1] - CABLE[-1]) < 0.01
+
+
+def test_a_tail_beyond_the_fixture_is_not_measured():
+    held = CABLE[60:340]
+    line = extract(draw(CABLE), held)
+    assert np.linalg.norm(line.points[0] - held[0]) < 0.015
+    assert np.linalg.norm(line.points[-1] - held[-1]) < 0.015
+
+
+def test_two_cables_are_refused():
+    other = arc(start=(0.25, -0.1))
+    with pytest.raises(VisionError, match=r"two cables: .* leave one cable in the picture"):
+        extract(draw(CABLE, onto=draw(other)), CABLE)
+
+
+def test_no_cable_dark_and_overexposed_pictures_say_so():
+    empty = np.full((420, 560, 3), 185, np.uint8)
+    with pytest.raises(VisionError, match=r"no cable found: the best chain .* background"):
+        extract(empty, CABLE)
+    with pytest.raises(VisionError, match="too dark"):
+        extract(draw(CABLE, cable=(4, 4, 4), board=(6, 6, 6)), CABLE)
+    with pytest.raises(VisionError, match="overexposed"):
+        extract(np.full((420, 560, 3), 255, np.uint8), CABLE)
+
+
+def test_wrong_declarations_are_named():
+    image = draw(CABLE)
+    with pytest.raises(VisionError, match=r"does not reach its end: .* from \(0\.350, -0\.200\) m"):
+        extract(image, CABLE, end=(0.35, -0.2), length=0.9)
+    with pytest.raises(VisionError, match="almost nothing of the place that it can reach"):
+        extract(image, CABLE, start=(5.0, 5.0), end=(5.3, 5.0))
+    with pytest.raises(VisionError, match="no cable found"):
+        extract(image, CABLE, width_px=30.0)

@@ -1,0 +1,172 @@
+"""Pixels to metres and back, against projections worked out with numpy alone."""
+
+import cv2
+import numpy as np
+import pytest
+
+from dlo_casadi.errors import VisionError
+from dlo_casadi.vision import Board, Camera, Reference, from_reference, locate_board
+
+SHAPE = (480, 640)
+MATRIX = np.array([[620.0, 0.0, 322.0], [0.0, 618.0, 236.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([-0.08, 0.03, 0.001, -0.0005, 0.0])
+CENTERS = {0: (-0.1, 0.2), 1: (0.5, 0.2), 2: (0.5, -0.25), 3: (-0.1, -0.25)}
+POINTS = np.array([[0.0, 0.0], [0.3, 0.1], [0.15, -0.2], [0.45, -0.1]])
+
+
+def pose():
+    """Rotation and shift of the board, tilted both ways, 0.95 m from the camera."""
+    tilt, pan = 0.25, -0.15
+    x_turn = np.array(
+        [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
+    )
+    y_turn = np.array([[np.cos(pan), 0, np.sin(pan)], [0, 1, 0], [-np.sin(pan), 0, np.cos(pan)]])
+    facing = np.diag([1.0, -1.0, -1.0])  # board y up, z to the camera; camera y down, z ahead
+    return x_turn @ y_turn @ facing, np.array([-0.18, -0.03, 0.95])
+
+
+def bend(a, b, distortion):
+    """Brown's model of a lens, written out."""
+    k1, k2, p1, p2, k3 = distortion
+    r2 = a * a + b * b
+    g = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    bent_a = a * g + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    bent_b = b * g + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    return bent_a, bent_b
+
+
+def project(points, height, distortion=DISTORTION):
+    """Pixels of board points at a height in front of the board."""
+    turn, shift = pose()
+    seen = np.column_stack([points, np.full(len(points), height)]) @ turn.T + shift
+    bent = bend(*(seen[:, :2] / seen[:, 2:]).T, distortion)
+    return np.column_stack([*bent, np.ones(len(points))]) @ MATRIX[:2].T
+
+
+def photograph(numbers=CENTERS, distortion=DISTORTION):
+    """Picture of the markers, by following the ray of every sub-pixel to the board."""
+    fine = 3
+    v, u = (np.mgrid[: SHAPE[0] * fine, : SHAPE[1] * fine] + 0.5) / fine - 0.5
+    target = (u.ravel() - MATRIX[0, 2]) / MATRIX[0, 0], (v.ravel() - MATRIX[1, 2]) / MATRIX[1, 1]
+    a, b = target
+    for _ in range(12):  # contracts tenfold a step
+        bent_a, bent_b = bend(a, b, distortion)
+        a, b = a + target[0] - bent_a, b + target[1] - bent_b
+    turn, shift = pose()
+    plane = np.linalg.inv(np.column_stack([turn[:, :2], shift]))
+    mapped = plane @ np.stack([a, b, np.ones_like(a)])
+    board = (mapped[:2] / mapped[2]).T
+    grey = np.full(len(board), 170.0)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    for number in numbers:
+        cells = np.pad(cv2.aruco.generateImageMarker(dictionary, number, 6), 1, constant_values=255)
+        local = (board - CENTERS[number]) / 0.08 * [1, -1] * 6 + 4  # eight cells with the margin
+        inside = np.all((local >= 0) & (local < 8), axis=1)
+        column, row = local[inside].astype(int).T
+        grey[inside] = cells[row, column]
+    picture = grey.reshape(SHAPE[0], fine, SHAPE[1], fine).mean(axis=(1, 3))
+    return np.repeat(np.round(picture).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def a_board(**changes):
+    return Board(
+        **{
+            "dictionary": "DICT_4X4_50",
+            "marker_size": 0.08,
+            "standoff": 0.02,
+            "marker_centers": CENTERS,
+            **changes,
+        }
+    )
+
+
+CAMERA = Camera(MATRIX, DISTORTION)
+
+
+@pytest.fixture(scope="module")
+def picture():
+    return photograph()
+
+
+def test_board_and_camera_give_the_plane_in_front_of_the_board(picture):
+    view = locate_board(picture, a_board(), CAMERA)
+    # the drawing is sharp to a third of a pixel; sixteen corners average to below a tenth
+    assert view.to_pixels(POINTS) == pytest.approx(project(POINTS, 0.02), abs=0.1)
+    assert view.to_board(project(POINTS, 0.02)) == pytest.approx(POINTS, abs=1.5e-4)
+    assert view.reprojection_error < 0.15
+    assert len(view.markers) == 4
+
+
+def test_round_trip_is_exact_to_rounding(picture):
+    view = locate_board(picture, a_board(), CAMERA)
+    assert view.to_board(view.to_pixels(POINTS)) == pytest.approx(POINTS, abs=1e-9)
+
+
+def test_standoff_moves_points_the_right_way(picture):
+    near = locate_board(picture, a_board(standoff=0.02), CAMERA)
+    flat = locate_board(picture, a_board(standoff=0.0), CAMERA)
+    shift = project(POINTS, 0.02) - project(POINTS, 0.0)
+    assert near.to_pixels(POINTS) - flat.to_pixels(POINTS) == pytest.approx(shift, abs=0.02)
+
+
+def test_one_marker_is_enough_with_a_camera():
+    view = locate_board(photograph([2]), a_board(), CAMERA)
+    close = np.array([[0.42, -0.2], [0.5, -0.15]])  # far from the marker its tilt would count
+    assert view.to_pixels(close) == pytest.approx(project(close, 0.02), abs=1.0)
+
+
+def test_without_camera_the_board_itself_is_measured():
+    straight = np.zeros(5)
+    view = locate_board(photograph(distortion=straight), a_board(standoff=0.0))
+    assert view.to_pixels(POINTS) == pytest.approx(
+        project(POINTS, 0.0, distortion=straight), abs=0.15
+    )
+    step = np.array([[0.15, 0.0], [0.151, 0.0]])
+    per_metre = np.linalg.norm(np.diff(view.to_pixels(step), axis=0)) / 1e-3
+    assert view.scale == pytest.approx(per_metre, rel=0.05)  # it varies over a tilted board
+
+
+def test_a_standoff_without_camera_is_refused(picture):
+    with pytest.raises(VisionError, match=r"standoff of 0\.02 m needs a camera"):
+        locate_board(picture, a_board())
+
+
+def test_a_missing_board_names_what_was_found(picture):
+    with pytest.raises(VisionError, match="no marker at all of DICT_4X4_50"):
+        locate_board(np.full((*SHAPE, 3), 170, np.uint8), a_board(), CAMERA)
+    other = a_board(marker_centers={7: (0.0, 0.0)})
+    with pytest.raises(
+        VisionError, match=r"only markers \[0, 1, 2, 3\] of DICT_4X4_50 .* has \[7\]"
+    ):
+        locate_board(picture, other, CAMERA)
+    with pytest.raises(VisionError, match="unknown ArUco dictionary 'DICT_4X4'"):
+        locate_board(picture, a_board(dictionary="DICT_4X4"), CAMERA)
+
+
+def test_markers_at_other_places_than_declared_are_refused(picture):
+    swapped = a_board(marker_centers={**CENTERS, 0: CENTERS[2], 2: CENTERS[0]})
+    with pytest.raises(VisionError, match="off their declared places"):
+        locate_board(picture, swapped, CAMERA)
+
+
+def test_one_displaced_marker_of_four_is_left_out(picture):
+    moved = a_board(marker_centers={**CENTERS, 1: (0.55, 0.2)})
+    view = locate_board(picture, moved, CAMERA)
+    assert len(view.markers) == 3
+    assert view.to_pixels(POINTS) == pytest.approx(project(POINTS, 0.02), abs=0.3)
+
+
+def test_two_points_give_a_similarity_with_y_up():
+    """With q = u - i v = A z + B, A = 1000 px/m turned by 0.3 rad."""
+    factor, offset = 1000 * np.exp(0.3j), 200 - 150j
+    z = POINTS[:, 0] + 1j * POINTS[:, 1]
+    pixels = np.column_stack([(factor * z + offset).real, -(factor * z + offset).imag])
+    view = from_reference(Reference(pixels[:2], POINTS[:2]), (300, 400, 3))
+    assert view.to_pixels(POINTS) == pytest.approx(pixels, abs=1e-9)
+    assert view.to_board(pixels) == pytest.approx(POINTS, abs=1e-12)
+    assert view.scale == pytest.approx(1000.0)
+
+
+def test_two_equal_reference_points_are_refused():
+    with pytest.raises(VisionError, match="too close for a scale"):
+        from_reference(Reference(np.zeros((2, 2)), np.array([[0, 0], [1, 0]])), (10, 10))
