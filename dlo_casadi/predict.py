@@ -1,0 +1,183 @@
+"""Predict the shape of a fitted cable from where its ends are held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.equilibrium import Branch, Equilibrium, Pose, solve_equilibrium
+from dlo_casadi.errors import DloError
+from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.report.parameters_file import Parameters, load_parameters
+
+FloatArray = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class PredictedShape:
+    """A fitted cable in one pose.
+
+    Parameters
+    ----------
+    cable : Parameters
+        The fitted cable.
+    pose : Pose
+        How its ends are held.
+    equilibrium : Equilibrium
+        Nodes, reactions, energy and stability.
+    curve : NodeCurve
+        The cable itself, at any arc length: `curve.at(s)`.
+    seen : NodeCurve
+        The same as the session's camera would measure it.
+    """
+
+    cable: Parameters
+    pose: Pose
+    equilibrium: Equilibrium
+    curve: NodeCurve
+    seen: NodeCurve
+
+    def points(self, count: int = 101) -> FloatArray:
+        """Points (count, 2) [m] evenly spaced along the cable, from start to end."""
+        return self.curve.at(np.linspace(0.0, self.curve.length, count))
+
+    def as_dict(self, count: int = 101) -> dict[str, Any]:
+        """Everything a program may want to know, as plain data in SI units."""
+        eq, pose = self.equilibrium, self.pose
+        return {
+            "cable": self.cable.model.cable.name,
+            "model_hash": self.cable.metadata.model_hash,
+            "length": self.cable.model.cable.length,
+            "start": list(pose.start),
+            "end": None if pose.end is None else list(pose.end),
+            "start_heading": pose.start_heading,
+            "end_heading": pose.end_heading,
+            "branch": pose.branch,
+            "status": eq.status.name.lower(),
+            "stable": eq.stable,
+            "energy": eq.energy,
+            "force_on_start": eq.lam_start.tolist(),
+            "force_on_end": eq.lam.tolist(),
+            "moment_on_start": float(eq.moments[0]),
+            "moment_on_end": float(eq.moments[1]),
+            "min_bend_radius": eq.min_bend_radius,
+            "points": self.points(count).tolist(),
+        }
+
+
+def predict(
+    parameters: str | Path | Parameters,
+    end: Sequence[float] | None = None,
+    *,
+    start: Sequence[float] | None = None,
+    start_heading: float | None = None,
+    end_heading: float | None = None,
+    branch: Branch | None = None,
+) -> PredictedShape:
+    """Predict the shape of a fitted cable.
+
+    Of several equilibria the stable one of lowest energy, unless `branch` names one.
+
+    Parameters
+    ----------
+    parameters : str, Path or Parameters
+        A parameters.yaml, the folder of results that holds it, or what was read from it.
+    end : (2,) [m]
+        Where the end is held; None for a free end.
+    start : (2,) [m], optional
+        Where the start is held; where all poses of the session had it, or (0, 0), by default.
+    start_heading, end_heading : float [rad], optional
+        Directions of clamped ends, continuous along the cable; those that all poses of the
+        session shared by default.
+    branch : "ccw" or "cw", optional
+        Which way a pinned cable turns from start to end.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be used.
+    EquilibriumError
+        If the pose has no equilibrium, e.g. because the end is out of reach.
+    DloError
+        If the ends are not held as the cable's boundary asks.
+    """
+    cable = parameters if isinstance(parameters, Parameters) else load_parameters(parameters)
+    pose = _pose(cable, end, start, start_heading, end_heading, branch)
+    model, p, rest, _ = cable
+    eq = solve_equilibrium(model, p, rest, pose)
+    return PredictedShape(
+        cable, pose, eq, _true_curve(model, p, rest, pose, eq), _curve(model, p, rest, pose, eq)
+    )
+
+
+def _pose(
+    cable: Parameters,
+    end: Sequence[float] | None,
+    start: Sequence[float] | None,
+    start_heading: float | None,
+    end_heading: float | None,
+    branch: Branch | None,
+) -> Pose:
+    """End conditions, checked against the boundary; what is not given is as in the session."""
+    model, shared = cable.model, cable.metadata.fixtures
+    if model.end == "free" and end is not None:
+        raise DloError(f"the end of {model.cable.name!r} is free: it cannot be held at {end} m")
+    if model.end != "free" and end is None:
+        raise DloError(f"the end of {model.cable.name!r} is {model.end}: where is it? (end)")
+    headings = {"start": start_heading, "end": end_heading}
+    for side, held in (("start", model.start), ("end", model.end)):
+        if held == "clamped" and headings[side] is None:
+            headings[side] = shared.get(f"{side}_heading")
+            if headings[side] is None:
+                raise DloError(
+                    f"the {side} of {model.cable.name!r} is clamped, and its heading differed "
+                    f"from pose to pose: give {side}_heading [rad]"
+                )
+        if held != "clamped" and headings[side] is not None:
+            raise DloError(
+                f"the {side} of {model.cable.name!r} is {held}: a {side}_heading has no meaning"
+            )
+    return Pose(
+        start=_point(start if start is not None else shared.get("start") or (0.0, 0.0), "start"),
+        end=None if end is None else _point(end, "end"),
+        start_heading=headings["start"],
+        end_heading=headings["end"],
+        branch=branch,
+    )
+
+
+def _point(values: Sequence[float], what: str) -> tuple[float, float]:
+    point = np.asarray(values, dtype=float)
+    if point.shape != (2,) or not np.all(np.isfinite(point)):
+        raise DloError(f"{what}: two finite numbers (x, y) in metres belong here, found {values}")
+    return float(point[0]), float(point[1])
+
+
+def _curve(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, eq: Equilibrium
+) -> NodeCurve:
+    """The curve as the session's camera would measure it."""
+    none = np.zeros(len(DEVIATIONS))
+    z = model.shape(eq.phi, eq.multipliers, p, rest, pose.vector, none)
+    return NodeCurve.of(model.chain, np.array(z).ravel())
+
+
+def _true_curve(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, eq: Equilibrium
+) -> NodeCurve:
+    """The curve itself: the same model without what the camera adds."""
+    seen = [effect for effect in model.effects if isinstance(effect, MeasurementEffect)]
+    if not seen:
+        return _curve(model, p, rest, pose, eq)
+    true = replace(
+        model, effects=tuple(effect for effect in model.effects if effect not in seen), priors={}
+    )
+    values = dict(zip(model.names, p, strict=True))
+    return _curve(true, np.array([values[name] for name in true.names]), rest, pose, eq)

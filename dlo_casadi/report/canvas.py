@@ -1,0 +1,80 @@
+"""Figures without a screen: sizes, colours and labels that all figures share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from dlo_casadi.outcome import Outcome, Stage, StageName
+
+# Okabe and Ito's colours, which the colour-blind can tell apart.
+BLACK, GREY = "#000000", "#6B6B6B"
+ORANGE, SKY, GREEN = "#E69F00", "#56B4E9", "#009E73"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+
+STAGE_LABELS: dict[StageName, str] = {
+    "initial": "initial guess",
+    "stiffness_only": "stiffness alone",
+    "algorithm1": "Algorithm 1",
+    "batch": "declared model, fitted",
+    "closed": "with added effects",
+}
+
+_STYLE: dict[Any, Any] = {
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.labelsize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E3E3E3",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.6,
+    "font.family": "DejaVu Sans",
+}
+_DPI = 150
+
+
+@contextmanager
+def figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
+    """Open a figure of a size [inch] and save it to a file when it is drawn."""
+    with mpl.rc_context(_STYLE):
+        drawing = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(drawing)
+        yield drawing
+        drawing.savefig(path, dpi=_DPI)
+
+
+def before_after(outcome: Outcome) -> tuple[Stage | None, Stage | None]:
+    """The stages that a figure compares: the last one, and the one that it improves on.
+
+    With effects added: the declared model fitted, and the model with the effects. Otherwise: the
+    initial guess, and the declared model fitted.
+    """
+    with_shapes = [stage for stage in outcome.stages if stage.shapes]
+    if not with_shapes:
+        return None, None
+    after = with_shapes[-1]
+    name: StageName = "batch" if after.name == "closed" else "initial"
+    before = next((stage for stage in with_shapes if stage.name == name), None)
+    return (None if before is after else before), after
+
+
+def label_of(stage: Stage, outcome: Outcome) -> str:
+    """What to call a stage in a figure."""
+    if stage.name == "closed" and outcome.effects:
+        return "with " + " and ".join(effect["name"] for effect in outcome.effects)
+    return STAGE_LABELS[stage.name]
+
+
+def millimetres(value: float) -> str:
+    """A length [m] as text in mm, with three digits."""
+    return f"{1e3 * value:.3g} mm"

@@ -1,0 +1,377 @@
+"""Figures of a run: poses, residuals, rest curvature, errors, candidates, the unexplained load."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import StrMethodFormatter
+from numpy.typing import NDArray
+
+from dlo_casadi.outcome import Outcome, PoseInput, Stage
+from dlo_casadi.report.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    before_after,
+    figure,
+    label_of,
+    millimetres,
+)
+from dlo_casadi.report.overlay import write_overlays
+
+FloatArray = NDArray[np.floating]
+
+_POSES_A_PAGE = 20
+_HELD_OUT = PURPLE
+# Behind a number that may lie on a line.
+_PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+
+
+def write_figures(folder: Path, outcome: Outcome) -> None:
+    """Draw all figures that the outcome has something for into an existing folder."""
+    draw_poses(folder, outcome)
+    draw_residuals(folder / "residuals.png", outcome)
+    draw_rest_curvature(folder / "rest_curvature.png", outcome)
+    draw_errors(folder / "errors.png", outcome)
+    if outcome.candidates:
+        draw_candidates(folder / "candidates.png", outcome)
+    if outcome.unexplained is not None:
+        draw_unexplained(folder / "unexplained.png", outcome)
+    if any(pose.image is not None for pose in outcome.poses):
+        write_overlays(folder / "overlays", outcome)
+
+
+# ---- poses -------------------------------------------------------------------------------------
+
+
+def draw_poses(folder: Path, outcome: Outcome) -> None:
+    """Every pose: measured points and predictions, before and after, on pages of one scale."""
+    poses = outcome.poses
+    pages = math.ceil(len(poses) / _POSES_A_PAGE)
+    for page in range(pages):
+        name = "poses.png" if pages == 1 else f"poses_{page + 1}.png"
+        shown = poses[page * _POSES_A_PAGE : (page + 1) * _POSES_A_PAGE]
+        _draw_page(folder / name, outcome, shown)
+
+
+def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None:
+    lines = _shown_stages(outcome)
+    columns = min(len(poses), 5)
+    rows = math.ceil(len(poses) / columns)
+    center, span = _common_frame(outcome, poses)
+    width = max(3.1 * columns, 7.5)
+    height = 0.82 * width / columns * float(span[1] / span[0])
+    with figure(path, (width, (height + 0.4) * rows + 1.3)) as drawing:
+        grid = drawing.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+        for axes, pose in zip(grid.ravel(), poses, strict=False):
+            _draw_pose(axes, pose, lines)
+            axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
+            axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
+        for axes in grid.ravel()[len(poses) :]:
+            axes.set_axis_off()
+        for axes in grid[-1]:
+            axes.set_xlabel("x [m]")
+        for axes in grid[:, 0]:
+            axes.set_ylabel("y [m]")
+        for column in range(columns):  # the lowest panel of a column that is not empty
+            lowest = max(k for k in range(len(poses)) if k % columns == column)
+            below = grid.ravel()[lowest]
+            below.set_xlabel("x [m]")
+            below.tick_params(labelbottom=True)
+        handles: list[Line2D | Patch] = [
+            Line2D([], [], color=BLACK, marker=".", ls="none", ms=7, label="measured")
+        ]
+        handles += [
+            Line2D([], [], color=color, ls=style, label=label_of(stage, outcome))
+            for stage, color, style in lines
+        ]
+        if any(pose.role == "held_out" for pose in poses):
+            handles.append(Patch(fc="white", ec=_HELD_OUT, lw=2, label="held out of the fit"))
+        drawing.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        drawing.suptitle(
+            f"{outcome.config.cable.name}: predicted from the end conditions alone "
+            "(number: distance to the measured points, RMS)",
+            fontsize=12,
+        )
+
+
+def _shown_stages(outcome: Outcome) -> list[tuple[Stage, str, str]]:
+    """Stages drawn for each pose, with colour and line style."""
+    before, after = before_after(outcome)
+    initial = outcome.stage("initial")
+    lines: list[tuple[Stage, str, str]] = []
+    if initial is not None and initial.shapes and initial not in (before, after):
+        lines.append((initial, SKY, ":"))
+    if before is not None:
+        lines.append((before, ORANGE, "--"))
+    if after is not None:
+        lines.append((after, BLUE, "-"))
+    return lines
+
+
+def _draw_pose(axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, str]]) -> None:
+    for stage, color, style in lines:
+        shape = stage.shapes.get(pose.name)
+        if shape is not None:
+            axes.plot(*shape.curve.T, color=color, ls=style)
+            axes.plot(*shape.curve[0], "s", color=BLACK, ms=4)
+            axes.plot(*shape.curve[-1], "o", color=BLACK, ms=4)
+    if len(pose.points):
+        axes.plot(*pose.points[:: max(1, len(pose.points) // 60)].T, ".", color=BLACK, ms=2.5)
+    axes.set_aspect("equal")
+    last = lines[-1][0].shapes.get(pose.name) if lines else None
+    title = pose.name
+    if not len(pose.points):
+        title += ": not read"
+    elif last is None:
+        title += ": no equilibrium"
+    elif last.rmse is not None:
+        title += f": {millimetres(last.rmse)}"
+    if last is not None and not last.stable:
+        title += ", unstable"
+    axes.set_title(title)
+    if pose.role == "held_out":
+        axes.title.set_color("#8C3B6C")
+        for spine in axes.spines.values():
+            spine.set(visible=True, color=_HELD_OUT, linewidth=2)
+
+
+def _common_frame(outcome: Outcome, poses: Sequence[PoseInput]) -> tuple[FloatArray, FloatArray]:
+    """Middle and size [m] of a window that holds everything drawn."""
+    drawn = [pose.points for pose in poses if len(pose.points)]
+    for stage, _, _ in _shown_stages(outcome):
+        drawn += [stage.shapes[pose.name].curve for pose in poses if pose.name in stage.shapes]
+    corners = np.concatenate(drawn) if drawn else np.zeros((1, 2))
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    span = 1.08 * (high - low) + 0.02 * max(float((high - low).max()), 1e-3)
+    # A slender window would leave no room for the axis: at least a third of the other side.
+    span = np.maximum(span, span.max() / 3)
+    return (low + high) / 2, span
+
+
+# ---- residuals ---------------------------------------------------------------------------------
+
+
+def draw_residuals(path: Path, outcome: Outcome) -> None:
+    """Normal distance of the measured points from the prediction along the arc, in noise units."""
+    before, after = before_after(outcome)
+    stages = [stage for stage in (before, after) if stage is not None]
+    roles = {pose.name: pose.role for pose in outcome.poses}
+    with figure(path, (8.5, 0.9 + 2.7 * len(stages))) as drawing:
+        grid = drawing.subplots(len(stages), 1, squeeze=False, sharex=True)
+        for axes, stage in zip(grid[:, 0], stages, strict=True):
+            axes.axhspan(-2, 2, color="#EDEDED", zorder=0)
+            axes.axhline(0, color=GREY, lw=0.8)
+            for name, shape in stage.shapes.items():
+                held_out = roles[name] == "held_out"
+                axes.plot(
+                    shape.s,
+                    shape.residual,
+                    color=_HELD_OUT if held_out else BLUE,
+                    lw=1.1,
+                    alpha=0.85 if held_out else 0.45,
+                    zorder=3 if held_out else 2,
+                )
+            chi2 = stage.chi2_per_dof
+            quality = "" if chi2 is None else f" (chi-square per degree of freedom {chi2:.3g})"
+            axes.set_title(label_of(stage, outcome) + quality, loc="left")
+            axes.set_ylabel("distance / noise")
+        grid[-1, 0].set_xlabel("arc length from the start s [m]")
+        grid[-1, 0].set_xlim(0, outcome.config.cable.length)
+        handles = [Line2D([], [], color=BLUE, label="fit pose")]
+        if outcome.measurement.poses_held_out:
+            handles.append(Line2D([], [], color=_HELD_OUT, label="held-out pose"))
+        handles.append(Line2D([], [], color="#EDEDED", lw=8, label="95 % of the noise lies within"))
+        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
+        drawing.suptitle(
+            f"{outcome.config.cable.name}: measured minus predicted, noise "
+            f"{millimetres(outcome.measurement.std)} ({outcome.measurement.std_source})",
+            fontsize=12,
+        )
+
+
+# ---- rest curvature ----------------------------------------------------------------------------
+
+
+def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
+    """Rest curvature of the last stage with its band, and of the fit that it improves on."""
+    before, after = before_after(outcome)
+    with figure(path, (8.5, 3.8)) as drawing:
+        axes = drawing.subplots()
+        if before is not None and before.name == "batch":
+            rest = before.rest_curvature
+            axes.plot(rest.s, rest.value, "--", color=ORANGE, label=label_of(before, outcome))
+        if after is not None:
+            rest = after.rest_curvature
+            band = np.stack([rest.value - 2 * rest.std, rest.value + 2 * rest.std])
+            axes.plot(rest.s, rest.value, color=BLUE, label=label_of(after, outcome))
+            axes.fill_between(rest.s, *band, color=BLUE, alpha=0.2, lw=0, label="its 95 % band")
+        axes.axhline(0, color=GREY, lw=0.8)
+        axes.set(
+            xlim=(0, outcome.config.cable.length),
+            xlabel="arc length from the start s [m]",
+            ylabel="rest curvature [1/m]",
+        )
+        drawing.legend(loc="outside lower center", ncols=3)
+        straight = outcome.config.cable.rest_shape == "straight"
+        note = "declared straight, not fitted" if straight else "shape without load"
+        drawing.suptitle(f"{outcome.config.cable.name}: rest curvature ({note})", fontsize=12)
+
+
+# ---- errors ------------------------------------------------------------------------------------
+
+
+def draw_errors(path: Path, outcome: Outcome) -> None:
+    """Errors of all stages as bars, with the noise of the centre-lines."""
+    rows: list[tuple[str, str, float | None]] = []
+    for stage in outcome.stages:
+        label = label_of(stage, outcome)
+        rows.append((label, "fit", stage.rmse_fit))
+        if outcome.measurement.poses_held_out:
+            rows.append((label, "held_out", stage.rmse_held_out))
+    known = [value for *_, value in rows if value]
+    floor = outcome.measurement.std
+    left = 10 ** math.floor(math.log10(min([*known, floor]) / 1.5)) if known else floor / 10
+    right = 3.5 * max([*known, floor])
+    per_stage = 2 if outcome.measurement.poses_held_out else 1
+    with figure(path, (8.5, 1.7 + 0.36 * len(rows))) as drawing:
+        axes = drawing.subplots()
+        for k, (_, role, value) in enumerate(rows):
+            y = -(k + 0.8 * (k // per_stage))
+            color = BLUE if role == "fit" else _HELD_OUT
+            if value is None:
+                axes.text(left * 1.1e3, y, "no value", va="center", color=GREY)
+                continue
+            axes.barh(y, 1e3 * value, left=0, height=0.9, color=color)
+            axes.text(
+                1e3 * value * 1.05, y, millimetres(value), va="center", fontsize=9, bbox=_PAPER
+            )
+        axes.axvline(1e3 * floor, color=BLACK, ls="--", lw=1.2, zorder=1.5)
+        middles = [
+            -(k + 0.8 * (k // per_stage)) - (per_stage - 1) / 2
+            for k in range(0, len(rows), per_stage)
+        ]
+        axes.set_yticks(middles, [rows[k][0] for k in range(0, len(rows), per_stage)])
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.set_xlim(1e3 * left, 1e3 * right)
+        axes.grid(visible=False, axis="y")
+        axes.set_xlabel("distance of the measured points from the prediction, RMS [mm]")
+        handles: list[Line2D | Patch] = [Patch(color=BLUE, label="fit poses")]
+        if per_stage == 2:
+            handles.append(Patch(color=_HELD_OUT, label="held-out poses"))
+        handles.append(
+            Line2D([], [], color=BLACK, ls="--", label=f"noise floor {millimetres(floor)}")
+        )
+        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
+        drawing.suptitle(f"{outcome.config.cable.name}: error of each stage", fontsize=12)
+
+
+# ---- diagnosis ---------------------------------------------------------------------------------
+
+
+def draw_candidates(path: Path, outcome: Outcome) -> None:
+    """Candidates for a missing effect: score, and cross-validated error where refitted."""
+    added = {effect["name"] for effect in outcome.effects}
+    tied = {name for effect in outcome.effects for name in effect["indistinguishable_from"]}
+    rows = list(outcome.candidates)
+    scores = [row["score"] or 0.0 for row in rows]
+    with figure(path, (8.5, 1.9 + 0.3 * len(rows))) as drawing:
+        axes = drawing.subplots()
+        for k, (row, score) in enumerate(zip(rows, scores, strict=True)):
+            known = {True: BLUE, False: GREY}[row["name"] in added]
+            color = ORANGE if row["name"] in tied else known
+            axes.barh(-k, score, height=0.72, color=color)
+            error = row["rmse_cross_validated"]
+            text = f" {score:,.0f}" if score >= 100 else f" {score:.2g}"
+            text += "" if error is None else f"   cross-validated {millimetres(error)}"
+            axes.text(score, -k, text, va="center", fontsize=9)
+        axes.set_yticks([-k for k in range(len(rows))], [row["name"] for row in rows])
+        axes.set_xlim(0, 1.55 * max([*scores, 1e-9]))
+        axes.grid(visible=False, axis="y")
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
+        axes.set_xlabel("score: fall of chi-square that adding it promises")
+        handles = [
+            Patch(color=BLUE, label="added to the model"),
+            Patch(color=ORANGE, label="cannot be told apart from it"),
+            Patch(color=GREY, label="not needed"),
+        ]
+        shown = [bool(added), bool(tied), True]
+        handles = [handle for handle, show in zip(handles, shown, strict=True) if show]
+        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
+        title = "what the declared model may lack, best first"
+        if outcome.verdict == "unexplained":
+            title = "candidates tried; what is left is not explained by any"
+        elif not outcome.effects:
+            title = "candidates tried; the declared model needs none"
+        drawing.suptitle(f"{outcome.config.cable.name}: {title}", fontsize=12)
+
+
+def draw_unexplained(path: Path, outcome: Outcome) -> None:
+    """Where the cable is pulled, and how, in each fit pose."""
+    load = outcome.unexplained
+    assert load is not None
+    names = load.get("poses") or [
+        pose.name for pose in outcome.poses if pose.role == "fit" and len(pose.points)
+    ]
+    length = outcome.config.cable.length
+    forces = np.array(load["force_per_pose"], dtype=float).reshape(-1, 2)
+    reach = 0.25 * length / max(float(np.hypot(*forces.T).max(initial=0.0)), 1e-12)
+    with figure(path, (8.5, 7.0)) as drawing:
+        axes = drawing.subplots()
+        for name, force in zip(names, forces, strict=False):
+            line = _measured_line(outcome, name)
+            if line is None:
+                continue
+            places, points = line
+            axes.plot(*points.T, color=SKY, lw=1.2)
+            pulled = np.linspace(load["interval_95"][0], load["interval_95"][1], 9)
+            part = [np.interp(pulled, places, points[:, i]) for i in (0, 1)]
+            axes.plot(*part, color=GREEN, lw=5, solid_capstyle="butt")
+            root = [np.interp(load["position"], places, points[:, i]) for i in (0, 1)]
+            tip = [root[i] + reach * force[i] for i in (0, 1)]
+            arrow = {"arrowstyle": "-|>", "color": VERMILLION, "lw": 1.6}
+            axes.annotate("", xy=(tip[0], tip[1]), xytext=(root[0], root[1]), arrowprops=arrow)
+            axes.plot(*tip, alpha=0)  # an annotation does not count for the axes' limits
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(xlabel="x [m]", ylabel="y [m]")
+        low, high = load["interval_95"]
+        size = float(np.hypot(*np.array(load["force"], dtype=float)))
+        handles = [
+            Line2D([], [], color=SKY, label="fit poses"),
+            Line2D([], [], color=GREEN, lw=4, label=f"pulled at {low:.3f} to {high:.3f} m (95 %)"),
+            Line2D([], [], color=VERMILLION, label=f"force, on average {size:.3g} N"),
+        ]
+        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
+        drawing.suptitle(
+            f"{outcome.config.cable.name}: unexplained, pulled by something that is not in the "
+            "model",
+            fontsize=12,
+        )
+
+
+def _measured_line(outcome: Outcome, name: str) -> tuple[FloatArray, FloatArray] | None:
+    """Measured points of a pose between its fixtures with their places along the cable [m]."""
+    measured = next((pose for pose in outcome.poses if pose.name == name), None)
+    declared = next((p for p in outcome.config.experiment.poses if p.name == name), None)
+    if measured is None or declared is None or not len(measured.points):
+        return None
+    parts = [np.array([declared.start]), measured.points]
+    if declared.end is not None:
+        parts.append(np.array([declared.end]))
+    points = np.concatenate(parts)
+    places = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    if declared.end is not None:
+        places *= outcome.config.cable.length / places[-1]
+    return places, points

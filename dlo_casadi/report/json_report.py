@@ -1,0 +1,136 @@
+"""report.json: what a run has found, for other programs (schema "dlo-report/1")."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+from dlo_casadi.outcome import Outcome, ParameterEstimate, Stage, StageName
+
+SCHEMA = "dlo-report/1"
+# In every report, in this order; `closed` only where an effect was added.
+ALWAYS: tuple[StageName, ...] = ("initial", "stiffness_only", "algorithm1", "batch")
+
+
+def report_dict(outcome: Outcome) -> dict[str, Any]:
+    """Everything that a program may want to know of a run, as plain data.
+
+    Every key of the schema is present; what is not known is None, never NaN.
+    """
+    measurement = outcome.measurement
+    names: list[StageName] = list(ALWAYS)
+    if outcome.stage("closed") is not None:
+        names.append("closed")
+    document = {
+        "schema": SCHEMA,
+        "config": outcome.config.name,
+        "versions": outcome.versions,
+        "warnings": all_warnings(outcome),
+        "timing_s": outcome.timing,
+        "measurement": {
+            "kind": measurement.kind,
+            "poses_fit": measurement.poses_fit,
+            "poses_held_out": measurement.poses_held_out,
+            "points": measurement.points,
+            "std": measurement.std,
+            "std_source": measurement.std_source,
+            "correlation_length_m": measurement.correlation_length,
+        },
+        "stages": [_stage(name, outcome.stage(name)) for name in names],
+        "discretization": {
+            "n": outcome.discretization.n,
+            "element": outcome.discretization.element,
+            "error_m": outcome.discretization.error,
+        },
+        "effects": list(outcome.effects),
+        "candidates": list(outcome.candidates),
+        "verdict": outcome.verdict,
+        "unexplained": outcome.unexplained,
+        "next_pose": outcome.next_pose,
+    }
+    plain: dict[str, Any] = finite(document)
+    return plain
+
+
+def report_text(outcome: Outcome) -> str:
+    """The text of report.json."""
+    return json.dumps(report_dict(outcome), indent=1, allow_nan=False) + "\n"
+
+
+def all_warnings(outcome: Outcome) -> list[str]:
+    """Warnings of the run, why a stage lacks a number, and what sits on a bound."""
+    lines = list(outcome.warnings)
+    held_out = outcome.measurement.poses_held_out > 0
+    for name in ALWAYS:
+        stage = outcome.stage(name)
+        if stage is None:
+            lines.append(f"stage {name} did not run")
+        elif stage.rmse_fit is None or (held_out and stage.rmse_held_out is None):
+            lines.append(f"stage {name}: {stage.note or 'some poses could not be predicted'}")
+    if outcome.stages:
+        for key, estimate in outcome.stages[-1].parameters.items():
+            if estimate.at_bound:
+                value = f"{estimate.value:.4g} {estimate.unit}".strip()
+                lines.append(f"{key} sits on a bound of what physics permits: {value}")
+    return lines
+
+
+def finite(value: Any) -> Any:
+    """Copy with NumPy's numbers as plain ones and None for what is not finite."""
+    if isinstance(value, dict):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return finite(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def _stage(name: StageName, stage: Stage | None) -> dict[str, Any]:
+    """One stage; with None for all numbers if it did not run."""
+    if stage is None or not stage.parameters:
+        unknown = {
+            "value": None,
+            "std": None,
+            "unit": "N m^2",
+            "interval_95": None,
+            "identifiable": None,
+        }
+        return {
+            "name": name,
+            "rmse_fit": None,
+            "rmse_held_out": None,
+            "chi2_per_dof": None,
+            "parameters": {
+                "bending_stiffness": unknown,
+                "rest_curvature": {"s": [], "value": [], "std": []},
+            },
+        }
+    parameters: dict[str, Any] = {
+        key: _estimate(estimate) for key, estimate in stage.parameters.items()
+    }
+    rest = stage.rest_curvature
+    parameters["rest_curvature"] = {"s": rest.s, "value": rest.value, "std": rest.std}
+    return {
+        "name": name,
+        "rmse_fit": stage.rmse_fit,
+        "rmse_held_out": stage.rmse_held_out,
+        "chi2_per_dof": stage.chi2_per_dof,
+        "parameters": parameters,
+    }
+
+
+def _estimate(estimate: ParameterEstimate) -> dict[str, Any]:
+    interval = estimate.interval_95
+    return {
+        "value": estimate.value,
+        "std": estimate.std,
+        "unit": estimate.unit,
+        "interval_95": None if interval is None else list(interval),
+        "identifiable": estimate.identifiable,
+    }

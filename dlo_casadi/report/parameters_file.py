@@ -1,0 +1,386 @@
+"""parameters.yaml: a fitted cable, complete enough to compute with (schema "dlo-parameters/1").
+
+Prediction, code generation and comparisons of cables read nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.config import Config, dump_yaml, read_yaml
+from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
+from dlo_casadi.errors import ConfigError, DloError
+from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.model import CableModel
+from dlo_casadi.outcome import Outcome
+from dlo_casadi.report.json_report import finite
+
+FloatArray = NDArray[np.floating]
+
+SCHEMA = "dlo-parameters/1"
+# What a prediction depends on beside the values of the parameters.
+_MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
+# Effects that a file may name: those of a configuration, and what every photograph has.
+_KNOWN: dict[str, type[Effect]] = {**EFFECTS, EdgeBias.name: EdgeBias}
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a parameters.yaml tells beside the model.
+
+    Parameters
+    ----------
+    path : Path
+    names : tuple of str
+        Fitted parameters, in the order of `covariance`.
+    covariance : (N, N)
+        In the products of the parameters' units.
+    std : dict
+        Standard deviation of each parameter by name [SI]; 0 where it was not fitted.
+    coefficients : (n_rest,) [1/m]
+        Of the rest curvature before the first pose.
+    fixtures : dict
+        What all poses of the session share of `start` [m], `start_heading`, `end_heading` [rad].
+    identifiable : bool or None
+        Whether the shapes determine the bending stiffness.
+    interval_95 : (float or None, float or None) or None [N m^2]
+        Of the bending stiffness; None in it = unbounded.
+    model_hash : str
+        As written.
+    edited : bool
+        Whether the model is no longer the one that was written.
+    config : str
+        Name of the configuration.
+    versions : dict
+    document : dict
+        The whole file.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    covariance: FloatArray
+    std: dict[str, float]
+    coefficients: FloatArray
+    fixtures: dict[str, Any]
+    identifiable: bool | None
+    interval_95: tuple[float | None, float | None] | None
+    model_hash: str
+    edited: bool
+    config: str
+    versions: dict[str, str]
+    document: dict[str, Any]
+
+
+class Parameters(NamedTuple):
+    """A fitted cable as parameters.yaml holds it: `model, p, rest, metadata = ...`.
+
+    Parameters
+    ----------
+    model : CableModel
+    p : (n_parameters,)
+        In the order of `model.names` (SI).
+    rest : (n_cells,) [1/m]
+        Rest curvature that the next pose finds.
+    metadata : Metadata
+    """
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    metadata: Metadata
+
+    @property
+    def std(self) -> dict[str, float]:
+        """Standard deviations by name (SI)."""
+        return self.metadata.std
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The whole file."""
+        return self.metadata.document
+
+
+# ---- writing -----------------------------------------------------------------------------------
+
+
+def parameters_text(outcome: Outcome) -> str:
+    """The text of parameters.yaml: equal results, equal bytes."""
+    head = (
+        f"# {outcome.config.cable.name}: parameters fitted by dlo_casadi. SI units: m, kg, s, N, "
+        "rad.\n# null: a bound or an end of an interval that does not exist. fitted: false: as "
+        "declared.\n"
+    )
+    return head + dump_yaml(parameters_dict(outcome))
+
+
+def parameters_dict(outcome: Outcome) -> dict[str, Any]:
+    """Everything that parameters.yaml holds, as plain data."""
+    config = outcome.config
+    document = fit_dict(outcome.fit)
+    stiffness = outcome.stages[-1].parameters.get("bending_stiffness")
+    if stiffness is not None:
+        document["parameters"]["bending_stiffness"] |= {
+            "interval_95": finite(stiffness.interval_95),
+            "identifiable": stiffness.identifiable,
+        }
+    if config.cable.youngs_modulus is not None:
+        document["cable"]["youngs_modulus"] = config.cable.youngs_modulus
+    document["fixtures"] = _shared_fixtures(config)
+    document["model_hash"] = model_hash(document)
+    document["config"] = config.name
+    document["config_hash"] = _file_hash(config.path)
+    document["versions"] = dict(outcome.versions)
+    return document
+
+
+def fit_dict(fit: Fit) -> dict[str, Any]:
+    """What a fit alone tells: the model, its parameters, covariance and state."""
+    model = fit.model
+    names, covariance = covariance_si(fit)
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "cable": {
+            "name": model.cable.name,
+            "length": model.cable.length,
+            "mass": model.cable.mass,
+            "diameter": model.cable.diameter,
+            "bending_stiffness": model.cable.bending_stiffness,
+            "rest_shape": "straight" if model.cable.straight else "curved",
+        },
+        "boundary": {"start": model.start, "end": model.end},
+        "gravity": list(model.gravity),
+        "element": model.element,
+        "n": model.n,
+        "n_rest": model.n_rest,
+        "effects": [_effect_row(effect) for effect in model.effects],
+        "parameters": {
+            q.name: {
+                "value": float(value),
+                "std": fit.std(q.name),
+                "unit": q.unit,
+                "lower": q.lower,
+                "upper": q.upper,
+                "fitted": q.name in names,
+                # Standard deviation of the prior of what is known within a tolerance.
+                "tolerance": model.priors.get(q.name),
+            }
+            for q, value in zip(model.parameters, fit.p, strict=True)
+        },
+        "rest_curvature": {
+            "coefficients": fit.coefficients,
+            "unit": "1/m",
+            "basis": "cubic B-splines on clamped uniform knots over [0, length]",
+        },
+        "state": {"rest_curvature": final_rest(fit), "unit": "1/m", "of": "cells, last pose done"},
+        "covariance": {"names": list(names), "values": covariance},
+    }
+    plain: dict[str, Any] = finite(document)
+    return plain
+
+
+def model_hash(document: Mapping[str, Any]) -> str:
+    """SHA-256 of what determines predictions; bounds and standard deviations do not."""
+    content = {key: document[key] for key in _MODEL_KEYS}
+    content["values"] = {key: row["value"] for key, row in document["parameters"].items()}
+    content["coefficients"] = document["rest_curvature"]["coefficients"]
+    text = json.dumps(_as_floats(content), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def covariance_si(fit: Fit) -> tuple[tuple[str, ...], FloatArray]:
+    """Names and covariance of all fitted parameters in SI units, the residual's excess included.
+
+    The fit's own unknowns are scaled or logarithmic: C = D C_theta D with D = dp/dtheta.
+    """
+    unknowns = fit.problem.unknowns
+    slopes = unknowns.scales.copy()
+    by_theta = unknowns.slopes(fit.point.theta)
+    for k, name in enumerate(unknowns.names[: unknowns.n_parameters]):
+        slopes[k] = by_theta[fit.model.names.index(name), k]
+    scaled = fit.covariance * np.outer(slopes, slopes) * fit.inflation**2
+    return unknowns.names, np.asarray((scaled + scaled.T) / 2)
+
+
+def final_rest(fit: Fit) -> FloatArray:
+    """Rest curvature (n_cells,) [1/m] that the session's last pose leaves behind."""
+    if not fit.model.has_state:
+        return fit.rest
+    return fit.problem.sweep.rest_after_last(fit.point.shapes, fit.p, fit.rest)
+
+
+def _effect_row(effect: Effect) -> dict[str, Any]:
+    """Name and label of an effect, and what else it was made with."""
+    if _KNOWN.get(effect.name) is not type(effect):
+        raise DloError(f"the effect {effect.name!r} cannot be written to parameters.yaml")
+    options = {
+        item.name: getattr(effect, item.name) for item in fields(effect) if item.name != "label"
+    }
+    return {"name": effect.name, "label": effect.label, **options}
+
+
+def _shared_fixtures(config: Config) -> dict[str, Any]:
+    """What all poses share of their start and headings."""
+    shared: dict[str, Any] = {}
+    for key in ("start", "start_heading", "end_heading"):
+        values = {getattr(pose, key) for pose in config.experiment.poses}
+        shared[key] = finite(values.pop()) if len(values) == 1 else None
+    return shared
+
+
+def _file_hash(path: Path) -> str | None:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None
+
+
+def _as_floats(data: Any) -> Any:
+    """Every number as a float: 1 and 1.0 are the same model."""
+    if isinstance(data, Mapping):
+        return {str(key): _as_floats(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_as_floats(value) for value in data]
+    if isinstance(data, int) and not isinstance(data, bool):
+        return float(data)
+    return data
+
+
+# ---- reading -----------------------------------------------------------------------------------
+
+
+def load_parameters(path: str | Path) -> Parameters:
+    """Read parameters.yaml and rebuild the model exactly.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, or the folder of results that holds it.
+
+    Returns
+    -------
+    (model, p, rest, metadata)
+        See `Parameters`.
+
+    Raises
+    ------
+    ConfigError
+        If the file is no parameters.yaml of this schema; the message names the key.
+    """
+    source = Path(path)
+    if source.is_dir():
+        source = source / "parameters.yaml"
+    document = read_yaml(source)
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        found = document.get("schema") if isinstance(document, dict) else type(document).__name__
+        raise ConfigError(
+            f"no fitted parameters: schema {SCHEMA!r} expected, {found!r} found.\n"
+            "  Try: the parameters.yaml in the results folder of a fit.",
+            source,
+        )
+    try:
+        return _rebuild(document, source)
+    except DloError as error:
+        raise ConfigError(f"damaged parameters: {error.message}", source) from None
+    except KeyError as error:
+        raise ConfigError(f"damaged parameters: {error.args[0]} is missing", source) from None
+    except (TypeError, ValueError, AttributeError) as error:
+        raise ConfigError(f"damaged parameters: {error}", source) from None
+
+
+def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
+    declared, rows = document["cable"], document["parameters"]
+    cable = Cable(
+        length=_positive(declared, "cable", "length"),
+        mass=_positive(declared, "cable", "mass"),
+        diameter=_positive(declared, "cable", "diameter"),
+        bending_stiffness=_positive(declared, "cable", "bending_stiffness"),
+        name=str(declared["name"]),
+        straight=declared["rest_shape"] == "straight",
+    )
+    gravity = _numbers(document["gravity"], 2, "gravity")
+    boundary = document["boundary"]
+    tolerances = {name: row.get("tolerance") for name, row in rows.items()}
+    model = CableModel(
+        cable=cable,
+        n=int(document["n"]),
+        element=_one_of(document["element"], ("arc", "link"), "element"),
+        start=_one_of(boundary["start"], ("pinned", "clamped"), "boundary.start"),
+        end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary.end"),
+        gravity=(float(gravity[0]), float(gravity[1])),
+        effects=tuple(_effect(row) for row in document["effects"]),
+        n_rest=int(document["n_rest"]),
+        priors={name: float(std) for name, std in tolerances.items() if std is not None},
+    )
+    if set(rows) != set(model.names):
+        wrong = ", ".join(sorted(set(rows) ^ set(model.names)))
+        raise DloError(f"parameters and effects do not belong together: {wrong}")
+    values = [rows[name]["value"] for name in model.names]
+    coefficients = document["rest_curvature"]["coefficients"]
+    rest = document["state"]["rest_curvature"]
+    names = tuple(document["covariance"]["names"])
+    covariance = np.array(document["covariance"]["values"], dtype=float)
+    interval = rows["bending_stiffness"].get("interval_95")
+    metadata = Metadata(
+        path=source,
+        names=names,
+        covariance=covariance.reshape(len(names), len(names)),
+        std={name: float(row.get("std") or 0.0) for name, row in rows.items()},
+        coefficients=_numbers(coefficients, model.rest.n_coefficients, "rest_curvature"),
+        fixtures=dict(document.get("fixtures") or {}),
+        identifiable=rows["bending_stiffness"].get("identifiable"),
+        interval_95=None if interval is None else (interval[0], interval[1]),
+        model_hash=str(document["model_hash"]),
+        edited=model_hash(document) != document["model_hash"],
+        config=str(document.get("config")),
+        versions=dict(document.get("versions") or {}),
+        document=document,
+    )
+    return Parameters(
+        model,
+        _numbers(values, len(values), "parameters"),
+        _numbers(rest, model.chain.n_cells, "state.rest_curvature"),
+        metadata,
+    )
+
+
+def _effect(row: Mapping[str, Any]) -> Effect:
+    name = row["name"]
+    if name not in _KNOWN:
+        raise DloError(f"no effect is called {name!r}; known: {', '.join(_KNOWN)}")
+    options: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in row.items()
+        if key != "name"
+    }
+    return _KNOWN[name](**options)
+
+
+def _positive(section: Mapping[str, Any], where: str, key: str) -> float:
+    value = section[key]
+    if not isinstance(value, int | float) or not 0 < value < math.inf:
+        raise DloError(f"{where}.{key} must be a positive number, found {value!r}")
+    return float(value)
+
+
+def _numbers(values: Sequence[Any], size: int, where: str) -> FloatArray:
+    array = np.array(values, dtype=float)
+    if array.shape != (size,):
+        raise DloError(f"{where}: {size} numbers belong here, found {array.size}")
+    if not np.all(np.isfinite(array)):
+        raise DloError(f"{where}: all numbers must be finite")
+    return array
+
+
+def _one_of(value: Any, allowed: tuple[str, ...], where: str) -> Any:
+    if value not in allowed:
+        raise DloError(f"{where} must be {' or '.join(allowed)}, found {value!r}")
+    return value

@@ -1,0 +1,345 @@
+"""Tables for the terminal: what was found, how well, what is not known, and how long it took."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from dlo_casadi.outcome import Outcome, ParameterEstimate, Stage
+from dlo_casadi.report.canvas import STAGE_LABELS, label_of
+from dlo_casadi.report.json_report import all_warnings
+
+# Parts of the run in the order in which they are done.
+TIMED = {
+    "vision": "photographs to centre-lines",
+    "algorithm1": "Algorithm 1",
+    "batch": "batch estimate",
+    "diagnosis": "diagnosis",
+}
+
+
+def print_summary(console: Console, outcome: Outcome) -> None:
+    """Print all that a user should see at the end of a run."""
+    console.print(summary(outcome))
+
+
+def summary(outcome: Outcome) -> RenderableType:
+    """Everything that a user should see at the end of a run."""
+    parts: list[RenderableType] = [
+        "",
+        _heading(outcome),
+        parameter_table(outcome),
+        *(Text("  " + line) for line in footnotes(outcome)),
+        "",
+        error_table(outcome),
+        "",
+        *(Text(line) for line in verdict_lines(outcome)),
+    ]
+    warnings = all_warnings(outcome)
+    if warnings:
+        parts.append("")
+        parts += [Text.assemble(("warning: ", "bold yellow"), text) for text in warnings]
+    parts += ["", timing_table(outcome)]
+    return Group(*parts)
+
+
+def _table(title: str) -> Table:
+    return Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+
+
+def _heading(outcome: Outcome) -> Text:
+    m = outcome.measurement
+    noise = f"noise {_mm(m.std)} ({m.std_source})"
+    if m.correlation_length > 0:
+        noise += f", correlated over {_mm(m.correlation_length)}"
+    text = (
+        f"{m.poses_fit} fit poses, {m.poses_held_out} held out, {m.points} points; {noise}; "
+        f"{outcome.discretization.n} {outcome.discretization.element}s, "
+        f"mesh error {_mm(outcome.discretization.error)}"
+    )
+    return Text.assemble((outcome.config.cable.name, "bold"), ": ", text)
+
+
+# ---- parameters --------------------------------------------------------------------------------
+
+
+def parameter_table(outcome: Outcome) -> Table:
+    """Fitted parameters of the last stage with their units, and what was kept fixed."""
+    table = _table(f"Parameters ({label_of(outcome.stages[-1], outcome)})")
+    for column in ("parameter", "value", "95 % interval", ""):
+        table.add_column(column, overflow="fold")
+    for name, estimate in outcome.stages[-1].parameters.items():
+        table.add_row(name, *describe(estimate))
+    for row in _rest_rows(outcome.stages[-1], outcome):
+        table.add_row(*row)
+    for row in nuisance_rows(outcome):
+        table.add_row(*row)
+    for row in fixed_rows(outcome):
+        table.add_row(*row, style="dim")
+    return table
+
+
+def describe(estimate: ParameterEstimate) -> tuple[str, str, str]:
+    """Value, interval and remark: no number where the data do not tell one."""
+    unit = f" {estimate.unit}" if estimate.unit else ""
+    if estimate.identifiable is False:
+        return (unidentified(estimate), "", "not identifiable from these shapes")
+    value = plus_minus(estimate.value, estimate.std)
+    interval = ""
+    if estimate.interval_95 is not None:
+        low, high = estimate.interval_95
+        interval = f"{_bound(low)} to {_bound(high)}{unit}"
+    return (value + unit, interval, "at a bound" if estimate.at_bound else "")
+
+
+def unidentified(estimate: ParameterEstimate) -> str:
+    """What can be said of a parameter that the shapes do not determine."""
+    low, high = estimate.interval_95 or (None, None)
+    unit = f" {estimate.unit}" if estimate.unit else ""
+    if low is not None and high is not None:
+        return f"{low:.2g} to {high:.2g}{unit}"
+    if low is not None:
+        return f">= {low:.2g}{unit}"
+    if high is not None:
+        return f"<= {high:.2g}{unit}"
+    return "unknown"
+
+
+def nuisance_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
+    """What is known within a tolerance and was adjusted there."""
+    fit = outcome.fit
+    reported = set(outcome.stages[-1].parameters)
+    rows = []
+    for q in fit.model.parameters:
+        tolerance = fit.model.priors.get(q.name)
+        if tolerance is None or q.name in reported or q.name.startswith("edge_bias."):
+            continue
+        shift, unit = fit.value(q.name) - q.nominal, f" {q.unit}" if q.unit else ""
+        rows.append(
+            (
+                q.name,
+                plus_minus(fit.value(q.name), fit.std(q.name)) + unit,
+                "",
+                f"moved {abs(shift) / tolerance:.1f} x its tolerance {tolerance:g}{unit}",
+            )
+        )
+    return rows
+
+
+def fixed_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
+    """What was declared and kept."""
+    cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
+    rows = [
+        ("length", f"{cable.length:g} m", "", "fixed"),
+        ("mass", f"{cable.mass:g} kg", "", "fixed"),
+        ("gravity", f"({gravity[0]:g}, {gravity[1]:g}) m/s^2", "", "fixed"),
+    ]
+    unknowns = outcome.fit.problem.unknowns
+    for q, free in zip(outcome.fit.model.parameters, unknowns.free, strict=True):
+        if not free:
+            unit = f" {q.unit}" if q.unit else ""
+            rows.append((q.name, f"{outcome.fit.value(q.name):.4g}{unit}", "", "fixed"))
+    return rows
+
+
+def footnotes(outcome: Outcome) -> list[str]:
+    """What the table of parameters needs to be read rightly."""
+    lines = []
+    stiffness = outcome.stages[-1].parameters.get("bending_stiffness")
+    if stiffness is not None and stiffness.identifiable is False:
+        bound = unidentified(stiffness)
+        known = f"EI {bound}" if bound[0] in "<>" else f"EI: {bound}"
+        lines.append(f"{known}, not identifiable from these shapes.")
+        lines.append(
+            "Try: poses in which weight and stiffness compete more (ends close together), or "
+            "hang a known weight on the cable and declare it under model.effects."
+        )
+    elif stiffness is not None:
+        lines.append(
+            "Shapes give the ratio of stiffness to weight: EI is as good as the declared mass."
+        )
+    return lines
+
+
+def _rest_rows(stage: Stage, outcome: Outcome) -> list[tuple[str, str, str, str]]:
+    if outcome.config.cable.rest_shape == "straight":
+        return [("rest curvature", "0 1/m", "", "fixed: declared straight")]
+    rest = stage.rest_curvature
+    if not len(rest.value):
+        return []
+    low, high = rest.value.min(), rest.value.max()
+    text = f"{low:.3g} to {high:.3g} 1/m along the cable"
+    return [("rest curvature", text, "", f"std {rest.std.mean():.2g} 1/m on average")]
+
+
+# ---- errors ------------------------------------------------------------------------------------
+
+
+def error_table(outcome: Outcome) -> Table:
+    """Errors of the stages: fit, cross-validated, held out, chi-square, beside the noise."""
+    table = _table("Distance of the measured points from the predicted shape, RMS")
+    table.add_column("stage")
+    validated = {"batch": None, "closed": None}
+    if outcome.effects:
+        validated["batch"] = outcome.effects[0]["rmse_cross_validated_before"]
+        validated["closed"] = outcome.effects[-1]["rmse_cross_validated_after"]
+    columns = ["fit", "cross-validated", "held out", "chi2/dof"]
+    if not outcome.effects:
+        columns.remove("cross-validated")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for stage in outcome.stages:
+        cells = {
+            "fit": _mm(stage.rmse_fit),
+            "cross-validated": _mm(validated.get(stage.name)),
+            "held out": _mm(stage.rmse_held_out),
+            "chi2/dof": "-" if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
+        }
+        label = STAGE_LABELS[stage.name] if stage.name != "closed" else label_of(stage, outcome)
+        table.add_row(label, *(cells[column] for column in columns))
+    table.add_section()
+    floor = [_mm(outcome.measurement.std)] + [""] * (len(columns) - 1)
+    table.add_row(f"noise ({outcome.measurement.std_source})", *floor)
+    return table
+
+
+# ---- verdict -----------------------------------------------------------------------------------
+
+
+def verdict_lines(outcome: Outcome) -> list[str]:
+    """What the diagnosis has led to, in sentences."""
+    if not outcome.config.diagnosis.enabled:
+        return ["Diagnosis: switched off; nothing was looked for in the residual."]
+    lines = [_verdict(outcome)]
+    for effect in outcome.effects:
+        lines += _effect_lines(effect)
+    load = outcome.unexplained
+    if load is not None:
+        force, (low, high) = load["force"], load["interval_95"]
+        lines.append(
+            f"  Without naming a cause: pulled by ({force[0]:.3g}, {force[1]:.3g}) N on average "
+            f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
+        )
+    proposal = outcome.next_pose
+    if proposal is not None:
+        x, y = proposal["end"]
+        lines.append(
+            f"  To tell {' from '.join(proposal['separates'])}: hold the end at ({x:.3f}, {y:.3f})"
+            f" m; they differ there by {_mm(proposal['expected_difference_m'])}."
+        )
+    return lines
+
+
+def _verdict(outcome: Outcome) -> str:
+    names = " and ".join(effect["name"] for effect in outcome.effects)
+    if outcome.verdict == "unexplained":
+        found = f" even with {names}" if names else ""
+        return f"Verdict: unexplained. The residual is not noise{found}."
+    if outcome.effects:
+        return f"Verdict: the declared model lacked {names}; with it the residual is noise."
+    return "Verdict: complete. The declared model explains the shapes down to their noise."
+
+
+def _effect_lines(effect: dict[str, Any]) -> list[str]:
+    values = ", ".join(_quantity(name, row) for name, row in effect["parameters"].items())
+    line = f"  {effect['name']}: {values}"
+    if effect["p_value"] is not None:
+        line += f" (p = {effect['p_value']:.1g})"
+    lines = [line]
+    rivals = effect["indistinguishable_from"]
+    if rivals:
+        lines.append(f"    These data cannot tell it from {' or '.join(rivals)}.")
+    return lines
+
+
+def _quantity(name: str, row: dict[str, Any]) -> str:
+    if row["value"] is None:
+        return f"{name} unbounded"
+    return f"{name} {plus_minus(row['value'], row['std'] or 0.0)} {row['unit']}".strip()
+
+
+# ---- timing ------------------------------------------------------------------------------------
+
+
+def timing_table(outcome: Outcome) -> Table:
+    """Wall-clock time of the parts of the run."""
+    table = _table("Time")
+    table.add_column("part")
+    table.add_column("seconds", justify="right")
+    table.add_column("")
+    timing = outcome.timing
+    photographs = sum(pose.image is not None for pose in outcome.poses)
+    rest = timing["total"] - sum(timing.get(name, 0.0) for name in TIMED)
+    for name, label in TIMED.items():
+        remark = ""
+        if name == "vision" and photographs:
+            remark = f"{timing[name] / photographs:.2f} s a photograph ({photographs})"
+        elif name == "vision":
+            label = "centre-lines"
+        table.add_row(label, f"{timing.get(name, 0.0):.2f}", remark)
+    table.add_row("other fits and predictions", f"{max(rest, 0.0):.2f}", "")
+    table.add_section()
+    table.add_row("total", f"{timing['total']:.2f}", "")
+    return table
+
+
+# ---- one predicted pose ------------------------------------------------------------------------
+
+
+def prediction_table(shape: dict[str, Any], notes: Iterable[str] = ()) -> RenderableType:
+    """Reactions, energy, stability and shape of one predicted pose.
+
+    Parameters
+    ----------
+    shape : dict
+        As from `PredictedShape.as_dict`.
+    """
+    table = _table(f"{shape['cable']}: predicted shape")
+    table.add_column("quantity")
+    table.add_column("value")
+    for side in ("start", "end"):
+        at = shape[side]
+        if at is None:
+            table.add_row(side, "free")
+            continue
+        x, y = shape[f"force_on_{side}"]
+        table.add_row(side, f"({at[0]:g}, {at[1]:g}) m")
+        table.add_row(f"force of the cable on its {side}", f"({x:.4g}, {y:.4g}) N")
+        if shape[f"{side}_heading"] is not None:
+            moment = shape[f"moment_on_{side}"]
+            table.add_row(f"moment of the cable on its {side}", f"{moment:.4g} N m")
+    table.add_row("energy", f"{shape['energy']:.6g} J")
+    table.add_row("smallest bend radius", _mm(shape["min_bend_radius"]))
+    table.add_row("stable", "yes" if shape["stable"] else "NO: the cable would not stay there")
+    points = _table("Points from start to end")
+    for column in ("s [m]", "x [m]", "y [m]"):
+        points.add_column(column, justify="right")
+    count = len(shape["points"])
+    for k, (x, y) in enumerate(shape["points"]):
+        if k % max(1, (count - 1) // 10) == 0:
+            points.add_row(f"{shape['length'] * k / (count - 1):.4f}", f"{x:.5f}", f"{y:.5f}")
+    return Group(table, points, *(Text(note) for note in notes))
+
+
+def plus_minus(value: float, std: float) -> str:
+    """A value with the digits that its standard deviation leaves: two of the latter."""
+    if not std > 0:
+        return f"{value:.4g}"
+    decimals = 1 - math.floor(math.log10(std))
+    if std >= 10 * abs(value) or not 0 <= decimals <= 7:
+        return f"{value:.2g} ± {std:.2g}"
+    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+
+
+def _bound(value: float | None) -> str:
+    return "unbounded" if value is None else f"{value:.4g}"
+
+
+def _mm(value: float | None) -> str:
+    return "-" if value is None else f"{1e3 * value:.3g} mm"
