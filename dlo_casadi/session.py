@@ -14,6 +14,7 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.declared import Declared, declared_model, straight
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import SETTLED_MODES, SMOOTH_MODES, Fit, fit_model, refine_mesh
@@ -111,8 +112,7 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
         measured = reweighted(fit, measured)
         fit, error = fit_declared(config, declared, measured, fit.model.n)
         clock.lap("fit")
-    solution = solve_batch(fit.problem, fit.point)
-    fit = replace(fit, point=solution.point)
+    fit = solved_by_ipopt(fit)
     clock.lap("batch")
     progress.step("fit the declared model", 1, 1)
 
@@ -167,6 +167,8 @@ def close_the_loop(
     )
     fit, stages = diagnosis.after, list(outcome.stages)
     fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
+    if diagnosis.added:
+        fit = solved_by_ipopt(fit)
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
     interval = stiffness_interval(fit)
@@ -222,10 +224,21 @@ def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float
     while True:
         if n != fit.model.n:
             fit = refine_mesh(fit, n, modes)
-        error = discretization_error(fit)
+        try:
+            error = discretization_error(fit)
+        except EstimationError:
+            error = np.inf
         if error <= MESH_SHARE * max(fit.noise.std, fit.residual_rms) or n >= FINEST_MESH:
             return fit, error
         n *= 2
+
+
+def solved_by_ipopt(fit: Fit) -> Fit:
+    """Minimum of the batch NLP, from the Gauss-Newton fit's; that one where IPOPT fails."""
+    try:
+        return replace(fit, point=solve_batch(fit.problem, fit.point).point)
+    except EstimationError:
+        return replace(fit, converged=False)
 
 
 def before_stages(
@@ -335,7 +348,12 @@ def _fit_warnings(fit: Fit, error: float) -> list[str]:
     ]
     if unstable:
         lines.append(f"not a stable equilibrium at the fitted parameters: {', '.join(unstable)}")
-    if error > MESH_SHARE * fit.noise.std:
+    if not np.isfinite(error):
+        lines.append(
+            f"the fitted shapes cannot be followed to a mesh finer than {fit.model.n} elements: "
+            "some pose is close to losing its stability"
+        )
+    elif error > MESH_SHARE * fit.noise.std:
         lines.append(
             f"the mesh of {fit.model.n} elements is off by {1e3 * error:.3g} mm, more than "
             f"{MESH_SHARE:.0%} of the noise: model.n larger?"

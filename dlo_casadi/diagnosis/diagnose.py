@@ -313,7 +313,8 @@ def _unexplained(
 ) -> tuple[Pull | None, Fit, list[AddedEffect]]:
     """Estimate the load without a cause; effects that it makes needless are withdrawn."""
     pull = estimate_pull(current)
-    if not added:
+    # In one pose a force fits as well as any cause; in many, at one place, it is a cause.
+    if not added or len(current.problem.used) < 2:
         return pull, current, added
     alone = estimate_pull(declared)
     if alone is None:
@@ -321,7 +322,8 @@ def _unexplained(
     # One force per pose on the declared model against the same on top of the added effects.
     n = np.log(declared.problem.n_points)
     extra = sum(len(item.candidate.frees) for item in added) * n
-    if pull is None or 2 * alone.fit.point.objective < 2 * pull.fit.point.objective + extra:
+    better = pull is None or (2 * alone.fit.point.objective < 2 * pull.fit.point.objective + extra)
+    if better and structure_of(alone.fit).p_value > structure_of(current).p_value:
         return alone, declared, []
     return pull, current, added
 

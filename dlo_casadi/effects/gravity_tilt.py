@@ -16,14 +16,14 @@ class GravityTilt(Load):
     Parameters
     ----------
     angle : scalar [rad]
-        Counter-clockwise; vanishes at 0.
+        Counter-clockwise; vanishes at 0; at most half a radian.
     """
 
     name = "gravity_tilt"
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the angle."""
-        return (Parameter("angle", "rad", scale=0.05, lower=-1.0, upper=1.0),)
+        return (Parameter("angle", "rad", scale=0.05, lower=-0.5, upper=0.5),)
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
         """Turn gravity counter-clockwise by the angle."""

@@ -17,14 +17,23 @@ class SideLoad(Load):
     Parameters
     ----------
     force_per_length : scalar [N/m]
-        Vanishes at 0.
+        Vanishes at 0; at most half the cable's weight on Earth.
     """
 
     name = "side_load"
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the force per length."""
-        return (Parameter("force_per_length", "N/m", scale=0.1 * 9.81 * cable.mass / cable.length),)
+        weight = 9.81 * cable.mass / cable.length
+        return (
+            Parameter(
+                "force_per_length",
+                "N/m",
+                scale=0.1 * weight,
+                lower=-0.5 * weight,
+                upper=0.5 * weight,
+            ),
+        )
 
     def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
         """Potential energy of the load [J]."""

@@ -113,7 +113,12 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
 
 
 class _BatchNlp:
-    """The NLP's expressions, built once; the points' factors are its parameters."""
+    """The NLP's expressions, built once; the points' factors are its parameters.
+
+    First and second derivatives of one pose are generated once and mapped over the poses; the
+    NLP's own are put together from these blocks. That is what its structure costs, while
+    differentiating the assembled NLP would cost as many sweeps as a pose has unknowns.
+    """
 
     def __init__(self, problem: BatchProblem) -> None:
         self.problem = problem
@@ -121,69 +126,136 @@ class _BatchNlp:
         self.poses = list(range(problem.sweep.m)) if model.has_state else list(problem.used)
         self.n_phi, self.n_lam = model.chain.n_headings, model.n_conditions
         self.columns = problem.sweep.used_deviations
-        n_dev, n_cells, n_z = len(self.columns), model.chain.n_cells, self._n_z(model)
-        self.stride = self.n_phi + self.n_lam + n_dev + (n_cells if model.has_state else 0)
+        self.n_dev = len(self.columns)
+        self.n_rest = model.chain.n_cells if model.has_state else 0
+        self.stride = self.n_phi + self.n_lam + self.n_dev + self.n_rest
         # Multipliers and balance in units of a typical force: EI turns^2.
         self.force = model.cable.bending_stiffness * model.cable.curvature_scale**2
+        self._differentiate()
+        lower, upper = unknowns.bounds
+        free = np.full(self.stride * len(self.poses), np.inf)
+        self.lower, self.upper = np.concatenate([lower, -free]), np.concatenate([upper, free])
+        self._assemble()
 
+    def _differentiate(self) -> None:
+        """Values, Jacobians and Hessian of one pose by its own unknowns and theta."""
+        problem = self.problem
+        unknowns, model = problem.unknowns, problem.unknowns.model
         theta = ca.SX.sym("theta", unknowns.size)
         own = ca.SX.sym("own", self.stride)
         ends = ca.SX.sym("ends", 6)
-        p = unknowns.symbolic_p(theta)
-        phi, lam, dev, rest = self._split(own, n_dev)
+        phi, lam, dev, rest = self._split(own)
         deviation = ca.SX.zeros(len(DEVIATIONS))
         for k, column in enumerate(self.columns):
             deviation[column] = dev[k] * problem.deviation_std[k]
         if not model.has_state:
             rest = unknowns.symbolic_rest(theta)
-        arguments = [phi, lam * self.force, p, rest, ends, deviation]
-        kkt = model.balance(*arguments)
+        arguments = [phi, lam * self.force, unknowns.symbolic_p(theta), rest, ends, deviation]
         scale = np.concatenate(
             [
                 np.full(self.n_phi, 1 / (self.force * model.cable.length)),
                 np.full(self.n_lam, 1 / model.cable.length),
             ]
         )
-        self.pose = ca.Function(
-            "pose",
-            [own, theta, ends],
-            [kkt * scale, model.shape(*arguments), model.next_rest(*arguments)[0], deviation],
+        balance = model.balance(*arguments) * scale
+        z = model.shape(*arguments)
+        after = ca.SX.zeros(0)
+        if model.has_state:
+            after = model.next_rest(*arguments)[0] / model.cable.curvature_scale
+        both = ca.vertcat(own, theta)
+        given = [own, theta, ends]
+        self.value = ca.Function("value", given, [balance, z, after])
+        blocks = [ca.densify(ca.jacobian(block, both)) for block in (balance, z, after)]
+        self.slope = ca.Function("slope", given, blocks)
+        weights = [ca.SX.sym("w", block.numel()) for block in (balance, z, after)]
+        weighted = sum(
+            (
+                ca.dot(weight, block)
+                for weight, block in zip(weights, (balance, z, after), strict=True)
+            ),
+            start=ca.SX(0),
         )
-        x_theta = ca.MX.sym("theta", unknowns.size)
-        x_own = ca.MX.sym("own", self.stride, len(self.poses))
+        bend = ca.densify(ca.hessian(weighted, both)[0])
+        self.bend = ca.Function("bend", [*given, *weights], [bend])
+
+    def _assemble(self) -> None:
+        """NLP, gradient, Jacobian and Hessian from the poses' blocks."""
+        problem, m = self.problem, len(self.poses)
+        unknowns, model = problem.unknowns, problem.unknowns.model
+        size, n_z = unknowns.size, self._n_z(model)
+        x = ca.MX.sym("x", size + self.stride * m)
         factor = ca.MX.sym("factor", n_z, n_z * len(problem.used))
         target = ca.MX.sym("target", n_z, len(problem.used))
-        poses = self.pose.map(len(self.poses))
+        p = ca.vertcat(ca.vec(factor), ca.vec(target))
+        theta, own = x[:size], ca.reshape(x[size:], self.stride, m)
+        thetas = ca.repmat(theta, 1, m)
         fixed = ca.DM(np.array([problem.measured[j].pose.vector for j in self.poses]).T)
-        balance, z, after, _ = poses(x_own, ca.repmat(x_theta, 1, len(self.poses)), fixed)
-        gap = x_theta - ca.DM(problem.mean)
-        objective = ca.bilin(ca.DM(problem.precision), gap, gap) / 2
+        balance, z, after = self.value.map(m)(own, thetas, fixed)
+        slopes = self.slope.map(m)(own, thetas, fixed)
+        width = self.stride + size
+        gap = theta - ca.DM(problem.mean)
+        precision = ca.DM(problem.precision)
+        at = self.n_phi + self.n_lam
+        pick = ca.DM.zeros(self.stride)
+        pick[at : at + self.n_dev] = 1.0
+
+        objective = ca.bilin(precision, gap, gap) / 2
+        by_theta, by_own = precision @ gap, [ca.MX.zeros(self.stride) for _ in self.poses]
+        pulls = [ca.MX.zeros(n_z) for _ in self.poses]
+        squares = [ca.MX.zeros(width, width) for _ in self.poses]
         for k, j in enumerate(problem.used):
-            column = self.poses.index(j)
+            c = self.poses.index(j)
             block = factor[:, k * n_z : (k + 1) * n_z]
-            objective += ca.sumsqr(block @ z[:, column] - target[:, k]) / 2
-            at = self.n_phi + self.n_lam
-            objective += ca.sumsqr(x_own[at : at + n_dev, column]) / 2
-        constraints = [ca.vec(balance)]
+            residual = block @ z[:, c] - target[:, k]
+            deviation = pick * own[:, c]
+            objective += ca.sumsqr(residual) / 2 + ca.sumsqr(deviation) / 2
+            jacobian = slopes[1][:, c * width : (c + 1) * width]
+            pulls[c] = block.T @ residual
+            gradient = jacobian.T @ pulls[c]
+            by_own[c] = gradient[: self.stride] + deviation
+            by_theta += gradient[self.stride :]
+            whitened = block @ jacobian
+            squares[c] = whitened.T @ whitened
+            squares[c] += ca.diag(ca.vertcat(pick, ca.DM.zeros(size)))
+        constraints, rows = [ca.vec(balance)], [self._blocks(slopes[0], m, width)]
         if model.has_state:
-            first = ca.MX(ca.DM(unknowns.rest_slopes)) @ x_theta
-            begins = x_own[self.n_phi + self.n_lam + n_dev :, :]
-            carried = ca.horzcat(first, after[:, :-1])
-            constraints.append(ca.vec(begins - carried) / model.cable.curvature_scale)
-        lower, upper = unknowns.bounds
-        free = np.full(self.stride * len(self.poses), np.inf)
-        self.lower, self.upper = np.concatenate([lower, -free]), np.concatenate([upper, free])
+            carried, row = self._carry(theta, own, after, slopes[2], width)
+            constraints.append(carried)
+            rows.append(row)
+        g = ca.vertcat(*constraints)
+
+        lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
+        n_balance = self.n_phi + self.n_lam
+        of_balance = ca.reshape(lam_g[: n_balance * m], n_balance, m)
+        of_after = ca.MX.zeros(self.n_rest, m)
+        if model.has_state:
+            # Row block j + 1 of the carried constraints holds minus what pose j leaves behind.
+            later = ca.reshape(lam_g[n_balance * m :], self.n_rest, m)[:, 1:]
+            of_after = ca.horzcat(-later, ca.MX.zeros(self.n_rest, 1))
+        bends = self.bend.map(m)(
+            own, thetas, fixed, of_balance, lam_f * ca.horzcat(*pulls), of_after
+        )
+        corner, side, diagonal = lam_f * precision, [], []
+        for c in range(m):
+            whole = bends[:, c * width : (c + 1) * width] + lam_f * squares[c]
+            diagonal.append(whole[: self.stride, : self.stride])
+            side.append(whole[self.stride :, : self.stride])
+            corner += whole[self.stride :, self.stride :]
+        hessian = ca.blockcat(
+            [
+                [corner, ca.horzcat(*side)],
+                [ca.MX(self.stride * m, size), ca.diagcat(*diagonal)],
+            ]
+        )
         self.solver = ca.nlpsol(
             "batch",
             "ipopt",
-            {
-                "x": ca.vertcat(x_theta, ca.vec(x_own)),
-                "p": ca.vertcat(ca.vec(factor), ca.vec(target)),
-                "f": objective,
-                "g": ca.vertcat(*constraints),
-            },
+            {"x": x, "p": p, "f": objective, "g": g},
             {
                 "print_time": False,
+                "grad_f": ca.Function("grad_f", [x, p], [objective, ca.vertcat(by_theta, *by_own)]),
+                "jac_g": ca.Function("jac_g", [x, p], [g, ca.vertcat(*rows)]),
+                "hess_lag": ca.Function("hess_lag", [x, p, lam_f, lam_g], [ca.triu(hessian)]),
                 "ipopt.print_level": 0,
                 "ipopt.sb": "yes",
                 "ipopt.tol": 1e-8,
@@ -195,12 +267,37 @@ class _BatchNlp:
             },
         )
 
+    def _blocks(self, slopes: ca.MX, m: int, width: int) -> ca.MX:
+        """Jacobian of a function of each pose: theta's columns, then the poses' on the diagonal."""
+        parts = [slopes[:, c * width : (c + 1) * width] for c in range(m)]
+        thetas = ca.vertcat(*(part[:, self.stride :] for part in parts))
+        owns = ca.diagcat(*(part[:, : self.stride] for part in parts))
+        return ca.horzcat(thetas, owns)
+
+    def _carry(
+        self, theta: ca.MX, own: ca.MX, after: ca.MX, slopes: ca.MX, width: int
+    ) -> tuple[ca.MX, ca.MX]:
+        """What each pose finds minus what the one before left behind, and its Jacobian."""
+        m, unknowns = len(self.poses), self.problem.unknowns
+        scale = unknowns.model.cable.curvature_scale
+        first = ca.DM(unknowns.rest_slopes) / scale
+        begins = own[self.stride - self.n_rest :, :] / scale
+        gap = ca.vec(begins - ca.horzcat(first @ theta, after[:, :-1]))
+        select = ca.DM.zeros(self.n_rest, self.stride)
+        select[:, self.stride - self.n_rest :] = ca.DM.eye(self.n_rest) / scale
+        left = self._blocks(slopes, m, width)
+        n, size = self.n_rest, unknowns.size
+        shifted = ca.vertcat(ca.MX(n, left.shape[1]), left[: n * (m - 1), :])
+        start = ca.vertcat(ca.MX(first), ca.MX(n * (m - 1), size))
+        direct = ca.horzcat(-start, ca.MX(ca.diagcat(*([select] * m))))
+        return gap, direct - shifted
+
     @staticmethod
     def _n_z(model: CableModel) -> int:
         return int(model.shape.size1_out(0))
 
-    def _split(self, own: ca.SX, n_dev: int) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        a, b, c = self.n_phi, self.n_phi + self.n_lam, self.n_phi + self.n_lam + n_dev
+    def _split(self, own: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        a, b, c = self.n_phi, self.n_phi + self.n_lam, self.n_phi + self.n_lam + self.n_dev
         return own[:a], own[a:b], own[b:c], own[c:]
 
     def solve(
