@@ -40,10 +40,11 @@ def draw_prediction(path: Path, shape: dict[str, Any]) -> None:
             axes.annotate(
                 f"{size:.3g} N",
                 xy=(tip[0], tip[1]),
-                xytext=(6, 0),
+                xytext=(8 * force[0] / size, 10 * force[1] / size),
                 textcoords="offset points",
                 color=VERMILLION,
-                va="center",
+                ha="left" if force[0] > 0 else "right",
+                va="bottom" if force[1] > 0 else "top",
             )
             axes.plot(*tip, alpha=0)  # an annotation does not count for the axes' limits
         axes.set_aspect("equal", adjustable="datalim")

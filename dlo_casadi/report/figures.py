@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import StrMethodFormatter
 from numpy.typing import NDArray
 
-from dlo_casadi.outcome import Outcome, PoseInput, Stage
+from dlo_casadi.outcome import Outcome, PoseInput, PoseShape, Stage
 from dlo_casadi.report.canvas import (
     BLACK,
     BLUE,
@@ -34,6 +34,12 @@ FloatArray = NDArray[np.floating]
 
 _POSES_A_PAGE = 20
 _HELD_OUT = PURPLE
+_HELD_OUT_TEXT = "#8C3B6C"
+# A typical deviation is drawn about this share of the cable's length wide.
+_VISIBLE = 0.03
+_FACTORS = (1, 5, 10, 20, 50, 100)
+# Tallest single row of poses [inch].
+_TALLEST = 8.0
 # Behind a number that may lie on a line.
 _PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 
@@ -67,15 +73,17 @@ def draw_poses(folder: Path, outcome: Outcome) -> None:
 
 def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None:
     lines = _shown_stages(outcome)
-    columns = min(len(poses), 5)
-    rows = math.ceil(len(poses) / columns)
+    rows, columns = _arranged(len(poses))
+    factor = _magnification(outcome, outcome.config.cable.length)
     center, span = _common_frame(outcome, poses)
     width = max(3.1 * columns, 7.5)
     height = 0.82 * width / columns * float(span[1] / span[0])
+    if rows == 1 and height > _TALLEST:
+        width, height = max(width * _TALLEST / height, 7.5), _TALLEST
     with figure(path, (width, (height + 0.4) * rows + 1.3)) as drawing:
         grid = drawing.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for axes, pose in zip(grid.ravel(), poses, strict=False):
-            _draw_pose(axes, pose, lines)
+            _draw_pose(axes, pose, lines, outcome.measurement.std, factor)
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
         for axes in grid.ravel()[len(poses) :]:
@@ -99,38 +107,59 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
         if any(pose.role == "held_out" for pose in poses):
             handles.append(Patch(fc="white", ec=_HELD_OUT, lw=2, label="held out of the fit"))
         drawing.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        drawn = "" if factor == 1 else f"; deviations drawn {factor} times as large"
         drawing.suptitle(
-            f"{outcome.config.cable.name}: predicted from the end conditions alone "
-            "(number: distance to the measured points, RMS)",
+            f"{outcome.config.cable.name}: predicted from the end conditions alone\n"
+            f"RMS distance to the measured points above each pose{drawn}",
             fontsize=12,
         )
+
+
+def _arranged(count: int) -> tuple[int, int]:
+    """Rows and columns of a grid with few empty places, about as many of one as of the other."""
+    if count <= 4:
+        return 1, count
+
+    def price(columns: int) -> tuple[int, int, int]:
+        rows = math.ceil(count / columns)
+        return (rows * columns - count, abs(rows - columns), -columns)
+
+    columns = min((3, 4, 5, 6), key=price)
+    return math.ceil(count / columns), columns
 
 
 def _shown_stages(outcome: Outcome) -> list[tuple[Stage, str, str]]:
     """Stages drawn for each pose, with colour and line style."""
     before, after = before_after(outcome)
-    initial = outcome.stage("initial")
-    lines: list[tuple[Stage, str, str]] = []
-    if initial is not None and initial.shapes and initial not in (before, after):
-        lines.append((initial, SKY, ":"))
-    if before is not None:
-        lines.append((before, ORANGE, "--"))
-    if after is not None:
-        lines.append((after, BLUE, "-"))
-    return lines
+    lines = [(before, ORANGE, "--"), (after, BLUE, "-")]
+    return [(stage, color, style) for stage, color, style in lines if stage is not None]
 
 
-def _draw_pose(axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, str]]) -> None:
+def _magnification(outcome: Outcome, size: float) -> int:
+    """Factor on deviations that makes those of the stage before visible in a figure."""
+    before, after = before_after(outcome)
+    stage = before or after
+    errors = [shape.rmse for shape in stage.shapes.values() if shape.rmse] if stage else []
+    if not errors:
+        return 1
+    wanted = _VISIBLE * size / float(np.median(errors))
+    return max(factor for factor in _FACTORS if factor == 1 or factor <= wanted)
+
+
+def _draw_pose(
+    axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, str]], std: float, factor: int
+) -> None:
     for stage, color, style in lines:
         shape = stage.shapes.get(pose.name)
         if shape is not None:
-            axes.plot(*shape.curve.T, color=color, ls=style)
-            axes.plot(*shape.curve[0], "s", color=BLACK, ms=4)
-            axes.plot(*shape.curve[-1], "o", color=BLACK, ms=4)
+            axes.plot(*_magnified(pose, shape, std, factor).T, color=color, ls=style)
     if len(pose.points):
         axes.plot(*pose.points[:: max(1, len(pose.points) // 60)].T, ".", color=BLACK, ms=2.5)
     axes.set_aspect("equal")
     last = lines[-1][0].shapes.get(pose.name) if lines else None
+    if last is not None:
+        axes.plot(*last.curve[0], "s", color=BLACK, ms=4)
+        axes.plot(*last.curve[-1], "o", color=BLACK, ms=4)
     title = pose.name
     if not len(pose.points):
         title += ": not read"
@@ -142,9 +171,23 @@ def _draw_pose(axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, st
         title += ", unstable"
     axes.set_title(title)
     if pose.role == "held_out":
-        axes.title.set_color("#8C3B6C")
+        axes.title.set_color(_HELD_OUT_TEXT)
         for spine in axes.spines.values():
             spine.set(visible=True, color=_HELD_OUT, linewidth=2)
+
+
+def _magnified(pose: PoseInput, shape: PoseShape, std: float, factor: int) -> FloatArray:
+    """The predicted curve, its distance from the measured points multiplied."""
+    if factor == 1 or not len(pose.points):
+        return shape.curve
+    places = np.linspace(0.0, 1.0, len(shape.curve))
+    slope = np.gradient(shape.curve, places, axis=0)
+    length = max(float(np.hypot(*np.diff(shape.curve, axis=0).T).sum()), 1e-12)
+    at = np.clip(shape.s / length, 0.0, 1.0)
+    tangent = np.stack([np.interp(at, places, slope[:, i]) for i in (0, 1)], axis=1)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.hypot(*tangent.T)[:, None]
+    moved = pose.points - factor * std * shape.residual[:, None] * normal
+    return np.asarray(moved)
 
 
 def _common_frame(outcome: Outcome, poses: Sequence[PoseInput]) -> tuple[FloatArray, FloatArray]:
@@ -255,7 +298,13 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
                 continue
             axes.barh(y, 1e3 * value, left=0, height=0.9, color=color)
             axes.text(
-                1e3 * value * 1.05, y, millimetres(value), va="center", fontsize=9, bbox=_PAPER
+                # Beyond the line of the noise, not on it.
+                1.05e3 * (floor if 0.5 * floor < value < floor else value),
+                y,
+                millimetres(value),
+                va="center",
+                fontsize=9,
+                bbox=_PAPER,
             )
         axes.axvline(1e3 * floor, color=BLACK, ls="--", lw=1.2, zorder=1.5)
         middles = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from dlo_casadi.outcome import Outcome, PoseInput
 from dlo_casadi.report.canvas import BLUE, ORANGE, before_after, label_of, millimetres
 from dlo_casadi.vision import read_image
 
-_WIDEST = 1280  # px
+_LARGEST = (1200, 900)  # px
+_NARROWEST = 640  # px, room for the legend
+_STRIP = 56  # px, for the legend below
 _DPI = 100
 
 
@@ -31,35 +34,52 @@ def write_overlays(folder: Path, outcome: Outcome) -> None:
 
 
 def draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome: Outcome) -> None:
-    """Draw one photograph (H, W, 3; red, green, blue) with its measured and predicted lines."""
-    shrink = max(1, int(np.ceil(image.shape[1] / _WIDEST)))
-    small = image[::shrink, ::shrink]
-    height, width = small.shape[:2]
-    strip = 34  # px, for the legend below
-    drawing = Figure(figsize=(width / _DPI, (height + strip) / _DPI), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(drawing)
-    axes = drawing.add_axes((0, strip / (height + strip), 1, height / (height + strip)))
-    axes.imshow(small, interpolation="nearest", aspect="auto")
-    axes.set_axis_off()
-
-    if pose.pixels is not None and len(pose.pixels):
-        points = pose.pixels / shrink
-        axes.plot(*points.T, ".", color="white", ms=3.2)
-        axes.plot(*points.T, ".", color="black", ms=1.6, label="measured")
+    """Draw the part of a photograph (H, W, 3; red, green, blue) that holds the cable."""
     before, after = before_after(outcome)
+    lines = []
     for stage, color, style in ((before, ORANGE, "--"), (after, BLUE, "-")):
         shape = None if stage is None else stage.shapes.get(pose.name)
-        if stage is None or shape is None:
-            continue
-        line = np.asarray(pose.to_pixels(shape.curve)) / shrink
-        label = label_of(stage, outcome)
-        if shape.rmse is not None:
-            label += f", {millimetres(shape.rmse)}"
+        if stage is not None and shape is not None:
+            label = label_of(stage, outcome)
+            label += "" if shape.rmse is None else f", {millimetres(shape.rmse)}"
+            lines.append((np.asarray(pose.to_pixels(shape.curve)), color, style, label))
+    measured = np.zeros((0, 2)) if pose.pixels is None else pose.pixels
+    (left, top), (right, bottom) = _window(image, [measured, *(line[0] for line in lines)])
+    zoom = min(_LARGEST[0] / (right - left), _LARGEST[1] / (bottom - top))
+    width, height = (right - left) * zoom, (bottom - top) * zoom
+    width = max(width, _NARROWEST)
+    drawing = Figure(figsize=(width / _DPI, (height + _STRIP) / _DPI), dpi=_DPI, facecolor="white")
+    FigureCanvasAgg(drawing)
+    share = _STRIP / (height + _STRIP)
+    axes = drawing.add_axes((0, share, 1, 1 - share))
+    extent = (left - 0.5, right - 0.5, bottom - 0.5, top - 0.5)
+    axes.imshow(image[top:bottom, left:right], extent=extent, interpolation="bilinear")
+    axes.set_axis_off()
+    axes.plot(*measured.T, ".", color="white", ms=4.2)
+    axes.plot(*measured.T, ".", color="black", ms=2.2, label="measured")
+    for line, color, style, label in lines:
         axes.plot(*line.T, color="white", lw=2.6, alpha=0.6)
         axes.plot(*line.T, color=color, ls=style, lw=1.5, label=label)
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_xlim(left - 0.5, right - 0.5)
+    axes.set_ylim(bottom - 0.5, top - 0.5)
     role = "held out" if pose.role == "held_out" else "fit"
-    drawing.legend(loc="lower right", ncols=3, fontsize=10, frameon=False, borderaxespad=0.2)
-    drawing.text(0.008, 10 / (height + strip), f"{pose.name} ({role})", fontsize=10)
+    drawing.legend(
+        loc="lower center", ncols=3, fontsize=9, frameon=False, title=f"{pose.name} ({role})"
+    )
     drawing.savefig(path, dpi=_DPI, pil_kwargs={"quality": 88})
+
+
+def _window(
+    image: NDArray[np.uint8], lines: Sequence[NDArray[np.floating]]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Corners (left, top), (right, bottom) [px] of a window about all lines, with a margin."""
+    size = np.array([image.shape[1], image.shape[0]])
+    drawn = np.concatenate(lines)
+    drawn = np.clip(drawn[np.isfinite(drawn).all(axis=1)], 0, size - 1)
+    if not len(drawn):
+        return (0, 0), (int(size[0]), int(size[1]))
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    margin = 0.12 * float((high - low).max()) + 8
+    low = np.maximum(np.floor(low - margin), 0).astype(int)
+    high = np.minimum(np.ceil(high + margin), size).astype(int)
+    return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))

@@ -73,7 +73,7 @@ def parameter_table(outcome: Outcome) -> Table:
     """Fitted parameters of the last stage with their units, and what was kept fixed."""
     table = _table(f"Parameters ({label_of(outcome.stages[-1], outcome)})")
     for column in ("parameter", "value", "95 % interval", ""):
-        table.add_column(column, overflow="fold")
+        table.add_column(column, no_wrap=True)
     for name, estimate in outcome.stages[-1].parameters.items():
         table.add_row(name, *describe(estimate))
     for row in _rest_rows(outcome.stages[-1], outcome):
@@ -126,7 +126,7 @@ def nuisance_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
                 q.name,
                 plus_minus(fit.value(q.name), fit.std(q.name)) + unit,
                 "",
-                f"moved {abs(shift) / tolerance:.1f} x its tolerance {tolerance:g}{unit}",
+                f"{shift / tolerance:+.1f} of its tolerance {tolerance:g}{unit}",
             )
         )
     return rows
@@ -174,7 +174,7 @@ def _rest_rows(stage: Stage, outcome: Outcome) -> list[tuple[str, str, str, str]
     if not len(rest.value):
         return []
     low, high = rest.value.min(), rest.value.max()
-    text = f"{low:.3g} to {high:.3g} 1/m along the cable"
+    text = f"{low:.3g} to {high:.3g} 1/m"
     return [("rest curvature", text, "", f"std {rest.std.mean():.2g} 1/m on average")]
 
 
