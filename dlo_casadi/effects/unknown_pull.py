@@ -21,7 +21,7 @@ class UnknownPull(Load):
     Parameters
     ----------
     fx, fy : scalar [N]
-        Mean over the poses; f_j is what each deviates from it.
+        Mean over the poses, at most ten weights; f_j is what each deviates from it.
     position : scalar [m], in [0, L]
     """
 
@@ -33,8 +33,8 @@ class UnknownPull(Load):
         length = cable.length
         scale = 9.81 * cable.mass
         return (
-            Parameter("fx", "N", scale=scale),
-            Parameter("fy", "N", scale=scale),
+            Parameter("fx", "N", scale=scale, lower=-10 * scale, upper=10 * scale),
+            Parameter("fy", "N", scale=scale, lower=-10 * scale, upper=10 * scale),
             Parameter(
                 "position", "m", nominal=length / 2, scale=0.1 * length, upper=length, lower=0.0
             ),
