@@ -1,0 +1,200 @@
+"""Write the C solver of a model: fill the templates."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi import __version__
+from dlo_casadi.codegen.kernels import Group, groups_of, kernels_to_c, table_of, table_to_c
+from dlo_casadi.codegen.prefix import check_prefix
+from dlo_casadi.codegen.program import c_number
+from dlo_casadi.codegen.split import Split
+from dlo_casadi.equilibrium import total_dead_load
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.floating]
+
+# Doubles of a workspace per slot; as in the template.
+_ARRAYS = 38
+
+
+@dataclass(frozen=True)
+class Solver:
+    """Text of a generated solver.
+
+    Parameters
+    ----------
+    prefix : str
+        Of all public names and of the files.
+    hash : str
+        SHA-256 of the model, its parameters and its rest curvature.
+    files : dict
+        File name -> text.
+    workspace : int
+        Number of doubles of a workspace.
+    """
+
+    prefix: str
+    hash: str
+    files: dict[str, str]
+    workspace: int
+
+    def write(self, folder: Path | str) -> list[Path]:
+        """Write all files into the folder, which is made if it is missing."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        written = []
+        for name, text in self.files.items():
+            path = folder / name
+            path.write_text(text, encoding="utf-8", newline="\n")
+            written.append(path)
+        return written
+
+
+def model_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
+    """SHA-256 of everything that decides the solver's numbers."""
+    content = {
+        "cable": [model.cable.length, model.cable.mass],
+        "mesh": [model.n, model.element],
+        "boundary": [model.start, model.end],
+        "gravity": list(map(float, model.gravity)),
+        "effects": [[type(effect).__name__, effect.label] for effect in model.effects],
+        "parameters": dict(zip(model.names, map(float, p), strict=True)),
+        "rest": list(map(float, rest)),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _extra(split: Split) -> list[float]:
+    """Numbers of the cable that no kernel holds, in the order of the template's macros."""
+    model = split.model
+    down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
+    bent = _resting(split)
+    chord = float(np.arctan2(np.sin(bent).mean(), np.cos(bent).mean()))
+    load = total_dead_load(model, split.p)
+    offset = split.offsets
+    return [split.length, down, chord, *load, *split.constant, *offset[2:6]]
+
+
+def _resting(split: Split) -> FloatArray:
+    """Headings (n_x,) of the cable at rest, counted from its start [rad]."""
+    chain = split.model.chain
+    cells = chain.cells
+    turn = np.concatenate([[0.0], np.cumsum(split.rest * np.diff(cells, axis=1).ravel())])
+    edges = np.concatenate([cells[:1, 0], cells[:, 1]])
+    inner = np.interp(chain.heading_places, edges, turn)
+    head = [0.0] * split.first
+    return np.concatenate([head, inner, [turn[-1]] * (split.n_x - split.first - split.n_phi)])
+
+
+def numbers_of(split: Split, groups: list[Group]) -> list[float]:
+    """The solver's table: rows of the kernels, widths of the cells, rest shape, the rest."""
+    return [
+        *table_of(groups, split.slots),
+        *split.inverse_widths,
+        *_resting(split),
+        *_extra(split),
+    ]
+
+
+def _values(split: Split, groups: list[Group], prefix: str, digest: str) -> dict[str, str]:
+    """What the templates' marks stand for."""
+    model = split.model
+    kernels, loops = kernels_to_c(groups, split.n_x, model.extensible)
+    rows = len(table_of(groups, split.slots))
+    clamped = {side: int(getattr(model, side) == "clamped") for side in ("start", "end")}
+    links = model.element == "link"
+    names = [effect.name for effect in model.effects]
+    return {
+        "FILE": f"{prefix}_solver",
+        "TITLE": model.cable.name.replace("*/", "* /"),
+        "VERSION": __version__,
+        "MODEL": f"{model.n} {model.element}s, start {model.start}, end {model.end}, effects: "
+        + (", ".join(names) or "none"),
+        "HASH": digest,
+        "N": str(model.n),
+        "N_HEADINGS": str(split.n_phi),
+        "HEADINGS_ARE": "of the links, element by element" if links else "at the nodes",
+        "LENGTH": c_number(split.length),
+        "START_CLAMPED": str(clamped["start"]),
+        "END_CLAMPED": str(clamped["end"]),
+        "END_FREE": str(int(model.end == "free")),
+        "WORKSPACE": str(_ARRAYS * (split.n_x + 1)),
+        "SLOTS": str(split.n_x),
+        "FIRST": str(split.first),
+        "LOW": str(clamped["start"]),
+        "HIGH": str(split.n_x - clamped["end"]),
+        "ELASTIC": str(int(model.extensible)),
+        "PLACE": "0.5" if links else "0.0",
+        "TABLE": table_to_c(numbers_of(split, groups)),
+        "WIDTHS": str(rows),
+        "RESTING": str(rows + split.n_x - 1),
+        "EXTRA": str(rows + 2 * split.n_x - 1),
+        "KERNELS": kernels,
+        "LOOPS": loops,
+    }
+
+
+def _template(name: str) -> str:
+    return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
+
+
+def fill(text: str, values: dict[str, str], prefix: str) -> str:
+    """Replace @MARKS@ and give public names their prefix."""
+    text = re.sub(r"\bdlo_(?!casadi)", f"{prefix}_", text)
+    text = re.sub(r"\bDLO_", f"{prefix.upper()}_", text)
+    return re.sub(r"@([A-Z_]+)@", lambda match: values[match.group(1)], text)
+
+
+def generate(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    prefix: str = "dlo",
+    *,
+    inline: bool = True,
+) -> Solver:
+    """Generate the C solver of a model.
+
+    Parameters
+    ----------
+    model : CableModel
+        Effects of the camera do not enter: the solver gives the true shape.
+    p : (n_parameters,)
+        In the order of `model.names`, SI units.
+    rest : (n_cells,) [1/m]
+        Rest curvature of the bending cells; of a drifting cable the latest.
+    prefix : str
+        Begins all public names: `<prefix>_solve`.
+    inline : bool
+        Whether numbers that all elements share are written into the code; otherwise all numbers
+        are in one table, and cables of one kind differ in it alone.
+
+    Raises
+    ------
+    DloError
+        If the prefix is not a C identifier or an effect cannot be generated.
+    """
+    check_prefix(prefix)
+    split = Split(model, p, rest)
+    groups = groups_of(split.slots, inline)
+    digest = model_hash(model, split.p, split.rest)
+    values = _values(split, groups, prefix, digest)
+    source = "".join(_template(name) for name in ("solver.c.in", "guesses.c.in", "interface.c.in"))
+    names = {
+        f"{prefix}_solver.h": "solver.h.in",
+        "CMakeLists.txt": "CMakeLists.txt.in",
+        f"{prefix}_solver.pc.in": "solver.pc.in",
+        "example.c": "example.c.in",
+    }
+    texts = {name: fill(_template(template), values, prefix) for name, template in names.items()}
+    texts[f"{prefix}_solver.c"] = fill(source, values, prefix)
+    return Solver(prefix, digest, texts, int(values["WORKSPACE"]))

@@ -1,0 +1,89 @@
+"""The compiled solver gives the shapes of equilibrium.py, for every effect of the cable."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.effects import EFFECTS, Cable, MeasurementEffect
+from dlo_casadi.equilibrium import Pose, solve_equilibrium
+from dlo_casadi.model import CableModel
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+
+CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
+ENDS = [(0.5, 0.1), (0.3, -0.5), (0.7, 0.05)]
+CLAMPS = (0.7, -0.6)
+# Values of parameters at which each effect is felt.
+VALUES = {
+    "lumped_mass": (0.05, 0.3),
+    "point_force": (0.3, -0.2, 0.5),
+    "side_load": (0.4,),
+    "gravity_tilt": (0.1,),
+    "stiffness_gradient": (0.3,),
+    "stiff_section": (0.3, 0.4, 3.0),
+    "bending_softening": (0.05,),
+    "axial_stretch": (1e-3,),
+    "length_error": (0.004,),
+    "start_spring": (0.1, 0.3),
+    "end_spring": (0.1, -0.3),
+    "clamp_angle": (0.1, -0.2),
+    "end_offset": (0.003, -0.002),
+    "rest_curvature_drift": (0.1,),
+}
+BOUNDARIES = [("pinned", "pinned"), ("clamped", "clamped"), ("clamped", "free")]
+
+
+def problem(names, element="arc", start="pinned", end="pinned", n=12):
+    """A curved cable with these effects."""
+    effects = tuple(EFFECTS[name]() for name in names)
+    model = CableModel(CABLE, n=n, element=element, start=start, end=end, effects=effects)
+    p = np.array([0.3, *(value for name in names for value in VALUES[name])])
+    rest = model.rest_basis @ np.random.default_rng(0).normal(size=model.rest_basis.shape[1])
+    return model, p, rest
+
+
+def difference(names, element, start, end):
+    """Largest distance of nodes of the compiled and the Python solution [m]."""
+    model, p, rest = problem(names, element, start, end)
+    solver = CompiledSolver(model, p, rest)
+    worst = 0.0
+    for place in ENDS:
+        pose = Pose(
+            (0.0, 0.0),
+            None if end == "free" else place,
+            CLAMPS[0] if start == "clamped" else None,
+            CLAMPS[1] if end == "clamped" else None,
+        )
+        expected = solve_equilibrium(model, p, rest, pose)
+        shape = solver.solve(place, headings=CLAMPS)
+        assert shape.energy <= expected.energy + 1e-9 * abs(expected.energy) + 1e-12
+        if shape.energy < expected.energy - 1e-7 * abs(expected.energy):
+            continue  # a better equilibrium
+        worst = max(worst, np.abs(shape.points - expected.points).max())
+        assert shape.energy == pytest.approx(expected.energy, rel=1e-7)
+        assert shape.lam == pytest.approx(expected.lam, rel=1e-6, abs=1e-6)
+        assert shape.lam_start == pytest.approx(expected.lam_start, rel=1e-6, abs=1e-6)
+        assert shape.min_bend_radius == pytest.approx(expected.min_bend_radius, rel=1e-5)
+        if element == "arc":
+            assert shape.moments == pytest.approx(expected.moments, rel=1e-6, abs=1e-6)
+    return worst
+
+
+def test_every_effect_of_the_cable_has_values():
+    of_the_cable = {n for n, e in EFFECTS.items() if not issubclass(e, MeasurementEffect)}
+    assert set(VALUES) == of_the_cable
+
+
+@pytest.mark.parametrize("name", [name for name in VALUES if name != "clamp_angle"])
+@pytest.mark.parametrize("element", ["link", "arc"])
+def test_effect(name, element):
+    assert difference([name], element, "pinned", "pinned") < 1e-8
+
+
+@pytest.mark.parametrize(("start", "end"), BOUNDARIES)
+@pytest.mark.parametrize("element", ["link", "arc"])
+def test_all_effects_together(element, start, end):
+    names = [n for n in VALUES if n != "clamp_angle" or (start, end) == ("clamped", "clamped")]
+    assert difference(names, element, start, end) < 1e-8
