@@ -115,7 +115,10 @@ def extract_centerline(
         min(1.0, seen / length),
         gaps,
         float(np.clip(trace.sound.sum() / max(1, trace.inside.sum()), 0.0, 1.0)),
-        _messages(trace, kept, gaps, seen, first, last, length),
+        (
+            *_messages(trace, kept, gaps, seen, first, last, length),
+            *_width_message(trace.width, diameter, 1.0 / view.scale),
+        ),
     )
 
 
@@ -140,6 +143,16 @@ def _check_fixtures(
                 f"({fixture[0]:.3f}, {fixture[1]:.3f}) m, at ({tip[0]:.3f}, {tip[1]:.3f}) m. "
                 f"Try: {name} in metres and in the board frame? Is the cable hidden there?"
             )
+
+
+def _width_message(width: float, diameter: float, pixel: float) -> tuple[str, ...]:
+    """Warn of a line that is much wider or thinner than the cable."""
+    if abs(width - diameter) < 0.3 * diameter + pixel:
+        return ()
+    return (
+        f"the line is {1e3 * width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm: "
+        "check the diameter, and whether a shadow was taken for the cable",
+    )
 
 
 def _messages(

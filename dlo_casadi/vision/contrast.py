@@ -85,10 +85,11 @@ def thresholds(values: NDArray[np.float32], area_px: float) -> tuple[float, ...]
     """Levels at which to cut the values of a candidate picture, from the area of a cable.
 
     The level P is exceeded by 0.4 of the cable's area, and so is typical of its core: its rim lies
-    near P / 2. A lower cut recovers a cable beside stronger objects.
+    near P / 2. A higher cut parts it from a deep shadow, a lower one recovers a cable beside
+    stronger objects.
     """
     core = _upper_level(values, 0.4 * area_px)
-    cuts = (0.5 * core, 0.3 * core)
+    cuts = (0.5 * core, 0.75 * core, 0.3 * core)
     return tuple(max(cut, _SIGNIFICANT) for cut in cuts if core > _SIGNIFICANT)
 
 

@@ -41,22 +41,31 @@ class Chain:
 
 
 def order_strands(
-    strands: list[Array], *, start: Array, end: Array | None, diameter: float, length: float
+    strands: list[Array],
+    widths: list[float],
+    *,
+    start: Array,
+    end: Array | None,
+    diameter: float,
+    length: float,
 ) -> Chain | None:
     """Find the chain of strands that explains a cable of known length best.
 
     The cost of a chain, in metres,
 
-        J = -seen + gaps + sum_links d (4 a^2 + 2 b^2)
+        J = -sum_strands seen (1 - p) + gaps + sum_links d (4 a^2 + 2 b^2)
             + 0.5 L (max(0, |total / L - 1| - 0.02) / 0.05)^2
 
-    prefers long seen stretches, short gaps, and links that go on in the direction of the strand:
-    a is the difference of the turns into and out of the gap (0 on a circle), b the whole turn.
+    prefers long seen stretches of the right width, short gaps, and links that go on in the
+    direction of the strand: a is the difference of the turns into and out of the gap (0 on a
+    circle), b the whole turn, p = 0.8 max(0, |log(width / d)| - 0.25), at most 1/2.
 
     Parameters
     ----------
     strands : list of (K, 2) [m]
         Unbranched lines.
+    widths : list of scalar
+        Their widths, relative to the cable's.
     start, end : (2,) [m]
         The fixtures; `end` is None for a free end.
     diameter, length : scalar [m]
@@ -70,12 +79,14 @@ def order_strands(
     last = np.array([way[-1] for way in ways])
     inwards = np.array([_tangent(way, diameter) for way in ways])
     outwards = np.array([-_tangent(way[::-1], diameter) for way in ways])
+    excess = np.abs(np.log(np.repeat(widths, 2))) - 0.25
+    worth = seen * (1 - np.clip(0.8 * excess, 0.0, 0.5))
     gap, link = _links(last, outwards, first, inwards, diameter)
 
     to_first = np.linalg.norm(first - start, axis=1)
     to_end = np.zeros(len(ways)) if end is None else np.linalg.norm(last - end, axis=1)
     states: list[_State] = [
-        (float(to_first[w] - seen[w]), (w,), float(seen[w]), float(seen[w] + to_first[w]))
+        (float(to_first[w] - worth[w]), (w,), float(seen[w]), float(seen[w] + to_first[w]))
         for w in range(len(ways))
         if to_first[w] < 0.6 * length
     ]
@@ -95,7 +106,7 @@ def order_strands(
             for w in np.nonzero(usable)[0]:
                 if any(w // 2 == p // 2 for p in path):
                     continue
-                step = float(link[tip, w] - seen[w])
+                step = float(link[tip, w] - worth[w])
                 following.append(
                     (cost + step, (*path, int(w)), supported + float(seen[w]), float(reach[w]))
                 )

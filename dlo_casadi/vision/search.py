@@ -25,7 +25,7 @@ _TWIN_CONTRAST = 0.6  # ... if they stand out as well, relative to the cable
 
 @dataclass(frozen=True)
 class _Line:
-    """A strand in metres, its width in pixels, and how much it stands out."""
+    """A strand in metres, its width relative to the cable's, and how much it stands out."""
 
     points: Array
     width: float
@@ -74,6 +74,7 @@ def find_cable(
             longest = max([longest, *(line.length for line in lines)])
             chain = order_strands(
                 [line.points for line in lines],
+                [line.width for line in lines],
                 start=start,
                 end=end,
                 diameter=diameter,
@@ -122,7 +123,7 @@ def _lines(
             if margin <= nearest < len(points) - margin and away[nearest] < diameter:
                 cuts.append(nearest)
         parts = [points[a:b] for a, b in pairwise(sorted(cuts))]
-        lines += [_Line(part, strand.width, level) for part in parts if len(part) > 2]
+        lines += [_Line(part, strand.width / width_px, level) for part in parts if len(part) > 2]
     return lines
 
 
