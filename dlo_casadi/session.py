@@ -14,6 +14,7 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.declared import Declared, declared_model, straight
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.diagnosis.repeatability import alike, repeatability
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.batch import solve_batch
@@ -35,6 +36,8 @@ MESH_SHARE = 0.1
 FINEST_MESH = 160
 # The search for missing effects, a hundred refits, runs on at most so many elements.
 SEARCH_MESH = 80
+# Poses that repeat worse than this many times the noise get a warning.
+REPEATS = 1.5
 # Huber's constant: points beyond it count with their distance instead of its square.
 HUBER = 1.5
 
@@ -228,7 +231,8 @@ def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float
             error = discretization_error(fit)
         except EstimationError:
             error = np.inf
-        if error <= MESH_SHARE * max(fit.noise.std, fit.residual_rms) or n >= FINEST_MESH:
+        largest = FINEST_MESH if np.isfinite(error) else SEARCH_MESH
+        if error <= MESH_SHARE * max(fit.noise.std, fit.residual_rms) or n >= largest:
             return fit, error
         n *= 2
 
@@ -339,6 +343,16 @@ def _reading_warnings(inputs: Sequence[PoseInput]) -> list[str]:
 
 def _fit_warnings(fit: Fit, error: float) -> list[str]:
     lines = []
+    spread = repeatability(fit.problem.measured, fit.model.cable.length)
+    if spread is not None and spread > REPEATS * fit.noise.std:
+        lines.append(
+            f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
+            f"others), the noise is {1e3 * fit.noise.std:.2g} mm: repeatability limits any "
+            "prediction, and intervals from this session are too narrow"
+        )
+        lines += [
+            f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
+        ]
     if not fit.converged:
         lines.append("the batch fit stopped before it had converged")
     unstable = [

@@ -28,6 +28,7 @@ FloatArray = NDArray[np.floating]
 
 # Decades about the prior stiffness from which fits are started.
 DECADES = (0, -1, 1, -2, 2, -3, 3)
+BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
 # Slow displacements per pose that are kept out of the noise estimate: many while an effect may
 # be missing, few once the model is taken as complete, because noise is slow, too.
 SMOOTH_MODES = 5
@@ -175,7 +176,7 @@ def settle(fit: Fit) -> Fit:
 
 
 def starting_points(
-    problem: BatchProblem, theta: FloatArray, decades: Sequence[int] = DECADES
+    problem: BatchProblem, theta: FloatArray, decades: Sequence[float] = DECADES
 ) -> list[Point]:
     """Equilibria near the measured shapes for stiffnesses over decades, best first."""
     shapes, feet = measured_shapes(problem)
@@ -306,7 +307,7 @@ def fit_model(
     free: Sequence[str] | None = None,
     values: FloatArray | None = None,
     start: Fit | None = None,
-    decades: Sequence[int] = DECADES,
+    decades: Sequence[float] = DECADES,
     max_iterations: int = 40,
 ) -> Fit:
     """Fit a model to all readable fit poses.
@@ -352,7 +353,9 @@ def fit_model(
         scatter = SCATTER_FLOOR * scatter
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.rest.n_coefficients))
-    points = starting_points(problem, theta, decades)
+    points = starting_points(problem, theta, decades) or starting_points(
+        problem, theta, BETWEEN_DECADES
+    )
     if not points:
         raise EstimationError(
             f"no stiffness within {max(decades)} decades of {model.cable.bending_stiffness:.3g} "

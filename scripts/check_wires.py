@@ -1,0 +1,69 @@
+"""Real wires, every trial left out once: prediction of the next hanging beside how it repeats.
+
+    python scripts/check_wires.py [black_wire white_wire]
+
+The wires were measured by Chen, Bretl and Pham (see configs/real/); each hangs in the same pose
+five times. The floor is the mean of the other trials as predictor.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from dlo_casadi.config import load_config
+from dlo_casadi.estimation.observation import chord_places
+from dlo_casadi.measure import read_poses
+from dlo_casadi.session import run_session
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def floor(measured, k: int, length: float) -> float:
+    """RMS distance of trial k from the mean of the others [m]."""
+    grid = np.linspace(0.0, 1.0, 101) * length
+    curves = []
+    for item in measured:
+        places = np.maximum.accumulate(chord_places(item, length))
+        curves.append(np.stack([np.interp(grid, places, item.points[:, i]) for i in (0, 1)], 1))
+    mean = np.mean([curve for i, curve in enumerate(curves) if i != k], axis=0)
+    gap = measured[k].points[:, None] - mean[None]
+    return float(np.sqrt((gap**2).sum(-1).min(axis=1).mean()))
+
+
+def main() -> None:
+    """Leave each trial out, print the errors of the stages."""
+    for name in sys.argv[1:] or ["white_wire", "black_wire"]:
+        config = load_config(ROOT / "configs" / f"{name}.yaml")
+        _, measured = read_poses(config, lambda *_: None)
+        table = []
+        for k in range(len(measured)):
+            poses = tuple(
+                pose.model_copy(update={"role": "held_out" if i == k else "fit"})
+                for i, pose in enumerate(config.experiment.poses)
+            )
+            experiment = config.experiment.model_copy(update={"poses": poses})
+            outcome = run_session(replace(config, experiment=experiment))
+            row = {"floor": floor(measured, k, config.cable.length)}
+            for stage in outcome.stages:
+                row[stage.name] = stage.rmse_held_out
+            row.setdefault("closed", row["batch"])
+            table.append(row)
+            effects = ",".join(effect["name"] for effect in outcome.effects) or "-"
+            cells = "  ".join(
+                f"{key} {1e3 * value:6.2f}" for key, value in row.items() if value is not None
+            )
+            print(f"{name} trial {k} left out [mm]: {cells}  effects {effects}", flush=True)
+        for key in ("floor", "stiffness_only", "batch", "closed"):
+            values = [row[key] for row in table if row[key] is not None]
+            print(f"{name} mean {key}: {1e3 * np.mean(values):.2f} mm", flush=True)
+
+
+if __name__ == "__main__":
+    main()
