@@ -209,7 +209,7 @@ def _plain_numbers(argv: Sequence[str]) -> list[str]:
 
 def _console(quiet: bool = False) -> Console:
     """Where results go; a file or a pipe has room for a whole table."""
-    width = None if sys.stdout.isatty() else 110
+    width = None if sys.stdout.isatty() else 120
     return Console(quiet=quiet, highlight=False, width=width)
 
 

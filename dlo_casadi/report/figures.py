@@ -210,14 +210,16 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
     """Normal distance of the measured points from the prediction along the arc, in noise units."""
     before, after = before_after(outcome)
     stages = [stage for stage in (before, after) if stage is not None]
-    roles = {pose.name: pose.role for pose in outcome.poses}
     with figure(path, (8.5, 0.9 + 2.7 * len(stages))) as drawing:
         grid = drawing.subplots(len(stages), 1, squeeze=False, sharex=True)
         for axes, stage in zip(grid[:, 0], stages, strict=True):
             axes.axhspan(-2, 2, color="#EDEDED", zorder=0)
             axes.axhline(0, color=GREY, lw=0.8)
-            for name, shape in stage.shapes.items():
-                held_out = roles[name] == "held_out"
+            for pose in outcome.poses:
+                shape = stage.shapes.get(pose.name)
+                if shape is None:
+                    continue
+                held_out = pose.role == "held_out"
                 axes.plot(
                     shape.s,
                     shape.residual,

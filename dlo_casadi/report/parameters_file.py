@@ -134,7 +134,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
         }
     if config.cable.youngs_modulus is not None:
         document["cable"]["youngs_modulus"] = config.cable.youngs_modulus
-    document["fixtures"] = _shared_fixtures(config)
+    document["fixtures"] = shared_fixtures(config)
     document["model_hash"] = model_hash(document)
     document["config"] = config.name
     document["config_hash"] = _file_hash(config.path)
@@ -227,7 +227,7 @@ def _effect_row(effect: Effect) -> dict[str, Any]:
     return {"name": effect.name, "label": effect.label, **options}
 
 
-def _shared_fixtures(config: Config) -> dict[str, Any]:
+def shared_fixtures(config: Config) -> dict[str, Any]:
     """What all poses share of their start and headings."""
     shared: dict[str, Any] = {}
     for key in ("start", "start_heading", "end_heading"):

@@ -73,7 +73,7 @@ def parameter_table(outcome: Outcome) -> Table:
     """Fitted parameters of the last stage with their units, and what was kept fixed."""
     table = _table(f"Parameters ({label_of(outcome.stages[-1], outcome)})")
     for column in ("parameter", "value", "95 % interval", ""):
-        table.add_column(column, no_wrap=True)
+        table.add_column(column, no_wrap=bool(column))
     for name, estimate in outcome.stages[-1].parameters.items():
         table.add_row(name, *describe(estimate))
     for row in _rest_rows(outcome.stages[-1], outcome):

@@ -1,0 +1,16 @@
+"""One small session, run once, that all tests of the report look at."""
+
+import os
+
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")  # before numpy: the matrices are small
+
+import pytest  # noqa: E402
+from small_sessions import small  # noqa: E402
+
+from dlo_casadi.session import run_session  # noqa: E402
+
+
+@pytest.fixture(scope="session")
+def outcome():
+    return run_session(small("short_clean"))

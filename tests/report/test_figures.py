@@ -1,0 +1,167 @@
+"""Figures are drawn for what an outcome holds, and show what they should."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from dlo_casadi.outcome import PoseInput
+from dlo_casadi.report import figures, overlay
+from dlo_casadi.report.canvas import before_after, label_of
+from dlo_casadi.report.drawing import draw_prediction
+
+PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"
+CANDIDATES = (
+    {"name": "lumped_mass", "score": 700.0, "p_value": 0.0, "rmse_cross_validated": 1e-4},
+    {"name": "point_force", "score": 690.0, "p_value": 0.0, "rmse_cross_validated": 1.1e-4},
+    {"name": "end_offset", "score": 0.0, "p_value": 1.0, "rmse_cross_validated": None},
+)
+EFFECT = {
+    "name": "lumped_mass",
+    "parameters": {"mass": {"value": 0.05, "std": 0.002, "unit": "kg"}},
+    "p_value": 1e-9,
+    "rmse_cross_validated_before": 5e-4,
+    "rmse_cross_validated_after": 1e-4,
+    "indistinguishable_from": ["point_force"],
+}
+LOAD = {
+    "force": [0.0, 1.0],
+    "force_per_pose": [[0.0, 1.0], [0.1, 1.1]],
+    "poses": ["pose_01", "pose_02"],
+    "position": 0.3,
+    "interval_95": [0.28, 0.32],
+}
+
+
+@pytest.fixture
+def closed(outcome):
+    """The outcome with an effect added: its last stage once more, closer to the points."""
+    batch = outcome.stage("batch")
+    stage = replace(batch, name="closed")
+    return replace(
+        outcome,
+        stages=(*outcome.stages, stage),
+        effects=(EFFECT,),
+        candidates=CANDIDATES,
+        verdict="effect_found",
+    )
+
+
+def drawn(path):
+    """Size of a picture, and the share of its pixels that are not paper."""
+    image = imread(path)[..., :3]
+    if image.dtype == np.uint8:
+        image = image / 255
+    return image.shape[:2], float((image.min(axis=2) < 0.9).mean())
+
+
+def test_an_outcome_without_effects(outcome, tmp_path):
+    figures.write_figures(tmp_path, outcome)
+
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"poses.png", "residuals.png", "rest_curvature.png", "errors.png"}
+    for path in tmp_path.iterdir():
+        (height, width), ink = drawn(path)
+        assert min(height, width) >= 500, path.name
+        assert ink > 0.01, path.name
+
+
+def test_candidates_and_the_unexplained_load_are_drawn(closed, tmp_path):
+    figures.draw_candidates(tmp_path / "candidates.png", closed)
+    unexplained = replace(closed, verdict="unexplained", unexplained=LOAD)
+    figures.draw_unexplained(tmp_path / "unexplained.png", unexplained)
+
+    assert drawn(tmp_path / "candidates.png")[1] > 0.02
+    assert drawn(tmp_path / "unexplained.png")[1] > 0.01
+
+
+def test_what_is_compared(outcome, closed):
+    before, after = before_after(outcome)
+    assert (before.name, after.name) == ("initial", "batch")
+    before, after = before_after(closed)
+    assert (before.name, after.name) == ("batch", "closed")
+    assert label_of(after, closed) == "with lumped_mass"
+
+
+def test_nothing_is_drawn_of_what_is_missing(outcome, tmp_path):
+    """A pose that could not be read, and stages without a prediction."""
+    lost = replace(outcome.poses[0], points=np.zeros((0, 2)), problem="no cable")
+    empty = replace(outcome.stages[0], rmse_fit=None, rmse_held_out=None, shapes={})
+    half = replace(outcome, poses=(lost, *outcome.poses[1:3]), stages=(empty, *outcome.stages[1:]))
+    figures.draw_poses(tmp_path, half)
+    figures.draw_residuals(tmp_path / "residuals.png", half)
+    figures.draw_errors(tmp_path / "errors.png", half)
+
+    assert (tmp_path / "poses.png").exists()
+
+
+def test_many_poses_take_several_pages(outcome, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "_POSES_A_PAGE", 8)
+    figures.draw_poses(tmp_path, outcome)
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["poses_1.png", "poses_2.png"]
+
+
+@pytest.mark.parametrize(
+    ("count", "grid"), [(1, (1, 1)), (4, (1, 4)), (6, (2, 3)), (12, (3, 4)), (18, (3, 6))]
+)
+def test_poses_fill_a_grid(count, grid):
+    assert figures._arranged(count) == grid
+
+
+def test_magnified_deviations_are_multiples_of_the_true_ones(outcome):
+    """Of a curve magnified k times, the points are k times as far away as of the curve."""
+    pose, std = outcome.poses[0], outcome.measurement.std
+    shape = outcome.stage("initial").shapes[pose.name]
+
+    distance = [
+        np.hypot(*(pose.points - figures._magnified(pose, shape, std, k)).T) for k in (5, 10)
+    ]
+    assert distance[1] == pytest.approx(2 * distance[0])
+    # Normals of 201 drawn points: exact to a thousandth.
+    assert distance[0] == pytest.approx(5 * std * np.abs(shape.residual), rel=1e-3)
+
+
+def test_lines_are_drawn_over_the_part_of_a_photograph_with_the_cable(outcome, tmp_path):
+    """The picture of a line along known pixels is cut out about them."""
+    pixels = np.stack([np.linspace(430, 700, 50), np.full(50, 200.0)], axis=1)
+
+    def to_pixels(points):
+        return np.asarray(points) * [500.0, 0.0] + [430.0, 200.0]
+
+    photographed = PoseInput("pose_01", "fit", outcome.poses[0].points, PHOTO, pixels, to_pixels)
+    shown = replace(outcome, poses=(photographed,))
+    overlay.write_overlays(tmp_path / "overlays", shown)
+
+    (height, width), _ = drawn(tmp_path / "overlays" / "pose_01.jpg")
+    assert width <= 1200
+    assert height < 0.5 * width  # a flat line: a flat window, not the whole photograph
+    before = imread(PHOTO)
+    assert before.shape[0] > 0.5 * before.shape[1]
+
+
+def test_a_photograph_that_is_gone_is_left_out(outcome, tmp_path):
+    gone = replace(outcome.poses[0], image=tmp_path / "gone.jpg", to_pixels=lambda x: x)
+    overlay.write_overlays(tmp_path / "overlays", replace(outcome, poses=(gone,)))
+
+    assert list((tmp_path / "overlays").iterdir()) == []
+
+
+@pytest.mark.parametrize("end", [None, [0.4, -0.1]])
+def test_a_prediction_is_drawn(tmp_path, end):
+    points = np.stack([np.linspace(0, 0.4, 21), -0.25 * np.linspace(0, 1, 21)], axis=1)
+    shape = {
+        "cable": "rope",
+        "points": points.tolist(),
+        "end": end,
+        "force_on_start": [0.0, -1.0],
+        "force_on_end": [0.0, 0.0],
+        "energy": 1.0,
+        "min_bend_radius": 0.1,
+        "stable": end is None,
+    }
+    draw_prediction(tmp_path / "shape.png", shape)
+
+    assert drawn(tmp_path / "shape.png")[1] > 0.005

@@ -1,0 +1,140 @@
+"""report.json holds every key of its schema, and no number that JSON does not know."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dlo_casadi.outcome import ParameterEstimate, RestCurvatureEstimate, Stage
+from dlo_casadi.report.json_report import all_warnings, finite, report_dict, report_text
+
+KEYS = {
+    "schema": str,
+    "config": str,
+    "versions": dict,
+    "warnings": list,
+    "timing_s": dict,
+    "measurement": dict,
+    "stages": list,
+    "discretization": dict,
+    "effects": list,
+    "candidates": list,
+    "verdict": str,
+    "unexplained": type(None),
+    "next_pose": type(None),
+}
+
+
+def strict(text):
+    """JSON without the extensions NaN and Infinity."""
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def stage(name, value=math.nan, **changes):
+    rest = RestCurvatureEstimate(np.array([0.0, 1.0]), np.array([1.0, math.nan]), np.zeros(2))
+    estimate = ParameterEstimate(value, math.inf, "N m^2", (None, 3.0), False)
+    full = Stage(name, 1e-3, math.inf, None, {"bending_stiffness": estimate}, rest, {})
+    return replace(full, **changes)
+
+
+def test_every_key_of_the_schema_is_there(outcome):
+    report = strict(report_text(outcome))
+
+    assert {key: type(value) for key, value in report.items()} == KEYS
+    assert report["schema"] == "dlo-report/1"
+    assert set(report["timing_s"]) == {"vision", "algorithm1", "batch", "diagnosis", "total"}
+    assert set(report["measurement"]) == {
+        "kind",
+        "poses_fit",
+        "poses_held_out",
+        "points",
+        "std",
+        "std_source",
+        "correlation_length_m",
+    }
+    assert set(report["discretization"]) == {"n", "element", "error_m"}
+    names = ["initial", "stiffness_only", "algorithm1", "batch"]
+    assert [entry["name"] for entry in report["stages"]] == names
+    for entry in report["stages"]:
+        assert set(entry) == {"name", "rmse_fit", "rmse_held_out", "chi2_per_dof", "parameters"}
+        stiffness = entry["parameters"]["bending_stiffness"]
+        assert {"value", "std", "interval_95", "identifiable"} <= set(stiffness)
+        assert set(entry["parameters"]["rest_curvature"]) == {"s", "value", "std"}
+
+
+def test_the_numbers_are_those_of_the_outcome(outcome):
+    report = strict(report_text(outcome))
+    batch, found = report["stages"][-1], outcome.stage("batch")
+
+    assert batch["rmse_held_out"] == found.rmse_held_out
+    assert batch["parameters"]["bending_stiffness"]["value"] == outcome.fit.p[0]
+    low, high = batch["parameters"]["bending_stiffness"]["interval_95"]
+    assert low < outcome.fit.p[0] < high
+    assert batch["parameters"]["rest_curvature"]["value"] == found.rest_curvature.value.tolist()
+
+
+def test_a_stage_that_did_not_run_is_null_with_a_warning(outcome):
+    report = report_dict(outcome)
+    algorithm1 = report["stages"][2]
+
+    assert algorithm1["rmse_fit"] is None
+    assert algorithm1["rmse_held_out"] is None
+    assert algorithm1["parameters"]["bending_stiffness"]["value"] is None
+    assert algorithm1["parameters"]["rest_curvature"] == {"s": [], "value": [], "std": []}
+    assert "stage algorithm1: switched off" in report["warnings"]
+
+
+def test_missing_stages_are_present(outcome):
+    report = report_dict(replace(outcome, stages=(stage("batch"),)))
+
+    assert [entry["name"] for entry in report["stages"]][:2] == ["initial", "stiffness_only"]
+    assert report["stages"][0]["rmse_fit"] is None
+    assert "stage initial did not run" in report["warnings"]
+
+
+def test_the_closed_stage_is_there_only_with_an_effect(outcome):
+    closed = replace(outcome, stages=(*outcome.stages, stage("closed")))
+
+    assert report_dict(closed)["stages"][-1]["name"] == "closed"
+    assert report_dict(outcome)["stages"][-1]["name"] == "batch"
+
+
+def test_nan_and_infinity_become_null(outcome):
+    report = strict(report_text(replace(outcome, stages=(stage("batch"),))))
+    batch = report["stages"][-1]
+
+    assert batch["rmse_held_out"] is None
+    assert batch["parameters"]["bending_stiffness"]["value"] is None
+    assert batch["parameters"]["bending_stiffness"]["std"] is None
+    assert batch["parameters"]["bending_stiffness"]["interval_95"] == [None, 3.0]
+    assert batch["parameters"]["rest_curvature"]["value"] == [1.0, None]
+
+
+@pytest.mark.parametrize(
+    ("value", "plain"),
+    [
+        (np.float64(2.5), 2.5),
+        (np.float64("nan"), None),
+        (np.int64(3), 3),
+        (np.bool_(True), True),
+        (np.array([[1.0, np.inf]]), [[1.0, None]]),
+        ((1, "a", None), [1, "a", None]),
+    ],
+)
+def test_numpy_becomes_plain(value, plain):
+    assert finite(value) == plain
+    assert type(finite(value)) is type(plain)
+
+
+def test_a_parameter_on_its_bound_is_a_warning(outcome):
+    estimate = ParameterEstimate(0.0, 0.1, "kg", at_bound=True)
+    last = replace(outcome.stage("batch"), parameters={"lumped_mass.mass": estimate})
+
+    lines = all_warnings(replace(outcome, stages=(*outcome.stages[:-1], last)))
+    assert "lumped_mass.mass sits on a bound of what physics permits: 0 kg" in lines

@@ -1,0 +1,201 @@
+"""parameters.yaml rebuilds the model exactly, and says what is wrong with a damaged file."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_sessions import BENCH, small
+
+from dlo_casadi.config import dump_yaml, load_config, read_yaml
+from dlo_casadi.declared import declared_model
+from dlo_casadi.effects import ImageDistortion, RestCurvatureDrift
+from dlo_casadi.errors import ConfigError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.measure import read_poses
+from dlo_casadi.predict import predict
+from dlo_casadi.report.parameters_file import (
+    covariance_si,
+    final_rest,
+    fit_dict,
+    load_parameters,
+    model_hash,
+    parameters_text,
+)
+
+
+@pytest.fixture(scope="module")
+def file(outcome, tmp_path_factory):
+    path = tmp_path_factory.mktemp("results") / "parameters.yaml"
+    path.write_text(parameters_text(outcome))
+    return path
+
+
+def fitted(name, *effects, n=20):
+    """A quick fit of a bench session with more effects than declared."""
+    config = load_config(BENCH / name / "session.yaml")
+    _, measured = read_poses(config, lambda *_: None)
+    declared = declared_model(config)
+    model = declared.model.with_mesh(n)
+    for effect in effects:
+        model = model.with_effect(effect)
+    return fit_model(model, measured, declared.tolerances, 3e-4, decades=(0,)), measured
+
+
+def as_file(fit, outcome, path):
+    path.write_text(parameters_text(replace(outcome, fit=fit)))
+    return path
+
+
+def test_prediction_from_the_file_equals_prediction_from_the_fit(outcome, file):
+    model, p, rest, _ = load_parameters(file)
+    fit = outcome.fit
+    poses = [item.pose for item in fit.problem.measured]
+
+    ours = predict_poses(model, p, rest, poses)
+    theirs = predict_poses(fit.model, fit.p, fit.rest, poses)
+    gap = max(
+        np.abs(a.curve.nodes - b.curve.nodes).max() for a, b in zip(ours, theirs, strict=True)
+    )
+    assert gap < 1e-10
+
+
+def test_the_model_is_rebuilt_exactly(outcome, file):
+    model, p, rest, metadata = load_parameters(file)
+
+    assert model == outcome.fit.model
+    assert np.array_equal(p, outcome.fit.p)
+    assert np.array_equal(rest, outcome.fit.rest)
+    assert np.array_equal(metadata.coefficients, outcome.fit.coefficients)
+    assert not metadata.edited
+    assert metadata.identifiable is True
+    assert metadata.config == "session"
+    assert metadata.fixtures["start"] == [0.0, 0.0]
+
+
+def test_equal_results_give_equal_bytes(outcome):
+    assert parameters_text(outcome) == parameters_text(outcome)
+
+
+def test_a_folder_of_results_will_do(file):
+    assert load_parameters(file.parent).metadata.path == file
+
+
+def test_covariance_is_in_si_units(outcome, file):
+    metadata, fit = load_parameters(file).metadata, outcome.fit
+
+    assert metadata.names == fit.problem.unknowns.names
+    for name in fit.model.names:
+        k = metadata.names.index(name)
+        assert np.sqrt(metadata.covariance[k, k]) == pytest.approx(fit.std(name), rel=1e-12)
+    rest = metadata.names.index("rest_curvature[3]")
+    curvature = outcome.stage("batch").rest_curvature
+    # B-splines are positive and sum to one: a curve's std is of the size of its coefficients'.
+    assert np.sqrt(metadata.covariance[rest, rest]) < 20 * curvature.std.max()
+    _, covariance = covariance_si(fit)
+    assert np.array_equal(covariance, covariance.T)
+
+
+def test_the_fitted_stiffness_agrees_with_the_bench_truth(file):
+    truth = read_yaml(BENCH.parent / "bench_truth" / "short_clean" / "truth.yaml")
+    low, high = load_parameters(file).metadata.interval_95
+    stiffness = truth["bending_stiffness"]
+
+    assert low < stiffness < high
+
+
+def test_effects_keep_what_they_were_made_with(outcome, tmp_path):
+    """A clamped start, a free end, a straight cable, a camera with a centre of its own."""
+    fit, measured = fitted("overhang", ImageDistortion(center=(0.2, -0.05)))
+    path = as_file(fit, outcome, tmp_path / "parameters.yaml")
+
+    model, p, rest, metadata = load_parameters(path)
+    assert model == fit.model
+    assert model.effects[-1].center == (0.2, -0.05)
+    assert not metadata.edited
+
+    pose = measured[0].pose
+    (ours,) = predict_poses(model, p, rest, [pose])
+    (theirs,) = predict_poses(fit.model, fit.p, fit.rest, [pose])
+    assert np.abs(ours.curve.nodes - theirs.curve.nodes).max() < 1e-10
+    shape = predict(path, start_heading=pose.start_heading)
+    assert np.abs(shape.seen.nodes - ours.curve.nodes).max() < 1e-10
+
+
+def test_the_next_pose_finds_the_cable_as_the_last_one_left_it(outcome, tmp_path):
+    fit, measured = fitted("drift", RestCurvatureDrift())
+    rest = load_parameters(as_file(fit, outcome, tmp_path / "parameters.yaml")).rest
+
+    # The second route: pose by pose, kappa_0 += rate (kappa - kappa_0), from the fitted shapes.
+    rate, expected = fit.value("rest_curvature_drift.rate"), fit.rest
+    shapes = fit.point.shapes
+    for j, item in enumerate(measured):
+        kappa = fit.model.strain(shapes.phi[j], item.pose.vector, shapes.deviation[j], fit.p)
+        expected = expected + rate * (np.array(kappa).ravel() - expected)
+    assert rate > 0.005
+    assert np.abs(expected - fit.rest).max() > 0.01
+    assert rest == pytest.approx(expected, abs=1e-9)
+    assert np.array_equal(rest, final_rest(fit))
+
+
+def test_the_hash_depends_on_the_model_alone(outcome):
+    document = fit_dict(outcome.fit)
+    before = model_hash(document)
+
+    document["parameters"]["bending_stiffness"]["std"] = 99.0
+    document["n"] = 20.0
+    assert model_hash(document) == before
+    document["parameters"]["bending_stiffness"]["value"] *= 1 + 1e-12
+    assert model_hash(document) != before
+
+
+def test_a_file_changed_by_hand_is_noticed(file, tmp_path):
+    document = read_yaml(file)
+    document["parameters"]["bending_stiffness"]["value"] *= 2
+    edited = tmp_path / "parameters.yaml"
+    edited.write_text(dump_yaml(document))
+
+    assert load_parameters(edited).metadata.edited
+
+
+def damaged(file, tmp_path, change):
+    document = read_yaml(file)
+    change(document)
+    path = tmp_path / "parameters.yaml"
+    path.write_text(dump_yaml(document))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.update(schema="other/1"), "schema 'dlo-parameters/1' expected, 'other/1'"),
+        (lambda d: d.pop("cable"), "cable is missing"),
+        (lambda d: d["cable"].update(length=-1.0), "cable.length must be a positive number"),
+        (lambda d: d["cable"].update(length="long"), "cable.length must be a positive number"),
+        (lambda d: d.update(element="beam"), "element must be arc or link, found 'beam'"),
+        (lambda d: d["boundary"].update(end="glued"), "boundary.end must be pinned or clamped"),
+        (lambda d: d["effects"].append({"name": "magic", "label": "x"}), "called 'magic'"),
+        (lambda d: d["effects"].pop(), "do not belong together: end_offset.dx, end_offset.dy"),
+        (lambda d: d["state"]["rest_curvature"].pop(), "20 numbers belong here, found 19"),
+        (lambda d: d["parameters"]["end_offset.dx"].update(value=None), "must be finite"),
+    ],
+)
+def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
+    path = damaged(file, tmp_path, change)
+
+    with pytest.raises(ConfigError, match=re.escape(message)) as caught:
+        load_parameters(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_file_is_a_clear_error(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        load_parameters(tmp_path / "parameters.yaml")
+
+
+def test_a_configuration_is_no_parameter_file():
+    with pytest.raises(ConfigError, match=r"the parameters\.yaml in the results folder of a fit"):
+        load_parameters(Path(small("short_clean").path))

@@ -1,0 +1,124 @@
+"""What the terminal says, word for word where it matters."""
+
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+from test_figures import EFFECT, LOAD
+
+from dlo_casadi.outcome import ParameterEstimate
+from dlo_casadi.report.terminal import describe, plus_minus, print_summary, unidentified
+
+
+def said(outcome):
+    """The summary as text, spaces collapsed."""
+    console = Console(width=120, record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.file:
+        print_summary(console, outcome)
+        return " ".join(console.export_text().split())
+
+
+def with_stiffness(outcome, interval):
+    estimate = ParameterEstimate(17.0, 30.0, "N m^2", interval, identifiable=False)
+    batch = replace(outcome.stage("batch"), parameters={"bending_stiffness": estimate})
+    return replace(outcome, stages=(*outcome.stages[:-1], batch))
+
+
+def test_a_summary_tells_units_what_was_fixed_and_the_noise(outcome):
+    text = said(outcome)
+
+    assert "9 fit poses, 3 held out, 2400 points" in text
+    assert "(estimated)" in text
+    assert "N m^2" in text
+    assert "length 0.55 m fixed" in text
+    assert "mass 0.2 kg fixed" in text
+    assert "gravity (0, -9.81) m/s^2 fixed" in text
+    assert "of its tolerance 0.0005 m" in text
+    assert "initial guess" in text
+    assert "declared model, fitted" in text
+    assert "noise (estimated)" in text
+    assert "warning: stage algorithm1: switched off" in text
+    assert "Diagnosis: switched off" in text
+    assert "batch estimate" in text
+    assert "total" in text
+
+
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [
+        ((4.1, None), "EI >= 4.1 N m^2, not identifiable from these shapes."),
+        ((None, 0.02), "EI <= 0.02 N m^2, not identifiable from these shapes."),
+        ((0.1, 4.0), "EI: 0.1 to 4 N m^2, not identifiable from these shapes."),
+        ((None, None), "EI: unknown, not identifiable from these shapes."),
+    ],
+)
+def test_no_number_is_given_for_what_the_shapes_do_not_tell(outcome, interval, words):
+    text = said(with_stiffness(outcome, interval))
+
+    assert words in text
+    assert "17" not in text.split("Distance of the measured points")[0].split("points;")[1]
+
+
+def test_a_parameter_on_its_bound_says_so(outcome):
+    estimate = ParameterEstimate(0.0, 0.1, "kg", at_bound=True)
+
+    assert describe(estimate)[2] == "at a bound"
+
+
+def test_an_added_effect_is_told_with_its_rivals(outcome):
+    closed = replace(outcome.stage("batch"), name="closed")
+    config = replace(
+        outcome.config, diagnosis=outcome.config.diagnosis.model_copy(update={"enabled": True})
+    )
+    proposal = {
+        "end": [0.1, -0.2],
+        "separates": ["lumped_mass", "point_force"],
+        "expected_difference_m": 2.5e-3,
+    }
+    text = said(
+        replace(
+            outcome,
+            config=config,
+            stages=(*outcome.stages, closed),
+            effects=(EFFECT,),
+            verdict="effect_found",
+            next_pose=proposal,
+        )
+    )
+
+    assert "the declared model lacked lumped_mass; with it the residual is noise" in text
+    assert "lumped_mass: mass 0.0500 ± 0.0020 kg (p = 1e-09)" in text
+    assert "These data cannot tell it from point_force." in text
+    assert "hold the end at (0.100, -0.200) m; they differ there by 2.5 mm" in text
+    assert "cross-validated" in text
+    assert "with lumped_mass" in text
+
+
+def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):
+    config = replace(
+        outcome.config, diagnosis=outcome.config.diagnosis.model_copy(update={"enabled": True})
+    )
+    text = said(replace(outcome, config=config, verdict="unexplained", unexplained=LOAD))
+
+    assert "Verdict: unexplained. The residual is not noise." in text
+    assert "pulled by (0, 1) N on average at 0.300 m (0.280 to 0.320 m) from the start" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (0.46867, 0.0368, "0.469 ± 0.037"),
+        (1.0002555, 0.00025794, "1.00026 ± 0.00026"),
+        (-9.8e-05, 0.000146, "-0.00010 ± 0.00015"),
+        (0.3, 0.0, "0.3"),
+        (1234.5, 56.0, "1234 ± 56"),
+        (1e-9, 2e-10, "1e-09 ± 2e-10"),
+        (5.0, 1e5, "5 ± 1e+05"),
+    ],
+)
+def test_digits_follow_the_standard_deviation(value, std, text):
+    assert plus_minus(value, std) == text
+
+
+def test_an_unbounded_parameter_has_no_number():
+    assert unidentified(ParameterEstimate(1.0, 1.0, "m")) == "unknown"

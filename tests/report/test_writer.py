@@ -1,0 +1,164 @@
+"""The folder of results is complete or untouched."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+from small_sessions import BENCH
+
+from dlo_casadi.errors import DloError
+from dlo_casadi.measurements import read_centerline
+from dlo_casadi.report import writer
+from dlo_casadi.report.writer import OWNED, ResultsFolder
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Figures take seconds and have their own tests: an empty one stands in."""
+    monkeypatch.setattr(
+        writer, "write_figures", lambda folder, outcome: (folder / "poses.png").touch()
+    )
+
+
+def tree(folder):
+    """Relative path -> content of every file, hidden ones included."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture
+def earlier(tmp_path):
+    """Results of an earlier run, with a note of the user's beside them."""
+    folder = tmp_path / "results"
+    (folder / "centerlines").mkdir(parents=True)
+    (folder / "figures").mkdir()
+    (folder / "report.json").write_text('{"schema": "dlo-report/1"}')
+    (folder / "parameters.yaml").write_text("schema: dlo-parameters/1\n")
+    (folder / "centerlines" / "old_pose.csv").write_text("x_m,y_m\n0,0\n1,0\n")
+    (folder / "notes.txt").write_text("mine")
+    return folder
+
+
+def test_a_run_writes_its_files_and_nothing_else(outcome, quick, tmp_path):
+    target = tmp_path / "new" / "results"
+    with ResultsFolder(target) as folder:
+        folder.write(outcome)
+
+    assert {path.name for path in target.iterdir()} == set(OWNED)
+    assert [path.name for path in target.parent.iterdir()] == ["results"]
+    assert json.loads((target / "report.json").read_text())["schema"] == "dlo-report/1"
+    assert len(list((target / "centerlines").iterdir())) == 12
+
+
+def test_centre_lines_are_written_as_measured(outcome, quick, tmp_path):
+    with ResultsFolder(tmp_path / "results") as folder:
+        folder.write(outcome)
+    written = read_centerline(tmp_path / "results" / "centerlines" / "pose_01.csv", (0.0, 0.0))
+    given = read_centerline(BENCH / "short_clean" / "pose_01.csv", (0.0, 0.0))
+
+    assert np.array_equal(written, given)
+
+
+def test_earlier_results_are_replaced_and_other_files_kept(outcome, quick, earlier):
+    with ResultsFolder(earlier) as folder:
+        folder.write(outcome)
+
+    assert not (earlier / "centerlines" / "old_pose.csv").exists()
+    assert (earlier / "notes.txt").read_text() == "mine"
+    assert {path.name for path in earlier.iterdir()} == {*OWNED, "notes.txt"}
+    assert "versions" in json.loads((earlier / "report.json").read_text())
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_a_run_that_stops_before_writing_leaves_no_trace(earlier, error):
+    before = tree(earlier)
+    with pytest.raises(error), ResultsFolder(earlier):
+        raise error
+
+    assert tree(earlier) == before
+    assert [path.name for path in earlier.parent.iterdir()] == ["results"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_a_run_that_stops_while_writing_leaves_no_trace(outcome, monkeypatch, earlier, error):
+    def stop(folder, outcome):
+        raise error
+
+    monkeypatch.setattr(writer, "write_figures", stop)
+    before = tree(earlier)
+    with pytest.raises(error), ResultsFolder(earlier) as folder:
+        folder.write(outcome)
+
+    assert tree(earlier) == before
+
+
+@pytest.mark.parametrize("moves", range(8))
+def test_a_failure_in_the_middle_of_the_swap_is_undone(outcome, quick, monkeypatch, earlier, moves):
+    """Whichever of the renamings fails, the earlier results come back."""
+    replace_, left = os.replace, [moves]
+
+    def fails_once(origin, goal):
+        if "draft" in str(origin) + str(goal) and not str(goal).endswith(".csv"):
+            left[0] -= 1
+            if left[0] == -1:
+                raise KeyboardInterrupt
+        replace_(origin, goal)
+
+    before = tree(earlier)
+    with ResultsFolder(earlier) as folder:
+        monkeypatch.setattr(os, "replace", fails_once)
+        with pytest.raises(KeyboardInterrupt):
+            folder.write(outcome)
+
+    assert tree(earlier) == before
+
+
+def test_folders_made_for_nothing_are_removed(tmp_path):
+    with pytest.raises(ValueError, match="broken"), ResultsFolder(tmp_path / "a" / "b" / "c"):
+        raise ValueError("broken")
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_in_the_way_is_reported_before_the_run(tmp_path):
+    (tmp_path / "results").write_text("a file")
+    with (
+        pytest.raises(DloError, match=r"results cannot be written: it is a file.\n  Try: another"),
+        ResultsFolder(tmp_path / "results"),
+    ):
+        pass
+
+
+def test_a_file_as_parent_is_reported_before_the_run(tmp_path):
+    (tmp_path / "file").write_text("a file")
+    with (
+        pytest.raises(DloError, match=r"file/results cannot be written: .*\n  Try: another folder"),
+        ResultsFolder(tmp_path / "file" / "results"),
+    ):
+        pass
+
+
+def test_a_folder_without_permission_is_reported_before_the_run(tmp_path, monkeypatch):
+    def refuse(**_):
+        raise PermissionError(13, "Permission denied", str(tmp_path))
+
+    monkeypatch.setattr(writer.tempfile, "mkdtemp", refuse)
+    with (
+        pytest.raises(DloError, match=r"cannot be written: Permission denied .*\n  Try:"),
+        ResultsFolder(tmp_path / "results"),
+    ):
+        pass
+
+
+def test_files_of_the_same_names_from_elsewhere_are_not_replaced(tmp_path):
+    (tmp_path / "centerlines").mkdir()
+    (tmp_path / "centerlines" / "mine.csv").write_text("x_m,y_m\n")
+    with (
+        pytest.raises(DloError, match="holds centerlines that no earlier fit has written"),
+        ResultsFolder(tmp_path),
+    ):
+        pass

@@ -1,0 +1,176 @@
+"""The commands: what they print, write and return."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dlo_casadi import cli
+from dlo_casadi.cli import main_fit, main_predict
+from dlo_casadi.config import dump_yaml, read_yaml
+
+ROOT = Path(__file__).parents[1]
+SESSION = ROOT / "tests" / "data" / "bench" / "short_clean" / "session.yaml"
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    """A session of five poses on a coarse mesh, one of them without its file."""
+    data = read_yaml(SESSION)
+    poses = data["experiment"]["poses"][:5]
+    for pose in poses:
+        pose["file"] = str(SESSION.parent / pose["file"])
+    poses[4]["file"] = "lost.csv"
+    data["experiment"]["poses"] = poses
+    data["model"] = {"n": 20}
+    path = tmp_path_factory.mktemp("config") / "rope.yaml"
+    path.write_text(dump_yaml(data))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(config, tmp_path_factory):
+    """Folder and printed text of one run of the command as a user starts it."""
+    folder = tmp_path_factory.mktemp("run")
+    command = [sys.executable, str(ROOT / "scripts" / "fit.py"), str(config), "--no-diagnosis"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+def test_fit_writes_results_named_after_the_configuration(run):
+    folder, _ = run
+    report = json.loads((folder / "results" / "rope" / "report.json").read_text())
+
+    assert report["config"] == "rope"
+    assert report["measurement"]["poses_fit"] == 3
+    assert report["measurement"]["poses_held_out"] == 1
+    assert (folder / "results" / "rope" / "figures" / "poses.png").exists()
+    assert [path.name for path in folder.iterdir()] == ["results"]
+
+
+def test_fit_prints_tables_and_progress_apart(run):
+    _, done = run
+    text = " ".join(done.stdout.split())
+
+    assert "3 fit poses, 1 held out" in text
+    assert "bending_stiffness" in text
+    assert "warning: lost" in text
+    assert "batch estimate" in text
+    assert "Results: results/rope" in text
+    assert "read the poses:" in done.stderr
+    assert "write the results:" in done.stderr
+
+
+def test_predict_prints_what_the_file_says(run, capsys):
+    folder, _ = run
+    results = str(folder / "results" / "rope")
+    figure = folder / "results" / "shape.png"
+
+    assert main_predict([results, "--end", "0.3", "-1e-1", "--figure", str(figure)]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "end (0.3, -0.1) m" in text
+    assert "smallest bend radius" in text
+    assert "stable yes" in text
+    assert figure.stat().st_size > 10_000
+
+
+def test_predict_prints_json(run, capsys):
+    folder, _ = run
+    path = str(folder / "results" / "rope" / "parameters.yaml")
+
+    assert main_predict([path, "--end", "-0.2", "-.1", "--branch", "cw", "--json"]) == 0
+    shape = json.loads(capsys.readouterr().out)
+    assert shape["end"] == [-0.2, -0.1]
+    assert np.array(shape["points"]).shape == (101, 2)
+    weight = np.array(shape["force_on_start"]) + shape["force_on_end"]
+    assert weight == pytest.approx([0.0, -0.2 * 9.81], abs=1e-6)
+
+
+def test_predict_out_of_reach_is_bad_input(run, capsys):
+    folder, _ = run
+
+    assert main_predict([str(folder / "results" / "rope"), "--end", "9", "0"]) == 2
+    said = capsys.readouterr()
+    assert "EquilibriumError" in said.err
+    assert "9.0000 m from the start" in said.err
+    assert "Traceback" not in said.err
+    assert said.out == ""
+
+
+def test_predict_names_the_kinds_of_figure(run, tmp_path, capsys):
+    folder, _ = run
+    arguments = [str(folder / "results" / "rope"), "--end", "0.3", "0", "--figure"]
+
+    assert main_predict([*arguments, str(tmp_path / "shape.gif")]) == 2
+    assert "must end in .png, .pdf, .svg, .jpg" in capsys.readouterr().err
+    assert main_predict([*arguments, str(tmp_path / "no" / "shape.png")]) == 2
+    assert "cannot be written: No such file or directory" in capsys.readouterr().err
+
+
+def test_fit_reports_bad_input_without_a_traceback(tmp_path, capsys):
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(SESSION.read_text().replace("length: 0.55", "length: -0.55"))
+
+    assert main_fit([str(bad), "--output", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert "ConfigError" in said.err
+    assert "bad.yaml, line 1" in said.err
+    assert "Traceback" not in said.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_fit_reports_a_missing_configuration(tmp_path, capsys):
+    assert main_fit([str(tmp_path / "cable.yaml")]) == 2
+    assert "no such file" in capsys.readouterr().err
+
+
+def test_fit_checks_the_output_before_it_works(config, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "run_session", lambda *_: pytest.fail("started"))
+    (tmp_path / "file").touch()
+
+    assert main_fit([str(config), "--output", str(tmp_path / "file"), "--quiet"]) == 2
+    assert "cannot be written: it is a file" in capsys.readouterr().err
+
+
+def test_an_interrupted_fit_keeps_the_earlier_results(config, tmp_path, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "run_session", interrupted)
+    (tmp_path / "report.json").write_text('{"schema": "dlo-report/1"}')
+
+    assert main_fit([str(config), "--output", str(tmp_path)]) == 130
+    assert capsys.readouterr().err.strip() == "interrupted; earlier results are as they were"
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_bug_is_told_apart_from_bad_input(config, tmp_path, capsys, monkeypatch):
+    def broken(*_):
+        raise ZeroDivisionError("oops")
+
+    monkeypatch.setattr(cli, "run_session", broken)
+
+    assert main_fit([str(config), "--output", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert "ZeroDivisionError: oops" in error
+    assert "This is a bug. Please report it" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_unknown_arguments_are_bad_input(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main_fit(["configs/cable.yaml", "--outptu", "x"])
+    assert caught.value.code == 2
+    assert "unrecognized arguments: --outptu x" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [("-1e-1", "-0.1"), ("-5.", "-5.0"), ("-.5", "-0.5"), ("-2E3", "-2000.0"), ("--end", "--end")],
+)
+def test_negative_numbers_are_no_options(text, number):
+    assert cli._plain_numbers([text]) == [number]

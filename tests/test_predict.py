@@ -1,0 +1,157 @@
+"""Predictions from a file of fitted parameters: physics, defaults, messages."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dlo_casadi.config import dump_yaml, load_config
+from dlo_casadi.declared import declared_model
+from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.measure import read_poses
+from dlo_casadi.predict import predict
+from dlo_casadi.report import parameters_file
+
+BENCH = Path(__file__).parent / "data" / "bench"
+ROOT = Path(__file__).parents[1]
+
+
+def results(name, folder):
+    """A folder of results of a quick fit that holds parameters.yaml alone."""
+    config = load_config(BENCH / name / "session.yaml")
+    _, measured = read_poses(config, lambda *_: None)
+    declared = declared_model(config)
+    model = declared.model.with_mesh(20)
+    fit = fit_model(model, measured[:4], declared.tolerances, 3e-4, decades=(0,))
+    document = parameters_file.fit_dict(fit)
+    document["fixtures"] = parameters_file.shared_fixtures(config)
+    document["model_hash"] = parameters_file.model_hash(document)
+    folder.mkdir(parents=True)
+    (folder / "parameters.yaml").write_text(dump_yaml(document))
+    return folder / "parameters.yaml"
+
+
+@pytest.fixture(scope="module")
+def pinned(tmp_path_factory):
+    return results("short_clean", tmp_path_factory.mktemp("pinned") / "results" / "cable")
+
+
+@pytest.fixture(scope="module")
+def overhang(tmp_path_factory):
+    return results("overhang", tmp_path_factory.mktemp("free") / "results" / "cable")
+
+
+def test_the_cable_spans_from_start_to_end(pinned):
+    shape = predict(pinned, end=(0.3, -0.1))
+    points = shape.points(201)
+
+    # The fitted end_offset is within its tolerance of 0.2 mm, a few of which are seen.
+    assert points[0] == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert points[-1] == pytest.approx([0.3, -0.1], abs=1e-3)
+    length = np.hypot(*np.diff(points, axis=0).T).sum()
+    assert length == pytest.approx(0.55, abs=2e-3)  # length_error is within 0.5 mm, mesh of 20
+    assert shape.equilibrium.stable
+
+
+def test_reactions_carry_the_weight(pinned):
+    eq = predict(pinned, end=(0.3, -0.1)).equilibrium
+
+    assert eq.lam + eq.lam_start == pytest.approx([0.0, -0.2 * 9.81], abs=1e-9)
+
+
+def test_the_reaction_is_the_slope_of_the_energy(pinned):
+    """-lam = dV/d(end), by central differences of step h: error of order h^2."""
+    h, end = 1e-4, np.array([0.3, -0.1])
+    cable = parameters_file.load_parameters(pinned)
+    slope = [
+        (
+            predict(cable, end + step).equilibrium.energy
+            - predict(cable, end - step).equilibrium.energy
+        )
+        / (2 * h)
+        for step in h * np.eye(2)
+    ]
+    assert -predict(cable, end).equilibrium.lam == pytest.approx(slope, rel=1e-4)
+
+
+def test_the_bend_radius_is_that_of_the_curve(pinned):
+    shape = predict(pinned, end=(0.3, -0.1))
+    s = np.linspace(0.0, shape.curve.length, 2001)
+    x, y = shape.points(2001).T
+    heading = np.unwrap(np.arctan2(np.gradient(y, s), np.gradient(x, s)))
+    sharpest = np.abs(np.gradient(heading, s)[20:-20]).max()
+
+    # Cells of 1/20 of the length have one curvature each: a tenth of a radius at most.
+    assert shape.equilibrium.min_bend_radius == pytest.approx(1 / sharpest, rel=0.1)
+
+
+def test_branches_turn_the_way_they_are_named(pinned):
+    turn = {}
+    for branch in ("ccw", "cw"):
+        phi = predict(pinned, (0.2, 0.0), branch=branch).equilibrium.phi
+        turn[branch] = phi[-1] - phi[0]
+    assert turn["ccw"] > 0 > turn["cw"]
+
+
+def test_a_moved_start_moves_the_cable(pinned):
+    here = predict(pinned, end=(0.3, -0.1)).points()
+    there = predict(pinned, start=(1.0, 2.0), end=(1.3, 1.9)).points()
+
+    assert there - here == pytest.approx(np.tile([1.0, 2.0], (101, 1)), abs=1e-6)
+
+
+def test_an_end_out_of_reach_is_told_with_numbers(pinned):
+    message = (
+        r"the end \(0.9000, 0.0000\) m is 0.9000 m from the start, the cable is 0\.5\d\d\d m long"
+    )
+    with pytest.raises(EquilibriumError, match=message) as caught:
+        predict(pinned, end=(0.9, 0.0))
+    assert caught.value.p_des == (0.9, 0.0)
+
+
+def test_a_free_end_hangs(overhang):
+    shape = predict(overhang, start_heading=0.0)
+
+    assert shape.equilibrium.lam == pytest.approx([0.0, 0.0])
+    assert shape.equilibrium.lam_start == pytest.approx([0.0, -0.02 * 9.81], abs=1e-9)
+    assert shape.points()[-1, 1] < 0
+
+
+@pytest.mark.parametrize(
+    ("file", "ends", "message"),
+    [
+        ("pinned", {}, "the end of 'short_clean' is pinned: where is it?"),
+        ("pinned", {"end": (0.3, float("nan"))}, "end: two finite numbers (x, y) in metres"),
+        ("pinned", {"end": (0.3, 0.1, 0.0)}, "end: two finite numbers (x, y) in metres"),
+        ("pinned", {"end": (0.3, 0), "start_heading": 1.0}, "a start_heading has no meaning"),
+        ("overhang", {"end": (0.3, 0.0)}, "the end of 'overhang' is free: it cannot be held"),
+        ("overhang", {}, "differed from pose to pose: give start_heading [rad]"),
+    ],
+)
+def test_ends_that_do_not_suit_the_cable(request, file, ends, message):
+    with pytest.raises(DloError, match=re.escape(message)):
+        predict(request.getfixturevalue(file), **ends)
+
+
+def test_the_example_of_the_readme_runs(pinned, monkeypatch):
+    """Word for word, where results/cable/parameters.yaml is."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert len(blocks) == 1
+    monkeypatch.chdir(pinned.parents[2])
+    names = {}
+    exec(blocks[0], names)
+
+    assert names["shape"].points(101).shape == (101, 2)
+
+
+def test_the_configuration_of_the_readme_is_one(tmp_path):
+    (block,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (tmp_path / "config.yaml").write_text(block)
+    for k in (1, 2, 3):
+        (tmp_path / f"pose_0{k}.csv").write_text("x_m,y_m\n0,0\n0.1,0\n")
+
+    config = load_config(tmp_path / "config.yaml")
+    assert config.warnings == ()
+    assert config.skipped == ()
