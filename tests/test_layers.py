@@ -22,9 +22,16 @@ MAY_IMPORT: dict[str, set[str]] = {
     "diagnosis": MECHANICS | {"config", "measurements", "estimation"},
     "codegen": MECHANICS | {"config"},
 }
-BELOW_REPORT = set(MAY_IMPORT)
-MAY_IMPORT["report"] = BELOW_REPORT
-MAY_IMPORT["cli"] = BELOW_REPORT | {"report"}
+# A session: what is declared and measured -> stages and findings -> one outcome.
+MAY_IMPORT["outcome"] = MECHANICS | {"config", "estimation"}
+MAY_IMPORT["declared"] = MAY_IMPORT["outcome"]
+MAY_IMPORT["measure"] = MAY_IMPORT["outcome"] | {"outcome", "measurements", "vision"}
+MAY_IMPORT["stages"] = MAY_IMPORT["outcome"] | {"outcome"}
+MAY_IMPORT["findings"] = MAY_IMPORT["outcome"] | {"diagnosis"}
+MAY_IMPORT["session"] = set(MAY_IMPORT)
+MAY_IMPORT["report"] = set(MAY_IMPORT)
+MAY_IMPORT["predict"] = MECHANICS | {"config", "estimation", "report"}
+MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 
 def layer_of(file: Path) -> str:
