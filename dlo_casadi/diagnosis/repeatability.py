@@ -26,8 +26,8 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
     for item in measured:
         if item.readable and not item.held_out:
             places = np.maximum.accumulate(chord_places(item, length))
-            curve = np.stack([np.interp(grid, places, item.points[:, i]) for i in (0, 1)], axis=1)
-            groups.setdefault(tuple(item.pose.vector), []).append(curve)
+            line = np.stack([np.interp(grid, places, item.points[:, i]) for i in (0, 1)], axis=1)
+            groups.setdefault(tuple(item.pose.vector), []).append(line)
     squares = []
     for curves in groups.values():
         for k, curve in enumerate(curves):
@@ -44,7 +44,7 @@ def alike(fit: Fit) -> list[tuple[str, ...]]:
     """
     names = fit.problem.unknowns.names
     held = [k for k, name in enumerate(names) if name in fit.model.priors]
-    hessian = fit.normal.hessian.copy()
+    hessian: FloatArray = fit.normal.hessian.copy()
     hessian[np.ix_(held, held)] -= fit.problem.precision[np.ix_(held, held)]
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     scaled = hessian / np.outer(scale, scale) + 1e-6 * np.eye(len(scale))

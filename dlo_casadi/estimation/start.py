@@ -74,7 +74,7 @@ def _kinematic_step(
     # 3 mm of noise a point against bends that change by 0.3 turns per length from cell to cell.
     rough = penalty * 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
     axes = [np.tile(axis, (len(s), 1)) for axis in ([1.0, 0.0], [0.0, 1.0])]
-    system: list[FloatArray] = [normal_rows(curve, s, axis) @ slopes for axis in axes] + [rough]
+    system: list[FloatArray] = [*(normal_rows(curve, s, axis) @ slopes for axis in axes), rough]
     target: list[FloatArray] = [gap[:, 0], gap[:, 1], -rough @ phi]
     if item.pose.end is not None:
         system.append(10 * slopes[[chain.n, 2 * chain.n + 1]])
@@ -184,10 +184,10 @@ def all_at_once(
         feet = point.feet
         if not np.all(np.isfinite(shapes.phi)):
             return None
-    solved, converged = sweep.solve(shapes, unknowns.p(theta), unknowns.rest(theta), 40)
-    if not converged or np.abs(solved.phi - shapes.phi).max() > 1.5:
+    final, converged = sweep.solve(shapes, unknowns.p(theta), unknowns.rest(theta), 40)
+    if not converged or np.abs(final.phi - shapes.phi).max() > 1.5:
         return None
-    return problem.evaluate(theta, solved, feet)
+    return problem.evaluate(theta, final, feet)
 
 
 def _predicted(
