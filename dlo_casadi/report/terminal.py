@@ -126,7 +126,7 @@ def nuisance_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
                 q.name,
                 plus_minus(fit.value(q.name), fit.std(q.name)) + unit,
                 "",
-                f"{shift / tolerance:+.1f} of its tolerance {tolerance:g}{unit}",
+                f"{round(shift / tolerance, 1) + 0.0:+.1f} of its tolerance {tolerance:g}{unit}",
             )
         )
     return rows
