@@ -216,9 +216,11 @@ def _console(quiet: bool = False) -> Console:
 def _guarded(work: Callable[[], None], kept: str) -> int:
     """Run a command and turn what goes wrong into a message and an exit code."""
     errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
-    before = signal.getsignal(signal.SIGTERM)
+    # SIGINT, too: a shell may have started the command with it ignored.
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        signal.signal(signal.SIGTERM, _interrupt)
+        for number in before:
+            signal.signal(number, _interrupt)
         work()
     except DloError as error:
         errors.print(f"{type(error).__name__}: {error}")
@@ -231,7 +233,8 @@ def _guarded(work: Callable[[], None], kept: str) -> int:
         errors.print("This is a bug. Please report it with the lines above and your configuration.")
         return UNEXPECTED
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return OK
 
 

@@ -1,6 +1,7 @@
 """The commands: what they print, write and return."""
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -145,6 +146,21 @@ def test_an_interrupted_fit_keeps_the_earlier_results(config, tmp_path, capsys, 
 
     assert main_fit([str(config), "--output", str(tmp_path)]) == 130
     assert capsys.readouterr().err.strip() == "interrupted; earlier results are as they were"
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_interrupts_a_running_fit(config, tmp_path, number):
+    (tmp_path / "report.json").write_text('{"schema": "dlo-report/1"}')
+    command = [sys.executable, "-u", str(ROOT / "scripts" / "fit.py"), str(config)]
+    command += ["--output", str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stderr.readline().startswith("read the poses")
+        running.send_signal(number)
+        said = running.stderr.read()
+        assert running.wait(timeout=60) == 130
+
+    assert said.strip().splitlines()[-1] == "interrupted; earlier results are as they were"
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 

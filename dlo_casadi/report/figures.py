@@ -36,7 +36,7 @@ _POSES_A_PAGE = 20
 _HELD_OUT = PURPLE
 _HELD_OUT_TEXT = "#8C3B6C"
 # A typical deviation is drawn about this share of the cable's length wide.
-_VISIBLE = 0.03
+_VISIBLE = 0.02
 _FACTORS = (1, 5, 10, 20, 50, 100)
 # Tallest single row of poses [inch].
 _TALLEST = 8.0
