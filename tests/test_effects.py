@@ -333,10 +333,10 @@ def test_clamp_angles_of_one_end_only():
 def test_measurement_maps():
     """Scale about the start; radial distortion about the image centre, by hand."""
     point, start = ca.SX(ca.DM([0.5, 0.2])), ca.SX(ca.DM([0.1, 0.0]))
-    scaled = ImageScale().observe(point, start, {"factor": ca.SX(1.1)})
+    scaled = ImageScale().observe(point, ca.SX(0.3), start, {"factor": ca.SX(1.1)})
     np.testing.assert_allclose(number(scaled), [0.54, 0.22], rtol=1e-14)
     lens = ImageDistortion(center=(0.2, -0.2))
-    moved = lens.observe(point, start, {"coefficient": ca.SX(0.4)})
+    moved = lens.observe(point, ca.SX(0.3), start, {"coefficient": ca.SX(0.4)})
     # Arm (0.3, 0.4), length 0.5: factor 1 + 0.4 * 0.25 = 1.1.
     np.testing.assert_allclose(number(moved), [0.53, 0.24], rtol=1e-14)
 

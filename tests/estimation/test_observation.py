@@ -1,0 +1,237 @@
+"""Measured points against a curve, on a circle; the noise model against simulated noise."""
+
+import numpy as np
+import pytest
+
+from dlo_casadi.chain import Chain
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.noise import (
+    NoiseModel,
+    NoiseSample,
+    correlation,
+    estimate_noise,
+    restricted_deviance,
+    smooth_modes,
+)
+from dlo_casadi.estimation.observation import (
+    MeasuredPose,
+    NodeCurve,
+    chord_places,
+    normal_rows,
+)
+
+CURVATURE, LENGTH = 4.0, 0.9  # 1/m, m: turns by 3.6 rad
+RADIUS = 1 / CURVATURE
+
+
+def on_circle(s: np.ndarray, radius: float = RADIUS) -> np.ndarray:
+    """Points about a circle through the origin that starts along +x and turns left."""
+    angle = CURVATURE * np.asarray(s)
+    return np.stack([radius * np.sin(angle), RADIUS - radius * np.cos(angle)], axis=1)
+
+
+def circle(n: int, *, links: bool = False) -> NodeCurve:
+    s = np.linspace(0.0, LENGTH, n + 1)
+    slopes = np.stack([np.cos(CURVATURE * s), np.sin(CURVATURE * s)], axis=1)
+    return NodeCurve(LENGTH, on_circle(s), None if links else slopes)
+
+
+def hermite_error(n: int) -> float:
+    """Bound h^4 k^3 / 384 of cubic Hermite interpolation of a circle [m]."""
+    return (LENGTH / n) ** 4 * CURVATURE**3 / 384
+
+
+# ---- the curve between its nodes ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [6, 12, 24])
+def test_interpolation_stays_within_its_bound(n):
+    s = np.linspace(0.0, LENGTH, 500)
+    error = np.hypot(*(circle(n).at(s) - on_circle(s)).T).max()
+    # Both coordinates together reach nearly the bound of the vector's fourth derivative.
+    assert 0.8 * hermite_error(n) < error < 1.001 * hermite_error(n)
+
+
+def test_links_are_chords():
+    """The sagitta of a chord: h^2 k / 8."""
+    n = 12
+    s = (np.arange(n) + 0.5) * LENGTH / n
+    gap = np.hypot(*(circle(n, links=True).at(s) - on_circle(s)).T)
+    exact = RADIUS * (1 - np.cos(CURVATURE * LENGTH / n / 2))
+    np.testing.assert_allclose(gap, exact, rtol=1e-10)
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_derivatives_against_finite_differences(links):
+    curve, d = circle(5, links=links), 1e-6
+    s = np.linspace(0.01, LENGTH - 0.01, 23)
+    for order in (1, 2):
+        central = (curve.at(s + d, order - 1) - curve.at(s - d, order - 1)) / (2 * d)
+        # Rounding 1e-16 * 400 / d for second derivatives of cubics over elements of 0.18 m.
+        np.testing.assert_allclose(curve.at(s, order), central, atol=1e-7)
+    frame = curve.frame(s, 2)
+    for order in (0, 1, 2):
+        np.testing.assert_array_equal(frame[order], curve.at(s, order))
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_points_are_linear_in_the_nodes(links):
+    """N . r(s) is a fixed row times z; z is unpacked column by column."""
+    curve = circle(5, links=links)
+    table = curve.nodes if links else np.hstack([curve.nodes, curve.slopes])
+    z = table.T.ravel()
+    again = NodeCurve.of(Chain(LENGTH, 5, "link" if links else "arc"), z)
+    np.testing.assert_array_equal(again.nodes, curve.nodes)
+    s = np.linspace(0.0, LENGTH, 31)
+    normals = curve.normals(s)
+    exact = (normals * curve.at(s)).sum(axis=1)
+    np.testing.assert_allclose(normal_rows(curve, s, normals) @ z, exact, atol=1e-14)
+
+
+# ---- feet and normals --------------------------------------------------------------------------
+
+
+def test_feet_and_normals_on_a_circle():
+    """The foot of a point beside the circle is at its angle; normals point to the centre."""
+    curve = circle(30)
+    exact = np.linspace(0.05, LENGTH - 0.05, 40)
+    offset = 0.02 * np.sin(37 * exact)  # to the left, where the centre is
+    points = on_circle(exact, RADIUS - offset[:, None].ravel())
+    rng = np.random.default_rng(0)
+    s = curve.feet(points, exact + rng.uniform(-0.01, 0.01, 40))
+    # The interpolant is off by 3e-7 m; a foot moves by that over 1 - offset / radius > 0.9,
+    # times the curve's slope error h^3 k^3.
+    np.testing.assert_allclose(s, exact, atol=2e-6)
+    normals = curve.normals(s)
+    center = np.array([0.0, RADIUS])
+    np.testing.assert_allclose(normals, (center - on_circle(exact)) / RADIUS, atol=2e-5)
+    distance = ((points - curve.at(s)) * normals).sum(axis=1)
+    np.testing.assert_allclose(distance, offset, atol=hermite_error(30))
+
+
+def test_nearest_place_on_a_curve_that_meets_itself():
+    """A circle and a quarter: beside the overlap the nearer strand is found, without a guess."""
+    n, turns = 60, 1.25
+    length = turns * 2 * np.pi * RADIUS
+    s = np.linspace(0.0, length, n + 1)
+    growing = RADIUS * (1 + 0.2 * s / length)  # a spiral, so that the strands are apart
+    spiral = np.stack([growing * np.sin(s / RADIUS), -growing * np.cos(s / RADIUS)], axis=1)
+    curve = NodeCurve(length, spiral, None)
+    places = np.array([0.1, 0.3, 1.2, length - 0.1])
+    beside = curve.at(places) + 1e-3 * curve.normals(places)
+    found = curve.nearest(beside)
+    # A polyline: the foot of a point beside a chord is exact.
+    np.testing.assert_allclose(found, places, atol=1e-8)
+    np.testing.assert_allclose(curve.distances(beside), 1e-3, rtol=1e-6)
+
+
+def test_feet_stay_on_the_curve():
+    curve = circle(10)
+    before, after = np.array([[-0.1, 0.0]]), [*on_circle([LENGTH]), [-0.05, -0.05]]
+    assert curve.feet(before, np.array([0.05])) == pytest.approx(0.0)
+    assert 0.0 <= curve.nearest(after)[0] <= LENGTH
+
+
+@pytest.mark.parametrize("gap", [False, True])
+def test_first_places_along_the_chords(gap):
+    """Dense noisy points of a circle: places within a hundredth of the length."""
+    rng = np.random.default_rng(0)
+    exact = np.linspace(0.01, LENGTH - 0.01, 200)
+    if gap:
+        exact = exact[(exact < 0.4) | (exact > 0.45)]
+    points = on_circle(exact) + rng.normal(scale=3e-4, size=(len(exact), 2))
+    (end,) = on_circle([LENGTH])
+    item = MeasuredPose(Pose((0.0, 0.0), (float(end[0]), float(end[1]))), points)
+    places = chord_places(item, LENGTH)
+    assert np.all(np.diff(places) >= 0)
+    # Noise of 0.3 mm lengthens chords of 18 mm by 2e-4 of themselves; the chord over a gap of
+    # 50 mm is short by its k^2 / 24 = 0.2 %: 0.1 mm. Smoothing over 2 % rounds the ends.
+    np.testing.assert_allclose(places, exact, atol=0.01 * LENGTH)
+
+
+def test_a_pose_knows_whether_it_can_be_read():
+    pose = Pose((0.0, 0.0))
+    assert not MeasuredPose(pose, np.empty((0, 2))).readable
+    item = MeasuredPose(pose, np.zeros((3, 2)))
+    np.testing.assert_array_equal(item.relative_std, 1.0)
+    weighted = MeasuredPose(pose, np.zeros((3, 2)), weight=np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(weighted.relative_std, [1.0, 2.0, 3.0])
+
+
+# ---- noise -------------------------------------------------------------------------------------
+
+NOISES = [
+    NoiseModel(3e-4),
+    NoiseModel(3e-4, share=0.6, length=0.03, kernel="exponential"),
+    NoiseModel(2e-4, share=0.8, length=0.05, kernel="gaussian"),
+    NoiseModel(2e-4, share=0.5, length=0.05, kernel="matern"),
+]
+
+
+@pytest.mark.parametrize("noise", NOISES, ids=lambda noise: f"{noise.kernel}-{noise.share}")
+def test_whitening_makes_the_covariance_one(noise):
+    rng = np.random.default_rng(0)
+    s, weight = np.sort(rng.uniform(0, LENGTH, 60)), rng.uniform(0.5, 3, 60)
+    white = noise.whitening(s, weight)
+    product = white @ noise.covariance(s, weight) @ white.T
+    # White noise leaves out the 1e-9 that keeps the others' factor regular, whose condition
+    # number is below 1e4.
+    np.testing.assert_allclose(product, np.eye(60), atol=1e-8)
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "matern", "gaussian"])
+def test_correlation_falls_from_one(kernel):
+    values = correlation(kernel, np.linspace(0.0, 6.0, 50))
+    assert values[0] == 1.0
+    assert np.all(np.diff(values) < 0)
+    assert values[-1] < 3e-3
+
+
+def simulated(noise: NoiseModel, poses: int = 14, points: int = 100) -> list[NoiseSample]:
+    """Noise of many poses on top of slow displacements that the curves may take."""
+    rng = np.random.default_rng(0)
+    s, weight = np.linspace(0.01, LENGTH - 0.01, points), np.ones(points)
+    factor = np.linalg.cholesky(noise.covariance(s, weight))
+    own = smooth_modes(s, LENGTH, 4, free_end=False)
+    samples = []
+    for _ in range(poses):
+        slow = own @ rng.normal(scale=5e-3, size=4)
+        samples.append(NoiseSample(factor @ rng.normal(size=points) + slow, s, weight, own, own))
+    return samples
+
+
+def test_restricted_likelihood_of_white_noise_is_unbiased():
+    """Projecting out 4 of 20 directions must not make the noise look 10 % smaller."""
+    samples = simulated(NoiseModel(3e-4), poses=200, points=20)
+    samples = [
+        NoiseSample(x.distances, x.places, x.weight, x.own, np.zeros((20, 0))) for x in samples
+    ]
+    _, std = restricted_deviance(NoiseModel(1.0), samples)
+    # 200 * 16 degrees of freedom: one standard deviation is 1.25 %.
+    assert std == pytest.approx(3e-4, rel=0.04)
+
+
+def test_white_noise_is_recovered():
+    found = estimate_noise(simulated(NoiseModel(3e-4)), LENGTH)
+    # 14 * 76 degrees of freedom: 2.2 % is one standard deviation. A share that is not there may
+    # be found where its length lies below the spacing of the points.
+    assert found.std == pytest.approx(3e-4, rel=0.07)
+    spacing = LENGTH / 80
+    neighbours = found.covariance(np.array([0.0, spacing]), np.ones(2))[0, 1] / found.std**2
+    assert neighbours < 0.1
+
+
+@pytest.mark.parametrize(
+    "truth", NOISES[1:3], ids=lambda noise: f"{noise.kernel}-{noise.share}-{noise.length}"
+)
+def test_correlated_noise_is_recovered(truth):
+    """Size, share and length, from 14 poses with four slow displacements each taken away."""
+    found = estimate_noise(simulated(truth), LENGTH)
+    # L / length * 14 = 250 to 420 independent stretches: the variance is known to 7 to 9 %, its
+    # root to half of that, three each. Rough and smoother kernels of other shares and lengths may
+    # look alike.
+    assert found.std == pytest.approx(truth.std, rel=0.15)
+    # What counts in the end is the covariance of neighbouring stretches.
+    s = np.array([0.0, 0.02])
+    exact, estimate = (x.covariance(s, np.ones(2))[0, 1] for x in (truth, found))
+    assert estimate == pytest.approx(exact, rel=0.3)
