@@ -63,7 +63,7 @@ class CompiledSolver:
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
         n, k = model.n, model.chain.n_headings
-        self._shape = np.dtype(
+        self.record = np.dtype(
             {
                 "names": [
                     *("points", "headings", "lam_start", "lam", "moments", "energy"),
@@ -103,7 +103,7 @@ class CompiledSolver:
         return poses
 
     def _read(self, record: Any, status: int) -> Shape:
-        values = {name: record[name] for name in self._shape.names or ()}
+        values = {name: record[name] for name in self.record.names or ()}
         scalars = {name: values[name].item() for name in values if values[name].ndim == 0}
         arrays = {name: values[name].copy() for name in values if values[name].ndim}
         return Shape(**arrays, **scalars, status=STATUSES[status])
@@ -112,7 +112,7 @@ class CompiledSolver:
         """Record of a shape to start from, and its address."""
         if warm is None:
             return None, None
-        record = np.zeros(1, self._shape)
+        record = np.zeros(1, self.record)
         record["headings"], record["lam"] = warm.headings, warm.lam
         return record, record.ctypes.data
 
@@ -149,7 +149,7 @@ class CompiledSolver:
             If there is no stable equilibrium and `throw` is true.
         """
         pose = self._poses(end, start, headings)
-        out = np.zeros(1, self._shape)
+        out = np.zeros(1, self.record)
         kept, address = self._warm(warm)
         work = self._work()
         status = self._c.dlo_solve(
@@ -192,7 +192,7 @@ class CompiledSolver:
             Records with the fields of Shape, and statuses (index into STATUSES).
         """
         poses = self._poses(ends, start, headings)
-        out = np.zeros(len(poses), self._shape)
+        out = np.zeros(len(poses), self.record)
         statuses = np.zeros(len(poses), np.intc)
         work = self._work()
         self._c.dlo_batch(
@@ -227,7 +227,7 @@ class CompiledSolver:
             For the first pose.
         """
         poses = self._poses(ends, start, headings)
-        out = np.zeros(len(poses), self._shape)
+        out = np.zeros(len(poses), self.record)
         statuses = np.zeros(len(poses), np.intc)
         jump = ctypes.c_size_t(0)
         kept, address = self._warm(warm)

@@ -77,11 +77,9 @@ def _extra(split: Split) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
     model = split.model
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
-    bent = _resting(split)
-    chord = float(np.arctan2(np.sin(bent).mean(), np.cos(bent).mean()))
     load = total_dead_load(model, split.p)
     offset = split.offsets
-    return [split.length, down, chord, *load, *split.constant, *offset[2:6]]
+    return [split.length, down, *load, *split.constant, *offset[2:6]]
 
 
 def _resting(split: Split) -> FloatArray:
@@ -148,10 +146,10 @@ def _template(name: str) -> str:
 
 
 def fill(text: str, values: dict[str, str], prefix: str) -> str:
-    """Replace @MARKS@ and give public names their prefix."""
+    """Replace @MARKS@ and give public names their prefix; CMake's own marks stay."""
     text = re.sub(r"\bdlo_(?!casadi)", f"{prefix}_", text)
     text = re.sub(r"\bDLO_", f"{prefix.upper()}_", text)
-    return re.sub(r"@([A-Z_]+)@", lambda match: values[match.group(1)], text)
+    return re.sub(r"@([A-Z_]+)@", lambda match: values.get(match.group(1), match.group(0)), text)
 
 
 def generate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -162,7 +163,7 @@ def kernels_to_c(groups: Sequence[Group], n_slots: int, elastic: bool) -> tuple[
             size=group.key.count("|") + 1 if group.key else 0,
             row=", const double *row" if width else "",
         )
-        if "x[" not in body.replace("jx[", "").replace("ax[", ""):
+        if not re.search(r"(?<![\w>])x\[", body):
             head = head[: head.index("    const double *const x")]
         value = names.get((0, 0), "0.0")
         functions.append(f"{head}{body}\n    return {value};\n}}\n")

@@ -1,0 +1,154 @@
+"""Benchmark of the generated C solver; prints the compiler and its flags.
+
+    python scripts/benchmark.py --output DIR [--only speed growth throughput random ipopt memory]
+
+Saves benchmark.json and benchmark.png. Everything runs on one machine in one run; medians and
+99th percentiles are over all solves, "best" is the median over the poses of each pose's fastest.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from benchmarks import memory, random_cables, speed
+
+PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory")
+
+
+def run_speed() -> dict[str, Any]:
+    """All methods at n = 10, links, the paper's twelve poses."""
+    out: dict[str, Any] = {
+        "generated": speed.generated(10, "link", 1000),
+        "bare_newton": speed.bare(10, 50),
+        "sqpmethod_qrqp": speed.by_casadi(10, "sqp", 50),
+        "ipopt": speed.by_casadi(10, "ipopt", 20),
+        "cobyla": speed.by_cobyla(10),
+    }
+    ours = out["generated"]["median"]
+    out["times_bare_newton"] = out["generated"]["best"] / out["bare_newton"]["best"]
+    out["faster_than"] = {
+        name: out[name]["median"] / ours for name in ("sqpmethod_qrqp", "ipopt", "cobyla")
+    }
+    return out
+
+
+def run_growth() -> dict[str, Any]:
+    """Time against n of all methods that stand it."""
+    sizes = (10, 20, 50, 100, 200, 500, 1000)
+    out: dict[str, Any] = {"n": sizes}
+    for element in ("link", "arc"):
+        out[element] = [speed.generated(n, element, max(50, 2000 // n)) for n in sizes]
+        per_element = np.array([row["best"] for row in out[element]]) / np.array(sizes)
+        out[f"{element}_spread"] = float(per_element.max() / per_element.min())
+    out["bare_newton"] = [speed.bare(n, 5) for n in sizes]
+    for kind in ("sqp", "ipopt"):
+        out[kind] = [speed.by_casadi(n, kind, 3) for n in sizes[:4]]
+    return out
+
+
+def run_random(cables: int, poses: int) -> dict[str, Any]:
+    """Random cables and poses: statuses, end errors, stability by the Python model."""
+    out: dict[str, Any] = {}
+    for element in ("link", "arc"):
+        rng = np.random.default_rng(0)
+        solver = random_cables.AnyCable(random_cables.random_problem(rng, 1, element=element))
+        ok, wrong, worst, total, slowest = 0, 0, 0.0, 0.0, 0.0
+        for _ in range(cables):
+            problem = random_cables.random_problem(rng, poses, element=element)
+            shapes, statuses, seconds = solver.solve(problem)
+            total, slowest = total + seconds, max(slowest, seconds / poses)
+            for shape, status, end in zip(shapes, statuses, problem.ends, strict=True):
+                if status:
+                    continue
+                ok += 1
+                stable, error = random_cables.check(problem, shape, end)
+                wrong += not stable
+                worst = max(worst, error)
+        out[element] = {
+            "problems": cables * poses,
+            "ok_share": ok / (cables * poses),
+            "ok_but_not_a_stable_equilibrium": wrong,
+            "worst_end_error_m": worst,
+            "mean_seconds": total / (cables * poses),
+            "slowest_cable_mean_seconds": slowest,
+        }
+        print(element, out[element], flush=True)
+    return out
+
+
+def run_ipopt(problems: int) -> dict[str, Any]:
+    """The lowest equilibrium found against that of IPOPT from the same first guesses."""
+    rng = np.random.default_rng(1)
+    solver = random_cables.AnyCable(random_cables.random_problem(rng, 5))
+    counts: dict[str, int] = {}
+    for _ in range(problems // 5):
+        problem = random_cables.random_problem(rng, 5)
+        shapes, statuses, _ = solver.solve(problem)
+        for shape, status, end in zip(shapes, statuses, problem.ends, strict=True):
+            word = random_cables.compare_with_ipopt(problem, shape, end) if not status else "failed"
+            counts[word] = counts.get(word, 0) + 1
+    compared = sum(n for word, n in counts.items() if word != "ipopt_failed")
+    good = counts.get("same", 0) + counts.get("lower", 0)
+    return {**counts, "same_or_lower_share": good / compared}
+
+
+def draw(growth: dict[str, Any], path: Path) -> None:
+    """Time against n."""
+    figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
+    sizes = np.array(growth["n"])
+    for name, label in (
+        ("ipopt", "IPOPT"),
+        ("sqp", "sqpmethod + qrqp, generated C"),
+        ("arc", "generated solver, arcs"),
+        ("link", "generated solver, links"),
+        ("bare_newton", "bare Newton, links"),
+    ):
+        rows = growth[name]
+        median = 1e6 * np.array([row["median"] for row in rows])
+        high = 1e6 * np.array([row["p99"] for row in rows])
+        (line,) = axes.loglog(sizes[: len(rows)], median, "o-", label=label)
+        axes.loglog(sizes[: len(rows)], high, ":", color=line.get_color())
+    axes.set_xlabel("elements n")
+    axes.set_ylabel("time per cold solve [µs]; dotted: 99th percentile")
+    axes.legend()
+    axes.grid(visible=True, which="both", alpha=0.3)
+    figure.savefig(path, dpi=150)
+
+
+def main() -> int:
+    """Run the parts, print and save."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--output", type=Path, default=Path("results/benchmark"))
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--cables", type=int, default=1000, help="random cables, 100 poses each")
+    parser.add_argument("--ipopt-problems", type=int, default=2000)
+    chosen = parser.parse_args()
+    chosen.output.mkdir(parents=True, exist_ok=True)
+    runs = {
+        "speed": run_speed,
+        "growth": run_growth,
+        "throughput": speed.throughput,
+        "random": lambda: run_random(chosen.cables, 100),
+        "ipopt": lambda: run_ipopt(chosen.ipopt_problems),
+        "memory": memory.run,
+    }
+    result: dict[str, Any] = {"compiler": speed.compiler(), "flags": list(speed.FLAGS)}
+    print(json.dumps(result), flush=True)
+    for part in chosen.only:
+        result[part] = runs[part]()
+        print(part, json.dumps(result[part], indent=1), flush=True)
+        if part == "growth":
+            draw(result[part], chosen.output / "benchmark.png")
+    (chosen.output / "benchmark.json").write_text(json.dumps(result, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
