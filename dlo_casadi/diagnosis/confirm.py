@@ -68,7 +68,7 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
         try:
             fit = fit_model(
                 model,
-                base.problem.measured,
+                base.problem.history,
                 base.problem.tolerances,
                 free=_free(base, model.names),
                 values=values,

@@ -186,7 +186,7 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
     """Score tests of all candidates at a fit, best first."""
     phi = fit.point.shapes.phi
     directions = (float(phi[:, 0].mean()), float(phi[:, -1].mean()))
-    listed = candidates(fit.model, center, len(fit.problem.measured), exclude, directions)
+    listed = candidates(fit.model, center, len(fit.problem.history), exclude, directions)
     return Screen(fit, listed).run(noise_degrees(fit)) if listed else []
 
 
@@ -303,7 +303,7 @@ def _drop(fit: Fit, candidate: Candidate) -> Fit | None:
         return None
     model = fit.model.without_effect(candidate.effect.label)
     try:
-        return fit_model(model, fit.problem.measured, fit.problem.tolerances, start=fit)
+        return fit_model(model, fit.problem.history, fit.problem.tolerances, start=fit)
     except EstimationError:
         return None
 

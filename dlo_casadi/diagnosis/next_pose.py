@@ -32,7 +32,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     The candidates are spread over the box of the ends that were used, a tenth wider, within
     97 % of the cable's length from the start; None for a free end.
     """
-    poses = [item.pose for item in first.problem.measured]
+    poses = [item.pose for item in first.problem.history]
     if first.model.end == "free":
         return None
     ends = np.array([pose.end for pose in poses])

@@ -71,7 +71,7 @@ def estimate_pull(base: Fit) -> Pull | None:
         try:
             refined = fit_model(
                 model,
-                base.problem.measured,
+                base.problem.history,
                 base.problem.tolerances,
                 free=[*free, name],
                 values=fit.p,
@@ -106,7 +106,7 @@ def _search(base: Fit, model: CableModel, free: list[str], name: str) -> list[Fi
         unknowns = Unknowns(model, chosen, values, problem.unknowns.rest_free)
         trial = BatchProblem(
             unknowns,
-            problem.measured,
+            problem.history,
             problem.noise,
             problem.tolerances,
             problem.roughness_std,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.fit import Fit, carried_shapes
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -91,6 +91,7 @@ class Screen:
             p[self.model.names.index(name)] = value
         self.p = p
         self.sweep: Sweep | None = None
+        self.shapes: Shapes | None = None
 
     def normal(self, scan: dict[str, float]) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
         """Normal equations of the extended model with the scanned parameters set."""
@@ -101,7 +102,7 @@ class Screen:
         unknowns = Unknowns(self.model, self.free, p, problem.unknowns.rest_free)
         larger = BatchProblem(
             unknowns,
-            problem.measured,
+            problem.history,
             problem.noise,
             problem.tolerances,
             problem.roughness_std,
@@ -110,7 +111,9 @@ class Screen:
         )
         self.sweep = larger.sweep
         larger.share_metric(problem)
-        shapes: Shapes = self.fit.point.shapes
+        if self.shapes is None:
+            self.shapes = carried_shapes(larger, self.fit)
+        shapes = self.shapes
         theta = unknowns.pack(p, self.fit.coefficients)
         point = replace(self.fit.point, theta=theta, shapes=shapes)
         normal = larger.normal_equations(point, larger.linearize(point))

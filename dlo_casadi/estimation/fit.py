@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.errors import EstimationError
+from dlo_casadi.equilibrium import solve_equilibrium
+from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import (
     BatchProblem,
     Linearization,
@@ -22,7 +23,7 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
 from dlo_casadi.estimation.sweep import Shapes
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -135,7 +136,7 @@ class Fit:
         slope = unknowns.scales[k]
         if name in self.model.names:
             slope = unknowns.slopes(self.point.theta)[self.model.names.index(name), k]
-        return float(abs(slope) * np.sqrt(self.covariance[k, k]) * self.inflation)
+        return float(abs(slope) * np.sqrt(max(self.covariance[k, k], 0.0)) * self.inflation)
 
     def value(self, name: str) -> float:
         """Value of a parameter (SI)."""
@@ -401,9 +402,7 @@ def _continue(
         start.problem.roughness_std,
         start.problem.scatter,
     )
-    shapes, solved = problem.sweep.solve(
-        on_other_mesh(start.point.shapes, start.model, model), p, unknowns.rest(theta)
-    )
+    shapes, solved = problem.sweep.solve(carried_shapes(problem, start), p, unknowns.rest(theta))
     if not solved:
         raise EstimationError("the shapes of the first fit are no equilibria of the second model")
     feet = _feet_for(problem, start)
@@ -411,6 +410,33 @@ def _continue(
     point = problem.evaluate(theta, shapes, feet)
     point, converged = problem.descend(point, max_iterations)
     return Fit(problem, point, converged)
+
+
+def carried_shapes(problem: BatchProblem, start: Fit) -> Shapes:
+    """Shapes of a problem's poses from those of a fit, on the problem's mesh.
+
+    Poses that the fit did not need, because it carried no state, are predicted.
+
+    Raises
+    ------
+    EstimationError
+        If such a pose has no equilibrium.
+    """
+    known = {index: k for k, index in enumerate(start.problem.indices)}
+    own = start.point.shapes
+    rows = []
+    for index in problem.indices:
+        if index in known:
+            k = known[index]
+            rows.append((own.phi[k], own.lam[k], own.deviation[k]))
+            continue
+        try:
+            found = solve_equilibrium(start.model, start.p, start.rest, problem.history[index].pose)
+        except EquilibriumError as error:
+            raise EstimationError(error.message) from error
+        rows.append((found.phi, found.multipliers, np.zeros(len(DEVIATIONS))))
+    phi, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
+    return on_other_mesh(Shapes(phi, lam, deviation), start.model, problem.unknowns.model)
 
 
 def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
@@ -437,12 +463,12 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     model = fit.model.with_mesh(n)
     unknowns = replace(problem.unknowns, model=model)
     try:
-        moved = _continue(unknowns, problem.measured, problem.tolerances, fit)
+        moved = _continue(unknowns, problem.history, problem.tolerances, fit)
     except EstimationError:
         # The coarse mesh was too far off to be followed: start again from the measured shapes.
         names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]
         std = fit.noise.std if fit.noise.declared else None
-        return fit_model(model, problem.measured, problem.tolerances, std, free=names, values=fit.p)
+        return fit_model(model, problem.history, problem.tolerances, std, free=names, values=fit.p)
     problem, point, converged = refine(
         moved.problem, moved.point, estimate=not fit.noise.declared, rounds=2, modes=modes
     )
@@ -451,5 +477,6 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
 
 def _feet_for(problem: BatchProblem, start: Fit) -> list[FloatArray]:
     """Feet of the problem's fitted poses, by the pose's place in the session."""
-    known = dict(zip(start.problem.used, start.point.feet, strict=True))
-    return [known[j] for j in problem.used]
+    places = [start.problem.indices[j] for j in start.problem.used]
+    known = dict(zip(places, start.point.feet, strict=True))
+    return [known[problem.indices[j]] for j in problem.used]

@@ -110,7 +110,8 @@ class BatchProblem:
     ----------
     unknowns : Unknowns
     measured : sequence of MeasuredPose
-        All poses in order; those held out or unreadable only carry the history.
+        All poses in order, the `history`; those held out or unreadable are among the problem's
+        own poses, `measured`, only if the model carries a state.
     noise : NoiseModel
     tolerances : Tolerances
     roughness_std : float
@@ -132,11 +133,15 @@ class BatchProblem:
         sweep: Sweep | None = None,
     ) -> None:
         self.unknowns = unknowns
-        self.measured = tuple(measured)
+        self.history = tuple(measured)
+        fitted = [k for k, item in enumerate(measured) if item.readable and not item.held_out]
+        # Poses that are not fitted matter only where they leave something behind in the cable.
+        self.indices = list(range(len(measured))) if unknowns.model.has_state else fitted
+        self.measured = tuple(self.history[k] for k in self.indices)
         self.noise = noise
         self.tolerances = tolerances
         self.roughness_std = roughness_std
-        self.sweep = sweep or Sweep(unknowns.model, [item.pose for item in measured])
+        self.sweep = sweep or Sweep(unknowns.model, [item.pose for item in self.measured])
         self.used = [
             j for j, item in enumerate(self.measured) if item.readable and not item.held_out
         ]
@@ -171,8 +176,11 @@ class BatchProblem:
             self.whitening(j, s)
 
     def share_metric(self, other: BatchProblem) -> None:
-        """Take over the noise metric of a problem with the same poses and noise."""
-        self._whitening = other._whitening
+        """Take over the noise metric of a problem with the same fitted poses and noise."""
+        self._whitening = {
+            mine: other._whitening[theirs]
+            for mine, theirs in zip(self.used, other.used, strict=True)
+        }
 
     def raw_residuals(
         self, curves: list[NodeCurve], feet: list[FloatArray]
@@ -346,7 +354,7 @@ class BatchProblem:
         """Return the same problem with another noise, roughness or scatter of the ends."""
         return BatchProblem(
             self.unknowns,
-            self.measured,
+            self.history,
             noise,
             self.tolerances,
             roughness_std,

@@ -58,7 +58,7 @@ def stiffness_interval(fit: Fit) -> Interval:
     model = fit.model
     log_ei = float(np.log(fit.p[0]))
     k = fit.problem.unknowns.names.index("bending_stiffness")
-    log_std = float(np.sqrt(fit.covariance[k, k])) * fit.inflation
+    log_std = float(np.sqrt(max(fit.covariance[k, k], 0.0))) * fit.inflation
     limit = threshold(fit)
     others = np.array([name != "bending_stiffness" for name in model.names])
     others &= fit.problem.unknowns.free
@@ -72,7 +72,7 @@ def stiffness_interval(fit: Fit) -> Interval:
         unknowns = Unknowns(model, others, p, fit.problem.unknowns.rest_free)
         problem = BatchProblem(
             unknowns,
-            fit.problem.measured,
+            fit.problem.history,
             fit.noise,
             fit.problem.tolerances,
             fit.problem.roughness_std,

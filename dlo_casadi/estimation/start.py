@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.equilibrium import guesses, solve_equilibrium
-from dlo_casadi.errors import EquilibriumError
+from dlo_casadi.equilibrium import guesses
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import (
     MeasuredPose,
@@ -141,10 +140,6 @@ def all_at_once(
     lower, upper = unknowns.bounds
     moving = ~held
     columns = sweep.used_deviations
-    # A pose without points tells nothing here unless it is part of a history: it is solved last.
-    idle = np.ones(sweep.m, dtype=bool)
-    idle[problem.used] = False
-    idle &= not unknowns.model.has_state
     own = np.diag(1 / problem.deviation_std**2 + 1e-12)
     for _ in range(iterations):
         p, rest = unknowns.p(theta), unknowns.rest(theta)
@@ -177,7 +172,6 @@ def all_at_once(
             deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
         moved = (deviation - shapes.deviation)[:, :, None]
         change = correction + sens.theta @ step + (sens.deviation @ moved)[:, :, 0]
-        change[idle] = 0.0
         size = float(np.abs(change[:, :n_phi]).max())
         damp = min(1.0, 0.7 / max(size, 1e-12))
         shapes = replace(
@@ -190,29 +184,10 @@ def all_at_once(
         feet = point.feet
         if not np.all(np.isfinite(shapes.phi)):
             return None
-    filled = _with_predictions(problem, shapes, theta, idle)
-    if filled is None:
-        return None
-    final, converged = sweep.solve(filled, unknowns.p(theta), unknowns.rest(theta), 40)
-    if not converged or np.abs(final.phi - filled.phi).max() > 1.5:
+    final, converged = sweep.solve(shapes, unknowns.p(theta), unknowns.rest(theta), 40)
+    if not converged or np.abs(final.phi - shapes.phi).max() > 1.5:
         return None
     return problem.evaluate(theta, final, feet)
-
-
-def _with_predictions(
-    problem: BatchProblem, shapes: Shapes, theta: FloatArray, idle: NDArray[np.bool_]
-) -> Shapes | None:
-    """Shapes with the idle poses predicted; None where one has no equilibrium."""
-    unknowns = problem.unknowns
-    phi, lam = shapes.phi.copy(), shapes.lam.copy()
-    for j in np.flatnonzero(idle):
-        pose = problem.measured[j].pose
-        try:
-            found = solve_equilibrium(unknowns.model, unknowns.p(theta), unknowns.rest(theta), pose)
-        except EquilibriumError:
-            return None
-        phi[j], lam[j] = found.phi, found.multipliers
-    return replace(shapes, phi=phi, lam=lam)
 
 
 def _predicted(
