@@ -1,0 +1,26 @@
+"""The planner example: OMPL in C++ calls the generated solver for every state and motion."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PLANNER = Path(__file__).parents[2] / "scripts" / "planner"
+
+
+def missing():
+    """What the example needs and this machine has not."""
+    tools = [tool for tool in ("cmake", "g++") if shutil.which(tool) is None]
+    headers = list(Path("/usr/include").glob("ompl*/**/RRTstar.h"))
+    return ", ".join([*tools, *([] if headers else ["OMPL (apt-get install libompl-dev)"])])
+
+
+@pytest.mark.skipif(bool(missing()), reason=f"not installed: {missing()}")
+def test_a_path_is_planned_checked_and_drawn(tmp_path):
+    command = [sys.executable, str(PLANNER / "plan.py"), "--output", str(tmp_path)]
+    run = subprocess.run([*command, "--iterations", "600"], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "smallest bend radius" in run.stdout
+    assert (tmp_path / "plan.png").stat().st_size > 10_000
