@@ -1,0 +1,54 @@
+"""A few thousand random problems; scripts/benchmark.py solves a hundred thousand."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+
+from benchmarks.random_cables import AnyCable, check, compare_with_ipopt, random_problem
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+
+
+@pytest.mark.parametrize("element", ["link", "arc"])
+def test_random_cables_have_stable_equilibria(element):
+    rng = np.random.default_rng(2)
+    solver = AnyCable(random_problem(rng, 1, element=element))
+    failed = total = 0
+    for _ in range(30):
+        problem = random_problem(rng, 60, element=element)
+        shapes, statuses, _ = solver.solve(problem)
+        failed, total = failed + np.count_nonzero(statuses), total + len(statuses)
+        for i in np.flatnonzero(statuses == 0)[::12]:
+            stable, error = check(problem, shapes[i], problem.ends[i])
+            assert stable
+            assert error < 1e-9
+    assert failed <= 0.001 * total
+
+
+def test_the_equilibrium_is_that_of_ipopt_or_a_lower_one():
+    rng = np.random.default_rng(3)
+    solver = AnyCable(random_problem(rng, 1))
+    words = []
+    for _ in range(15):
+        problem = random_problem(rng, 2)
+        shapes, _, _ = solver.solve(problem)
+        words += [
+            compare_with_ipopt(problem, shape, end)
+            for shape, end in zip(shapes, problem.ends, strict=True)
+        ]
+    assert words.count("higher") <= 1
+    assert words.count("same") + words.count("lower") > 25
+
+
+@pytest.mark.parametrize("branch", [1, 2])
+def test_a_named_branch_is_found_too(branch):
+    rng = np.random.default_rng(4)
+    solver = AnyCable(random_problem(rng, 1))
+    for _ in range(10):
+        _, statuses, _ = solver.solve(random_problem(rng, 60), branch)
+        assert not statuses.any()
