@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -168,6 +168,20 @@ class _Held:
         return isinstance(other, _Held) and other.model is self.model
 
 
+def stats_of(solver: ca.Function) -> dict[str, Any]:
+    """Statistics of an IPOPT solver's last run.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the run was interrupted: IPOPT takes the signal for an answer and returns.
+    """
+    stats: dict[str, Any] = solver.stats()
+    if stats["return_status"] == "User_Requested_Stop":
+        raise KeyboardInterrupt
+    return stats
+
+
 def guesses(model: CableModel, pose: Pose, rest: FloatArray) -> list[FloatArray]:
     """First guesses of the headings, by boundary and branch.
 
@@ -287,7 +301,7 @@ def _from_start(
     x0 = np.concatenate([phi, np.zeros(chain.n if model.extensible else 0)])
     bounds = np.concatenate([np.zeros(model.n_conditions), np.full(n_bends, JOINT_BOUND)])
     out = solver(x0=x0, p=np.concatenate([p, rest, ends, deviation]), lbg=-bounds, ubg=bounds)
-    stats = solver.stats()
+    stats = stats_of(solver)
     phi = np.array(out["x"]).ravel()[: chain.n_headings]
     multipliers = np.array(out["lam_g"]).ravel()
     lam, bound_lam = multipliers[: model.n_conditions], multipliers[model.n_conditions :]

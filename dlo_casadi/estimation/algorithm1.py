@@ -29,7 +29,7 @@ from scipy.optimize import least_squares, minimize
 
 from dlo_casadi.chain import Chain
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium import JOINT_BOUND, Pose, check_reach
+from dlo_casadi.equilibrium import JOINT_BOUND, Pose, check_reach, stats_of
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.initial import arc_headings
@@ -329,7 +329,7 @@ class InnerProblem:
             nearest = target.points[index].T.ravel()
             p = np.concatenate([[k_theta], theta_0, target.end, seen, nearest])
             found = self._solver(x0=phi, p=p, lbg=-bound, ubg=bound)
-            if not self._solver.stats()["success"]:
+            if not stats_of(self._solver)["success"]:
                 return phi, False
             phi = found["x"].toarray().ravel()
         return phi, True

@@ -25,6 +25,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.equilibrium import stats_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import NodeCurve, normal_rows
@@ -324,7 +325,7 @@ class _BatchNlp:
             ubg=0.0,
         )
         residual = float(np.abs(np.array(out["g"])).max())
-        return np.array(out["x"]).ravel(), self.solver.stats(), residual
+        return np.array(out["x"]).ravel(), stats_of(self.solver), residual
 
     def unpack(self, vector: FloatArray, shapes: Shapes) -> tuple[FloatArray, Shapes]:
         """Unknowns and shapes of the solution."""
