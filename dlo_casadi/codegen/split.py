@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.codegen.program import UNARY, Program, on_symbols
+from dlo_casadi.codegen.program import Program
 from dlo_casadi.errors import DloError
 from dlo_casadi.model import DEVIATIONS, CableModel
 
@@ -45,22 +45,6 @@ class Slot:
 
     key: str
     numbers: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Kernel:
-    """L_j as a function of symbols, for all slots of one key.
-
-    Parameters
-    ----------
-    x : (2,), lam : (2,), numbers : (k,)
-    value : scalar
-    """
-
-    x: ca.SX
-    lam: ca.SX
-    numbers: ca.SX
-    value: ca.SX
 
 
 class Split:
@@ -264,38 +248,3 @@ class Split:
             numbers.append(node.value)
             return "#"
         return " ".join([*(self._text(k, j, numbers) for k in node.args), f"@{node.op}"])
-
-
-def kernel_of(key: str, n_numbers: int) -> Kernel:
-    """Rebuild L_j of a slot from its key, with symbols for the numbers."""
-    x, lam = ca.SX.sym("x", 2), ca.SX.sym("lam", 2)
-    numbers = ca.SX.sym("c", n_numbers)
-    used = 0
-    total = ca.SX(0)
-
-    def take() -> ca.SX:
-        nonlocal used
-        used += 1
-        return numbers[used - 1]
-
-    for term in key.split("|") if key else []:
-        multipliers, text = term.split(":")
-        factor = ca.SX(0)
-        for k in map(int, multipliers.split(",")):
-            factor += take() * (lam[k] if k >= 0 else 1)
-        stack: list[ca.SX] = []
-        for token in text.split(" "):
-            if token in ("a", "b"):
-                stack.append(x[token == "b"])
-            elif token in ("u", "v"):
-                stack.append(lam[token == "v"])
-            elif token == "#":
-                stack.append(take())
-            else:
-                op = int(token[1:])
-                n = 1 if op in UNARY else 2
-                operands = stack[-n:]
-                del stack[-n:]
-                stack.append(on_symbols(op, operands))
-        total += factor * stack.pop()
-    return Kernel(x, lam, numbers, total)

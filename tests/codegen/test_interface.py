@@ -9,6 +9,7 @@ import pytest
 
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate, library
 from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, EndOffset
+from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model import CableModel
 
@@ -256,3 +257,13 @@ def test_no_compiler_is_an_error_that_says_so(monkeypatch):
     monkeypatch.setattr(library.shutil, "which", lambda name: None)
     with pytest.raises(DloError, match="no C compiler"):
         CompiledSolver(*cable())
+
+
+def test_a_start_anywhere_moves_everything_with_it(links):
+    model, p, rest = cable()
+    start, end = np.array([0.3, -0.4]), (0.7, -0.1)
+    expected = solve_equilibrium(model, p, rest, Pose(tuple(start), end))
+    shape = links.solve(end, start=start)
+    assert np.abs(shape.points - expected.points).max() < 1e-8
+    assert shape.energy == pytest.approx(expected.energy, rel=1e-9)
+    assert shape.points[0] == pytest.approx(start)

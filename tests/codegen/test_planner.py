@@ -24,3 +24,11 @@ def test_a_path_is_planned_checked_and_drawn(tmp_path):
     assert run.returncode == 0, run.stderr
     assert "smallest bend radius" in run.stdout
     assert (tmp_path / "plan.png").stat().st_size > 10_000
+
+
+def test_the_same_from_python(tmp_path):
+    pytest.importorskip("ompl", reason="the PyPI package ompl is not installed")
+    command = [sys.executable, str(PLANNER / "plan_python.py"), "--output", str(tmp_path)]
+    run = subprocess.run([*command, "--seconds", "4"], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert (tmp_path / "plan_python.png").stat().st_size > 10_000
