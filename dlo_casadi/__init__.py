@@ -2,6 +2,7 @@
 
 __version__ = "0.1.0"
 
+from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.equilibrium import Equilibrium, Pose, solve_equilibrium
@@ -21,6 +22,7 @@ __all__ = [
     "EFFECTS",
     "Cable",
     "CableModel",
+    "CompiledSolver",
     "Config",
     "ConfigError",
     "DloError",
