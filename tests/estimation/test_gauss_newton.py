@@ -1,0 +1,347 @@
+"""The batch problem: poses solved together, exact Jacobians, round trips, two routes."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dlo_casadi.effects import (
+    AxialStretch,
+    BendingSoftening,
+    Cable,
+    EndOffset,
+    GravityTilt,
+    ImageScale,
+    LengthError,
+    LumpedMass,
+    RestCurvatureDrift,
+    StiffnessGradient,
+)
+from dlo_casadi.equilibrium import Pose, solve_equilibrium
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.batch import solve_batch
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
+from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.sweep import Shapes, Sweep
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model import DEVIATIONS, CableModel
+
+CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
+STD = 3e-4  # m
+ENDS = [
+    (0.55, 0.1),
+    (0.3, -0.4),
+    (0.65, -0.1),
+    (0.45, 0.3),
+    (0.2, -0.65),
+    (0.6, 0.25),
+    (0.35, 0.0),
+    (0.7, 0.1),
+]
+BOTH = pytest.mark.parametrize("element", ["arc", "link"])
+
+
+def poses_at(count: int) -> list[Pose]:
+    return [Pose((0.0, 0.0), end, branch="ccw", name=f"pose {end}") for end in ENDS[:count]]
+
+
+def measured_from(
+    model: CableModel, p: np.ndarray, coefficients: np.ndarray, count: int, noise: float, points=60
+) -> list[MeasuredPose]:
+    """Points of the model's own shapes with white noise [m], in the order of the poses."""
+    rng = np.random.default_rng(0)
+    poses = poses_at(count)
+    shapes = predict_poses(model, p, model.rest_basis @ coefficients, poses)
+    s = np.linspace(0.02, 0.98, points) * model.cable.length
+    return [
+        MeasuredPose(pose, shape.curve.at(s) + rng.normal(scale=noise, size=(points, 2)))
+        for pose, shape in zip(poses, shapes, strict=True)
+        if shape is not None
+    ]
+
+
+def all_free(model: CableModel) -> Unknowns:
+    return Unknowns(model, np.ones(len(model.names), dtype=bool), model.nominal.copy())
+
+
+def solved(problem: BatchProblem, theta: np.ndarray, deviation: np.ndarray | None = None) -> Shapes:
+    """Equilibria of all poses, each from its own IPOPT solve, a drift carried along."""
+    unknowns, model = problem.unknowns, problem.unknowns.model
+    p, rest = unknowns.p(theta), unknowns.rest(theta)
+    found = predict_poses(model, p, rest, [item.pose for item in problem.measured])
+    phi = np.array([shape.equilibrium.phi for shape in found if shape is not None])
+    lam = np.array([shape.equilibrium.multipliers for shape in found if shape is not None])
+    still = np.zeros((len(phi), len(DEVIATIONS)))
+    shapes, converged = problem.sweep.solve(
+        Shapes(phi, lam, still if deviation is None else deviation), p, rest
+    )
+    assert converged
+    return shapes
+
+
+# ---- equilibria of many poses ------------------------------------------------------------------
+
+
+@BOTH
+def test_poses_solved_together_are_those_solved_alone(element):
+    """Two routes: Newton's method over the stacked poses; IPOPT for each of them."""
+    model = CableModel(CABLE, 8, element, effects=(LumpedMass(), AxialStretch()))
+    p = np.array([0.06, 0.03, 0.3, 2e-3])
+    rest = np.full(model.chain.n_cells, 0.8)
+    poses = poses_at(3)
+    alone = [solve_equilibrium(model, p, rest, pose) for pose in poses]
+    sweep = Sweep(model, poses)
+    guess = Shapes(
+        np.array([eq.phi for eq in alone]) + 0.02,
+        np.array([eq.multipliers for eq in alone]) * 0.9,
+        np.zeros((3, len(DEVIATIONS))),
+    )
+    together, converged = sweep.solve(guess, p, rest)
+    assert converged
+    # IPOPT's tol of 1e-11 on the balance, over a tangent stiffness of 1e-2 N m.
+    np.testing.assert_allclose(together.phi, [eq.phi for eq in alone], atol=1e-8)
+    np.testing.assert_allclose(together.lam, [eq.multipliers for eq in alone], atol=1e-7)
+    force, _ = sweep.kkt(together, p, rest)
+    assert np.abs(force).max() < 1e-11  # rounding of terms of order one
+    np.testing.assert_array_equal(sweep.stable(together, p, rest), True)
+
+
+def test_a_drift_is_carried_in_order():
+    """Each pose finds rest + rate (curvature - rest) of the one before."""
+    model = CableModel(CABLE, 8, effects=(RestCurvatureDrift(),))
+    p, rest = np.array([0.06, 0.3]), np.full(8, 0.8)
+    poses = poses_at(3)
+    shapes = predict_poses(model, p, rest, poses)
+    sweep = Sweep(model, poses)
+    stacked = Shapes(
+        np.array([shape.equilibrium.phi for shape in shapes]),
+        np.array([shape.equilibrium.multipliers for shape in shapes]),
+        np.zeros((3, len(DEVIATIONS))),
+    )
+    rests = sweep.rests(stacked, p, rest)
+    np.testing.assert_array_equal(rests[0], rest)
+    for j in (1, 2):
+        curvature = shapes[j - 1].equilibrium.curvature
+        by_hand = rests[j - 1] + 0.3 * (curvature - rests[j - 1])
+        np.testing.assert_allclose(rests[j], by_hand, rtol=1e-12)
+    moved, converged = sweep.solve(replace(stacked, phi=stacked.phi + 0.01), p, rest)
+    assert converged
+    np.testing.assert_allclose(moved.phi, stacked.phi, atol=1e-8)  # IPOPT's tol
+
+
+# ---- derivatives -------------------------------------------------------------------------------
+
+EFFECTS_AND_VALUES = {
+    LumpedMass: [0.03, 0.3],
+    StiffnessGradient: [0.2],
+    BendingSoftening: [0.05],
+    AxialStretch: [2e-3],
+    LengthError: [0.004],
+    EndOffset: [0.003, -0.002],
+    GravityTilt: [0.03],
+    ImageScale: [1.004],
+    RestCurvatureDrift: [0.15],
+}
+
+
+@cache
+def rich(element: str) -> tuple[BatchProblem, Point]:
+    """Many effects at once, three poses, at a point that is not the minimum."""
+    effects = tuple(kind() for kind in EFFECTS_AND_VALUES)
+    model = CableModel(CABLE, 8, element, effects=effects, n_rest=5)
+    p = np.array([0.06, *(v for values in EFFECTS_AND_VALUES.values() for v in values)])
+    coefficients = np.array([0.5, 1.0, 1.5, 0.8, 0.4])
+    measured = measured_from(model, p, coefficients, 3, 2e-3, points=25)
+    noise = NoiseModel(STD, share=0.5, length=0.05, kernel="matern")
+    problem = BatchProblem(all_free(model), measured, noise, Tolerances(), 0.5)
+    theta = problem.unknowns.pack(p, coefficients)
+    theta = theta + np.random.default_rng(1).normal(scale=0.02, size=len(theta))
+    shapes = solved(problem, theta)
+    curves = problem.curves(theta, shapes)
+    feet = [curve.nearest(item.points) for curve, item in zip(curves, measured, strict=True)]
+    problem.refresh(feet)
+    return problem, problem.evaluate(theta, shapes, feet)
+
+
+def residuals(problem: BatchProblem, point: Point, theta, deviation=None) -> list[np.ndarray]:
+    """Whitened normal distances at other unknowns: equilibria solved again, feet moved."""
+    start = point.shapes if deviation is None else replace(point.shapes, deviation=deviation)
+    shapes, converged = problem.sweep.solve(
+        start, problem.unknowns.p(theta), problem.unknowns.rest(theta), tolerance=1e-12
+    )
+    assert converged
+    distances, moved = problem.raw_residuals(problem.curves(theta, shapes), point.feet)
+    return [
+        problem.whitening(j, s) @ d for j, s, d in zip(problem.used, moved, distances, strict=True)
+    ]
+
+
+@BOTH
+def test_jacobian_by_the_unknowns_against_central_differences(element):
+    """Feet move, equilibria are solved again, the drift of earlier poses is carried along."""
+    problem, point = rich(element)
+    lin = problem.linearize(point)
+    d = 1e-5
+    for k, name in enumerate(problem.unknowns.names):
+        step = d * np.eye(problem.unknowns.size)[k]
+        ahead = residuals(problem, point, point.theta + step)
+        behind = residuals(problem, point, point.theta - step)
+        for exact, one, other in zip(lin.by_theta, ahead, behind, strict=True):
+            # d^2 of third derivatives is 1e-10 of the size. Feet stop at 1e-8 L, and a point
+            # 2 mm beside the curve feels that in second order only. (On links a foot could
+            # pass a joint, where the distance has a kink: none does within 1e-5.)
+            tolerance = 1e-7 * np.abs(exact).max()
+            central = (one - other) / (2 * d)
+            np.testing.assert_allclose(central, exact[:, k], rtol=0, atol=tolerance, err_msg=name)
+
+
+def test_jacobian_by_the_deviations_against_central_differences():
+    """Of each pose's own end, on its own points."""
+    problem, point = rich("arc")
+    lin = problem.linearize(point)
+    d = 1e-6  # m
+    for j in problem.used:
+        for k, column in enumerate(problem.sweep.used_deviations):
+            step = np.zeros_like(point.shapes.deviation)
+            step[j, column] = d
+            ahead = residuals(problem, point, point.theta, step)[j]
+            behind = residuals(problem, point, point.theta, -step)[j]
+            exact = lin.by_deviation[j][:, k]
+            # As above, with residuals of order ten that are good to 1e-11, over 2 d.
+            tolerance = 1e-5 * np.abs(exact).max()
+            np.testing.assert_allclose((ahead - behind) / (2 * d), exact, atol=tolerance)
+
+
+def test_gradient_of_the_objective():
+    """Residuals times Jacobian plus the prior's part, against the objective itself."""
+    problem, point = rich("arc")
+    lin = problem.linearize(point)
+    gradient = problem.precision @ (point.theta - problem.mean)
+    for e, a in zip(lin.residuals, lin.by_theta, strict=True):
+        gradient = gradient + a.T @ e
+    for k, name in enumerate(problem.unknowns.names):
+        step = 1e-5 * np.eye(problem.unknowns.size)[k]
+        values = []
+        for theta in (point.theta + step, point.theta - step):
+            white = residuals(problem, point, theta)
+            gap = theta - problem.mean
+            values.append((sum(e @ e for e in white) + gap @ problem.precision @ gap) / 2)
+        # d^2 of third derivatives, and 1e-12 of an objective of 1e4 over 2 d.
+        tolerance = 1e-6 * np.abs(gradient).max()
+        assert (values[0] - values[1]) / 2e-5 == pytest.approx(gradient[k], abs=tolerance), name
+
+
+def test_unknown_ends_take_information_away():
+    """Eliminating the deviations lowers the Hessian of the unknowns, never raises it."""
+    problem, point = rich("arc")
+    lin = problem.linearize(point)
+    normal = problem.normal_equations(point, lin)
+    full = problem.precision + sum(a.T @ a for a in lin.by_theta)
+    lost = np.linalg.eigvalsh(full - normal.hessian)
+    assert lost.max() > 0
+    assert lost.min() > -1e-9 * lost.max()  # rounding
+
+
+# ---- round trips -------------------------------------------------------------------------------
+
+
+@cache
+def round_trip(element: str):
+    """A cable with a connector: eight poses, 0.3 mm of white noise, fitted with the same mesh."""
+    model = CableModel(CABLE, 16, element, effects=(LumpedMass(),), n_rest=5)
+    p, coefficients = np.array([0.09, 0.04, 0.3]), np.array([0.5, 1.0, 1.5, 0.8, 0.4])
+    measured = measured_from(model, p, coefficients, 8, STD)
+    fit = fit_model(model, measured, Tolerances(), STD)
+    return fit, p, coefficients
+
+
+@BOTH
+def test_round_trip_with_noise_within_three_sigma(element):
+    """Parameters -> poses -> noise -> the same parameters; the prior of EI is off by 1.8."""
+    fit, p, coefficients = round_trip(element)
+    assert fit.converged
+    assert fit.stable.all()
+    for name, exact in zip(fit.model.names, p, strict=True):
+        assert abs(fit.value(name) - exact) < 3 * fit.std(name), name
+    for k, exact in enumerate(coefficients):
+        std = fit.std(f"rest_curvature[{k}]")
+        assert abs(fit.coefficients[k] - exact) < 3 * std, f"coefficient {k}"
+    # 480 normal distances less about a dozen unknowns: chi2 per degree is 1 +- 0.065.
+    assert fit.chi2_per_dof == pytest.approx(1.0, abs=0.2)
+    # A stiffness that is known to two percent.
+    assert fit.std("bending_stiffness") < 0.05 * p[0]
+
+
+def test_standard_deviations_match_the_scatter_of_the_normal_equations():
+    """Covariance times Hessian is one; correlations are correlations."""
+    fit, *_ = round_trip("arc")
+    product = fit.covariance @ fit.normal.hessian
+    np.testing.assert_allclose(product, np.eye(len(product)), atol=1e-6)
+    std = np.sqrt(np.diag(fit.covariance))
+    assert np.abs(fit.covariance / np.outer(std, std)).max() < 1 + 1e-9
+
+
+def test_noise_free_round_trip_is_exact():
+    """Without noise, and next to no prior, the minimum is the truth."""
+    model = CableModel(CABLE, 10, effects=(LumpedMass(),), n_rest=5)
+    p, coefficients = np.array([0.06, 0.04, 0.3]), np.array([0.5, 1.0, 1.5, 0.8, 0.4])
+    measured = measured_from(model, p, coefficients, 5, 0.0)
+    problem = BatchProblem(all_free(model), measured, NoiseModel(1e-7), Tolerances(), 100.0)
+    exact = problem.unknowns.pack(p, coefficients)
+    theta = exact + 0.03 * np.array([1, -1, 0.5, 1, -1, 1, -1, 1])
+    shapes = solved(problem, theta)
+    curves = problem.curves(theta, shapes)
+    feet = [curve.nearest(item.points) for curve, item in zip(curves, measured, strict=True)]
+    problem.refresh(feet)
+    found, converged = problem.descend(problem.evaluate(theta, shapes, feet))
+    assert converged
+    # A standard deviation of 1e-7 m against positions of 1 m: relative 1e-6 or better, and the
+    # ends may deviate by a share (1e-7 / 2e-4)^2 of what the points ask for.
+    np.testing.assert_allclose(found.theta, exact, atol=1e-4)
+
+
+def test_a_drift_comes_back():
+    """Rate and stiffness from poses in order; in another order the rate comes out wrong."""
+    model = CableModel(CABLE, 10, effects=(RestCurvatureDrift(),), n_rest=4)
+    p, coefficients = np.array([0.06, 0.2]), np.array([0.5, 1.0, 1.2, 0.6])
+    measured = measured_from(model, p, coefficients, 8, STD)
+    fit = fit_model(model, measured, Tolerances(), STD)
+    for name, exact in zip(model.names, p, strict=True):
+        assert abs(fit.value(name) - exact) < 3 * fit.std(name), name
+    assert fit.std("rest_curvature_drift.rate") < 0.02
+    shuffled = fit_model(model, [measured[k] for k in (3, 0, 7, 5, 1, 6, 2, 4)], Tolerances(), STD)
+    assert shuffled.chi2_per_dof > 2 * fit.chi2_per_dof
+
+
+def test_batch_nlp_has_the_same_minimum():
+    """Two routes: the NLP with all poses and multipliers stacked; Gauss-Newton with them gone."""
+    fit, *_ = round_trip("arc")
+    solution = solve_batch(fit.problem, fit.point)
+    # Both stop when the objective changes by 1e-4, which is 0.01 standard deviations.
+    std = np.sqrt(np.diag(fit.covariance))
+    np.testing.assert_array_less(np.abs(solution.point.theta - fit.point.theta), 0.05 * std)
+    assert solution.point.objective == pytest.approx(fit.point.objective, abs=1e-2)
+
+
+def test_predictions_of_a_fit_are_its_shapes():
+    """Per-pose solves at the fitted parameters and deviations left out: within the tolerances."""
+    fit, *_ = round_trip("arc")
+    poses = [item.pose for item in fit.problem.measured]
+    predicted = predict_poses(fit.model, fit.p, fit.rest, poses)
+    curves = fit.problem.curves(fit.point.theta, fit.point.shapes)
+    s = np.linspace(0.0, CABLE.length, 50)
+    for one, other in zip(predicted, curves, strict=True):
+        assert isinstance(other, NodeCurve)
+        # The fit may move each end by its tolerance of 0.2 mm, a few of them at most.
+        assert np.hypot(*(one.curve.at(s) - other.at(s)).T).max() < 1e-3
+
+
+def test_nothing_to_fit_says_so():
+    model = CableModel(CABLE, 4)
+    (pose,) = poses_at(1)
+    with pytest.raises(EstimationError, match="no pose to fit"):
+        fit_model(model, [MeasuredPose(pose, np.empty((0, 2)))], Tolerances(), STD)
