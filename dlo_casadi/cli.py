@@ -107,6 +107,7 @@ class Watch:
 
     def step(self, name: str, done: int, total: int) -> None:
         """`done` of `total` parts of the named work are finished."""
+        _signals.check()
         name, detail = ("read the poses", name[5:]) if name.startswith("read ") else (name, "")
         first = name not in self._begun
         begun = self._begun.setdefault(name, time.perf_counter())
@@ -218,9 +219,10 @@ def _guarded(work: Callable[[], None], kept: str) -> int:
     errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
     # SIGINT, too: a shell may have started the command with it ignored.
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    _signals.received = False
     try:
         for number in before:
-            signal.signal(number, _interrupt)
+            signal.signal(number, _signals.interrupt)
         work()
     except DloError as error:
         errors.print(f"{type(error).__name__}: {error}")
@@ -238,5 +240,21 @@ def _guarded(work: Callable[[], None], kept: str) -> int:
     return OK
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+class _Signals:
+    """Whether a signal has come: a library underneath may swallow the exception that it raises."""
+
+    def __init__(self) -> None:
+        self.received = False
+
+    def interrupt(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal."""
+        self.received = True
+        raise KeyboardInterrupt
+
+    def check(self) -> None:
+        """Raise what has been swallowed."""
+        if self.received:
+            raise KeyboardInterrupt
+
+
+_signals = _Signals()
