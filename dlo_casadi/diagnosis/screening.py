@@ -51,9 +51,6 @@ class Screened:
         Corrected for the places scanned, not for the number of candidates.
     start : dict
         One-step estimate of the candidate's parameters.
-    signature : (size,)
-        Whitened, projected direction of the best scan in the space of the data, reduced to the
-        poses' normal equations; unit length. Cosines tell collinear candidates.
     """
 
     candidate: Candidate

@@ -12,7 +12,7 @@ from dlo_casadi.parameters import Parameter
 class _PinSpring(BoundaryEffect):
     """A torsional spring between a pin and the cable.
 
-        V = moment-free at stiffness = 0:   k (phi - heading)^2 / 2          [J]
+        V = k (phi - heading)^2 / 2                                   [J]
 
     Parameters
     ----------
