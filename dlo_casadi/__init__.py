@@ -15,8 +15,7 @@ from dlo_casadi.errors import (
     VisionError,
 )
 from dlo_casadi.model import CableModel
-from dlo_casadi.outcome import Outcome
-from dlo_casadi.session import run_session
+from dlo_casadi.session import Outcome, run_session
 
 __all__ = [
     "EFFECTS",

@@ -21,8 +21,8 @@ import numpy as np
 import yaml
 
 from dlo_casadi.config import load_config
-from dlo_casadi.outcome import Outcome
 from dlo_casadi.session import run_session
+from dlo_casadi.session.outcome import Outcome
 
 ROOT = Path(__file__).resolve().parent.parent
 TRUTH = ROOT / "tests" / "data" / "bench_truth"

@@ -22,14 +22,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from dlo_casadi.config import load_config
-from dlo_casadi.declared import declared_model
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Shapes, Sweep
-from dlo_casadi.measure import conditions
-from dlo_casadi.session import fit_declared
+from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import fit_declared
+from dlo_casadi.session.measure import conditions
 
 ROOT = Path(__file__).resolve().parent.parent
 SESSIONS = ("short_clean", "held_headings", "weightless_fit", "thin")

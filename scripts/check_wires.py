@@ -19,8 +19,8 @@ import numpy as np
 
 from dlo_casadi.config import load_config
 from dlo_casadi.estimation.observation import chord_places
-from dlo_casadi.measure import read_poses
 from dlo_casadi.session import run_session
+from dlo_casadi.session.measure import read_poses
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -23,11 +23,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "codegen": MECHANICS | {"config"},
 }
 # A session: what is declared and measured -> stages and findings -> one outcome.
-MAY_IMPORT["outcome"] = MECHANICS | {"config", "estimation"}
-MAY_IMPORT["declared"] = MAY_IMPORT["outcome"]
-MAY_IMPORT["measure"] = MAY_IMPORT["outcome"] | {"outcome", "measurements", "vision"}
-MAY_IMPORT["stages"] = MAY_IMPORT["outcome"] | {"outcome"}
-MAY_IMPORT["findings"] = MAY_IMPORT["outcome"] | {"diagnosis"}
 MAY_IMPORT["session"] = set(MAY_IMPORT)
 MAY_IMPORT["report"] = set(MAY_IMPORT)
 MAY_IMPORT["predict"] = MECHANICS | {"config", "estimation", "report"}

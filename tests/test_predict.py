@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
-from dlo_casadi.declared import declared_model
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.measure import read_poses
 from dlo_casadi.predict import predict
 from dlo_casadi.report import parameters_file
+from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.measure import read_poses
 
 BENCH = Path(__file__).parent / "data" / "bench"
 ROOT = Path(__file__).parents[1]

@@ -11,7 +11,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dlo_casadi.outcome import Outcome, Stage, StageName
+from dlo_casadi.session.outcome import Outcome, Stage, StageName
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 BLACK, GREY = "#000000", "#6B6B6B"

@@ -13,7 +13,6 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import StrMethodFormatter
 from numpy.typing import NDArray
 
-from dlo_casadi.outcome import Outcome, PoseInput, PoseShape, Stage
 from dlo_casadi.report.canvas import (
     BLACK,
     BLUE,
@@ -29,6 +28,7 @@ from dlo_casadi.report.canvas import (
     millimetres,
 )
 from dlo_casadi.report.overlay import write_overlays
+from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape, Stage
 
 FloatArray = NDArray[np.floating]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.outcome import Outcome, ParameterEstimate, Stage, StageName
+from dlo_casadi.session.outcome import Outcome, ParameterEstimate, Stage, StageName
 
 SCHEMA = "dlo-report/1"
 # In every report, in this order; `closed` only where an effect was added.

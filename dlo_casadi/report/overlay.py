@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.outcome import Outcome, PoseInput
 from dlo_casadi.report.canvas import BLUE, ORANGE, before_after, label_of, millimetres
+from dlo_casadi.session.outcome import Outcome, PoseInput
 from dlo_casadi.vision import read_image
 
 _LARGEST = (1200, 900)  # px

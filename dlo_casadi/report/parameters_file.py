@@ -21,8 +21,8 @@ from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.model import CableModel
-from dlo_casadi.outcome import Outcome
 from dlo_casadi.report.json_report import finite
+from dlo_casadi.session.outcome import Outcome
 
 FloatArray = NDArray[np.floating]
 

@@ -11,9 +11,9 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dlo_casadi.outcome import Outcome, ParameterEstimate, Stage
 from dlo_casadi.report.canvas import STAGE_LABELS, label_of
 from dlo_casadi.report.json_report import all_warnings
+from dlo_casadi.session.outcome import Outcome, ParameterEstimate, Stage
 
 # Parts of the run in the order in which they are done.
 TIMED = {

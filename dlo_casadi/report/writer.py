@@ -11,10 +11,10 @@ from types import TracebackType
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.measurements import write_centerline
-from dlo_casadi.outcome import Outcome
 from dlo_casadi.report.figures import write_figures
 from dlo_casadi.report.json_report import report_text
 from dlo_casadi.report.parameters_file import parameters_text
+from dlo_casadi.session.outcome import Outcome
 
 # What a run writes; nothing else in the folder is ever touched.
 OWNED = ("report.json", "parameters.yaml", "centerlines", "figures")

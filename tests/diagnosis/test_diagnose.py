@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
-from dlo_casadi.declared import declared_model
 from dlo_casadi.diagnosis.candidates import candidates
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
@@ -18,7 +17,8 @@ from dlo_casadi.diagnosis.structure import structure_of
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.measure import read_poses
+from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.measure import read_poses
 
 BENCH = Path(__file__).resolve().parents[1] / "data" / "bench"
 

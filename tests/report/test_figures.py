@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dlo_casadi.outcome import PoseInput
 from dlo_casadi.report import figures, overlay
 from dlo_casadi.report.canvas import before_after, label_of
 from dlo_casadi.report.drawing import draw_prediction
+from dlo_casadi.session.outcome import PoseInput
 
 PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"
 CANDIDATES = (

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.outcome import ParameterEstimate, RestCurvatureEstimate, Stage
 from dlo_casadi.report.json_report import all_warnings, finite, report_dict, report_text
+from dlo_casadi.session.outcome import ParameterEstimate, RestCurvatureEstimate, Stage
 
 KEYS = {
     "schema": str,

@@ -9,12 +9,10 @@ import pytest
 from small_sessions import BENCH, small
 
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
-from dlo_casadi.declared import declared_model
 from dlo_casadi.effects import ImageDistortion, RestCurvatureDrift
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.measure import read_poses
 from dlo_casadi.predict import predict
 from dlo_casadi.report.parameters_file import (
     covariance_si,
@@ -24,6 +22,8 @@ from dlo_casadi.report.parameters_file import (
     model_hash,
     parameters_text,
 )
+from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.measure import read_poses
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 from test_figures import EFFECT, LOAD
 
-from dlo_casadi.outcome import ParameterEstimate
 from dlo_casadi.report.terminal import describe, plus_minus, print_summary, unidentified
+from dlo_casadi.session.outcome import ParameterEstimate
 
 
 def said(outcome):

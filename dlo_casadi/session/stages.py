@@ -15,7 +15,7 @@ from dlo_casadi.estimation.prediction import Prediction, predict_poses, rms_dist
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model import CableModel
-from dlo_casadi.outcome import (
+from dlo_casadi.session.outcome import (
     ParameterEstimate,
     PoseShape,
     RestCurvatureEstimate,

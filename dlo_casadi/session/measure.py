@@ -13,7 +13,7 @@ from dlo_casadi.equilibrium import Pose
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.measurements import read_centerline
-from dlo_casadi.outcome import PoseInput
+from dlo_casadi.session.outcome import PoseInput
 
 # Points kept of one centre-line; more only repeat their neighbours' noise.
 MOST_POINTS = 240

@@ -1,0 +1,83 @@
+"""Fit of the declared model on a mesh that is fine enough."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dlo_casadi.config import Config
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.batch import solve_batch
+from dlo_casadi.estimation.fit import SMOOTH_MODES, Fit, fit_model, refine_mesh
+from dlo_casadi.estimation.mesh import discretization_error
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.session.declared import Declared
+
+# The search over decades of stiffness runs on this mesh.
+FIRST_MESH = 20
+# The mesh is refined until its error is below this share of the noise.
+MESH_SHARE = 0.1
+FINEST_MESH = 160
+# The search for missing effects, a hundred refits, runs on at most so many elements.
+SEARCH_MESH = 80
+# Huber's constant: points beyond it count with their distance instead of its square.
+HUBER = 1.5
+
+
+def fit_declared(
+    config: Config, declared: Declared, measured: Sequence[MeasuredPose], n: int | None = None
+) -> tuple[Fit, float]:
+    """Fit the declared model on a mesh that is fine enough, and return the mesh's error [m].
+
+    A mesh that is too coarse looks like a missing effect; it is refined first.
+    """
+    std = config.experiment.measurement.std
+    finest = config.model.n or n
+    model = declared.model.with_mesh(min(finest or FIRST_MESH, FIRST_MESH))
+    free = [name for name in model.names if name not in declared.fixed]
+    fit = fit_model(
+        model, measured, declared.tolerances, std, free=free, values=declared.start_values()
+    )
+    if finest:
+        fit = refine_mesh(fit, finest)
+        return fit, discretization_error(fit)
+    return fine_enough(fit, 2 * FIRST_MESH)
+
+
+def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float]:
+    """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
+
+    Where an effect is missing, the mesh need not be finer than what is missing.
+    """
+    while True:
+        if n != fit.model.n:
+            fit = refine_mesh(fit, n, modes)
+        try:
+            error = discretization_error(fit)
+        except EstimationError:
+            error = np.inf
+        largest = FINEST_MESH if np.isfinite(error) else SEARCH_MESH
+        if error <= MESH_SHARE * max(fit.noise.std, fit.residual_rms) or n >= largest:
+            return fit, error
+        n *= 2
+
+
+def solved_by_ipopt(fit: Fit) -> Fit:
+    """Minimum of the batch NLP, from the Gauss-Newton fit's; that one where IPOPT fails."""
+    try:
+        return replace(fit, point=solve_batch(fit.problem, fit.point).point)
+    except EstimationError:
+        return replace(fit, converged=False)
+
+
+def reweighted(fit: Fit, measured: Sequence[MeasuredPose]) -> tuple[MeasuredPose, ...]:
+    """Measured poses in which outlying points weigh less (Huber's weights)."""
+    out = list(measured)
+    for j, d in zip(fit.problem.used, fit.linearization.raw, strict=True):
+        item = measured[j]
+        score = np.abs(d) / (fit.noise.std * item.relative_std)
+        grown = np.sqrt(np.maximum(1.0, score / HUBER))
+        out[j] = replace(item, weight=item.relative_std * grown)
+    return tuple(out)

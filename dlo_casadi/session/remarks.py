@@ -1,0 +1,60 @@
+"""What a user should be warned of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dlo_casadi.diagnosis.repeatability import alike, repeatability
+from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.session.fitting import MESH_SHARE
+from dlo_casadi.session.outcome import PoseInput
+
+# Poses that repeat worse than this many times the noise get a warning.
+REPEATS = 1.5
+
+
+def reading_warnings(inputs: Sequence[PoseInput]) -> list[str]:
+    """What the camera step noticed, pose by pose."""
+    lines = []
+    for item in inputs:
+        if item.problem:
+            lines.append(f"{item.name} is left out: {item.problem}")
+        lines += [f"{item.name}: {text}" for text in item.messages]
+    return lines
+
+
+def fit_warnings(fit: Fit, error: float) -> list[str]:
+    """What a fit cannot promise; `error` is that of its mesh [m]."""
+    lines = []
+    spread = repeatability(fit.problem.measured, fit.model.cable.length)
+    if spread is not None and spread > REPEATS * fit.noise.std:
+        lines.append(
+            f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
+            f"others), the noise is {1e3 * fit.noise.std:.2g} mm: repeatability limits any "
+            "prediction, and intervals from this session are too narrow"
+        )
+        lines += [
+            f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
+        ]
+    if not fit.converged:
+        lines.append("the batch fit stopped before it had converged")
+    unstable = [
+        item.pose.name
+        for item, ok in zip(fit.problem.measured, fit.stable, strict=True)
+        if item.readable and not ok
+    ]
+    if unstable:
+        lines.append(f"not a stable equilibrium at the fitted parameters: {', '.join(unstable)}")
+    if not np.isfinite(error):
+        lines.append(
+            f"the fitted shapes cannot be followed to a mesh finer than {fit.model.n} elements: "
+            "some pose is close to losing its stability"
+        )
+    elif error > MESH_SHARE * fit.noise.std:
+        lines.append(
+            f"the mesh of {fit.model.n} elements is off by {1e3 * error:.3g} mm, more than "
+            f"{MESH_SHARE:.0%} of the noise: model.n larger?"
+        )
+    return lines
