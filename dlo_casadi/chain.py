@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from dlo_casadi.errors import DloError
 
-Element = Literal["arc", "link"]
+FloatArray = NDArray[np.floating]
+Element = Literal["quadratic", "arc", "link"]
+ELEMENTS: tuple[Element, ...] = ("quadratic", "arc", "link")
 
 # Gauss-Legendre on [0, 1]: three points integrate cos and sin of a heading that turns by d in
 # one element with an error below d^6 / 2e6.
@@ -74,8 +76,10 @@ class Chain:
         Declared length along the cable.
     n : int
         Number of elements, >= 2.
-    element : "arc" or "link"
-        "arc": the heading varies linearly in an element (n + 1 nodal headings).
+    element : "quadratic", "arc" or "link"
+        "arc": beyond the rest shape, the heading varies linearly in an element (n + 1 nodal
+        headings): an arc, if the cable is straight or round at rest.
+        "quadratic": an arc that also bows, by an angle per element that the model eliminates.
         "link": straight links joined by hinges (n headings), the paper's chain.
     start_clamped, end_clamped : bool
         A clamp bends the half cell between itself and the middle of a link; an arc's nodal
@@ -91,8 +95,8 @@ class Chain:
     def __post_init__(self) -> None:
         if self.n < 2:
             raise DloError(f"a chain needs at least 2 elements, got n = {self.n}")
-        if self.element not in ("arc", "link"):
-            raise DloError(f"element {self.element!r} is not known; use 'arc' or 'link'")
+        if self.element not in ELEMENTS:
+            raise DloError(f"element {self.element!r} is not known; use one of {ELEMENTS}")
 
     @property
     def h(self) -> float:
@@ -100,14 +104,19 @@ class Chain:
         return self.length / self.n
 
     @property
-    def n_headings(self) -> int:
-        """Number of absolute headings among the coordinates."""
-        return self.n + 1 if self.element == "arc" else self.n
+    def nodal(self) -> bool:
+        """Whether the headings are those at the nodes: of arcs, not of links."""
+        return self.element != "link"
 
     @property
-    def cells(self) -> NDArray[np.floating]:
+    def n_headings(self) -> int:
+        """Number of absolute headings among the coordinates."""
+        return self.n + 1 if self.nodal else self.n
+
+    @property
+    def cells(self) -> FloatArray:
         """Bending cells (n_cells, 2) [m]: where each discrete curvature acts, from s0 to s1."""
-        if self.element == "arc":
+        if self.nodal:
             edges = np.linspace(0.0, self.length, self.n + 1)
         else:
             middles = (np.arange(self.n) + 0.5) * self.h
@@ -122,9 +131,9 @@ class Chain:
         return len(self.cells)
 
     @property
-    def heading_places(self) -> NDArray[np.floating]:
+    def heading_places(self) -> FloatArray:
         """Arc lengths (n_headings,) [m] at which the headings are the cable's direction."""
-        if self.element == "arc":
+        if self.nodal:
             return np.linspace(0.0, self.length, self.n + 1)
         return (np.arange(self.n) + 0.5) * self.h
 
@@ -136,6 +145,8 @@ class Chain:
         end_heading: ca.SX | float = 0.0,
         stretch: ca.SX | float = 1.0,
         ratio: ca.SX | None = None,
+        rest: ca.SX | None = None,
+        bow: ca.SX | None = None,
     ) -> Curve:
         """Build the curve of the headings `phi`.
 
@@ -150,6 +161,10 @@ class Chain:
             True length over declared length, the same everywhere.
         ratio : (n,), optional
             Length of each element over its declared length; `stretch` everywhere by default.
+        rest : (n,), optional [1/m]
+            Mean rest curvature of each element; arcs follow its variation inside.
+        bow : (n,), optional [rad]
+            How far the heading in the middle of an element lies beyond the mean of its ends.
         """
         bent = phi
         if self.element == "link":
@@ -159,14 +174,43 @@ class Chain:
                 bent = ca.vertcat(bent, end_heading)
         if ratio is None:
             ratio = ca.SX.ones(self.n) * stretch
-        return Curve(self, phi, bent, ratio, stretch, start)
+        own = ca.SX.zeros(self.n, 2)
+        if rest is not None and self.nodal:
+            variation = ca.DM(self.rest_variation) @ rest
+            own = self.h * stretch * ca.reshape(variation, self.n, 2)
+        bow = ca.SX.zeros(self.n) if bow is None else bow
+        return Curve(self, phi, bent, ratio, stretch, start, own, bow)
+
+    @property
+    def rest_variation(self) -> FloatArray:
+        """Linear and quadratic part (2 n, n) of the rest curvature in each element.
+
+        From the means m over the element and its neighbours, for x from -1/2 to 1/2,
+
+            kappa_0(x) = m_e + a x + c (x^2 - 1/12),
+            a = (m_(e+1) - m_(e-1)) / 2,   c = (m_(e+1) - 2 m_e + m_(e-1)) / 2
+
+        which is exact for parabolas. The first and last element continue their neighbour's.
+        """
+        linear, quadratic = np.zeros((self.n, self.n)), np.zeros((self.n, self.n))
+        if self.n == 2:
+            linear[:] = [-1.0, 1.0]
+            return np.concatenate([linear, quadratic])
+        for e in range(self.n):
+            middle = min(max(e, 1), self.n - 2)
+            around = slice(middle - 1, middle + 2)
+            quadratic[e, around] = [0.5, -1.0, 0.5]
+            linear[e, around] = [-0.5, 0.0, 0.5]
+            linear[e] += 2 * (e - middle) * quadratic[e]
+        return np.concatenate([linear, quadratic])
 
 
 @dataclass(frozen=True)
 class Curve:
     """A planar curve, seen by effects through position, heading and strain at an arc length.
 
-    Arc lengths `s` are material coordinates in [0, declared length].
+    Arc lengths `s` are material coordinates in [0, declared length]. The bow enters positions to
+    second order: of the fourth order in the element's length is what that leaves out.
     """
 
     chain: Chain
@@ -175,23 +219,39 @@ class Curve:
     ratio: ca.SX
     stretch: ca.SX | float
     start: ca.SX
+    own: ca.SX
+    bow: ca.SX
+
+    def _own_turn(self, e: int, u: ca.SX | float) -> ca.SX:
+        """Heading of the rest shape beyond its linear part; zero at both ends of element e."""
+        x = u - 0.5
+        return self.own[e, 0] * (x * x - 0.25) / 2 + self.own[e, 1] * x * (x * x - 0.25) / 3
 
     def _heading_in(self, e: int, u: ca.SX | float) -> ca.SX:
-        """Heading in element e at the fraction u of its length."""
-        if self.chain.element == "link":
+        """Heading in element e at the fraction u of its length, without the bow."""
+        if not self.chain.nodal:
             return self.phi[e]
-        return self.phi[e] + u * (self.phi[e + 1] - self.phi[e])
+        return self.phi[e] + u * (self.phi[e + 1] - self.phi[e]) + self._own_turn(e, u)
+
+    def _tangent(self, e: int, u: ca.SX | float) -> ca.SX:
+        """Derivative of position by s in element e (2,) [1]."""
+        heading = self._heading_in(e, u)
+        c, s = ca.cos(heading), ca.sin(heading)
+        straight = self.ratio[e] * ca.vertcat(c, s)
+        if self.chain.element != "quadratic":
+            return straight
+        turn = 4 * u * (1 - u) * self.bow[e]
+        bowed = turn * ca.vertcat(-s, c) - turn * turn / 2 * ca.vertcat(c, s)
+        return straight + self.stretch * bowed
 
     def _advance(self, e: int, u: ca.SX | float) -> ca.SX:
         """Vector from the start of element e to the fraction u of its length [m]."""
-        if self.chain.element == "link":
-            t = ca.vertcat(ca.cos(self.phi[e]), ca.sin(self.phi[e]))
-            return self.chain.h * self.ratio[e] * u * t
+        if not self.chain.nodal:
+            return self.chain.h * u * self._tangent(e, u)
         total = ca.SX.zeros(2)
         for node, weight in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
-            heading = self._heading_in(e, u * node)
-            total += weight * ca.vertcat(ca.cos(heading), ca.sin(heading))
-        return self.chain.h * self.ratio[e] * u * total
+            total += weight * self._tangent(e, u * node)
+        return self.chain.h * u * total
 
     @property
     def strain(self) -> ca.SX:
@@ -210,7 +270,7 @@ class Curve:
     @property
     def node_headings(self) -> ca.SX:
         """Direction of the cable at the nodes (n + 1,) [rad]; of links, the mean of neighbours."""
-        if self.chain.element == "arc":
+        if self.chain.nodal:
             return self.phi
         last = self.chain.n - 1
         return ca.vertcat(self.phi[0], (self.phi[1:] + self.phi[:-1]) / 2, self.phi[last])
@@ -238,6 +298,8 @@ class Curve:
         for i in range(self.chain.n_headings - 1):
             u = ca.fmin(ca.fmax((s - places[i]) / self.chain.h, 0), 1)
             total = total + u * (self.phi[i + 1] - self.phi[i])
+            if self.chain.nodal:
+                total = total + self._own_turn(i, u) + 4 * u * (1 - u) * self.bow[i]
         return total
 
     @property
@@ -259,14 +321,9 @@ class Curve:
         h, n = self.chain.h, self.chain.n
         total = self.chain.length * self.start
         for e in range(n):
-            if self.chain.element == "link":
-                weight = h * (n - e - 0.5)
-                t = ca.vertcat(ca.cos(self.phi[e]), ca.sin(self.phi[e]))
-                total = total + weight * h * self.ratio[e] * t
+            if not self.chain.nodal:
+                total = total + h * h * (n - e - 0.5) * self._tangent(e, 0.5)
                 continue
             for node, gauss in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
-                heading = self._heading_in(e, node)
-                weight = gauss * h * (n - e - node)
-                t = ca.vertcat(ca.cos(heading), ca.sin(heading))
-                total = total + weight * h * self.ratio[e] * t
+                total = total + gauss * h * h * (n - e - node) * self._tangent(e, node)
         return total

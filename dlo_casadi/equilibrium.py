@@ -298,7 +298,7 @@ def _from_start(
     ends = pose.vector
     deviation = np.zeros(len(DEVIATIONS))
     n_bends = chain.n_headings - 1
-    x0 = np.concatenate([phi, np.zeros(chain.n if model.extensible else 0)])
+    x0 = np.concatenate([phi, np.zeros(model.n_inner)])
     bounds = np.concatenate([np.zeros(model.n_conditions), np.full(n_bends, JOINT_BOUND)])
     out = solver(x0=x0, p=np.concatenate([p, rest, ends, deviation]), lbg=-bounds, ubg=bounds)
     stats = stats_of(solver)

@@ -46,6 +46,16 @@ STIFFNESS_PRIOR_STD = float(np.log(1e3))
 DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading", "pull_x", "pull_y")
 
 
+def _stiffening(x: ca.SX) -> ca.SX:
+    """Stiffness 1 + x of a bow under tension; under compression x < 0 it stays above 1/4.
+
+    Elements of a limp cable would buckle one by one on the way to an equilibrium. Twice
+    differentiable, and 1 + x + O(x^3) everywhere.
+    """
+    pressed = 4 / 3 * ca.fmin(x, 0)
+    return ca.fmax(x, 0) + 0.25 + 0.75 / (1 - pressed + pressed**2)
+
+
 @dataclass(frozen=True)
 class CableModel:
     """An elastic cable between two fixtures in a plane.
@@ -55,7 +65,7 @@ class CableModel:
     cable : Cable
     n : int
         Number of elements.
-    element : "arc" or "link"
+    element : "quadratic", "arc" or "link"
     start : "pinned" or "clamped"
     end : "pinned", "clamped" or "free"
     gravity : (float, float) [m/s^2]
@@ -75,7 +85,7 @@ class CableModel:
 
     cable: Cable
     n: int = 40
-    element: Element = "arc"
+    element: Element = "quadratic"
     start: StartKind = "pinned"
     end: EndKind = "pinned"
     gravity: tuple[float, float] = (0.0, -9.81)
@@ -204,7 +214,7 @@ class CableModel:
         """Number of end conditions: end position, then headings of clamped arcs."""
         position = 0 if self.end == "free" else 2
         headings = 0
-        if self.element == "arc":
+        if self.chain.nodal:
             headings = (self.start == "clamped") + (self.end == "clamped")
         return position + headings
 
@@ -212,7 +222,7 @@ class CableModel:
     def condition_names(self) -> tuple[str, ...]:
         """Names of the end conditions, for messages."""
         names = [] if self.end == "free" else ["end_position_x", "end_position_y"]
-        if self.element == "arc":
+        if self.chain.nodal:
             names += ["start_heading"] if self.start == "clamped" else []
             names += ["end_heading"] if self.end == "clamped" else []
         return tuple(names)
@@ -259,22 +269,64 @@ class CableModel:
         """Whether some effect lets the cable stretch under tension."""
         return any(effect.extensible for effect, _ in self._slot(Kinematics))
 
-    def _curve(self, ratio: ca.SX | None = None) -> Curve:
+    def _curve(self, ratio: ca.SX | None = None, bow: ca.SX | None = None) -> Curve:
         held = self._held
         return self.chain.curve(
-            self._phi, held.start, held.start_heading, held.end_heading, self._stretch, ratio
+            self._phi,
+            held.start,
+            held.start_heading,
+            held.end_heading,
+            self._stretch,
+            ratio,
+            self._rest,
+            bow,
         )
+
+    @property
+    def bowed(self) -> bool:
+        """Whether the elements bow."""
+        return self.element == "quadratic"
+
+    @property
+    def yields(self) -> bool:
+        """Whether the end moves with the force on it while the headings stay."""
+        return self.extensible or self.bowed
+
+    def _section(self, bend: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Section laws by cell, for the energy EI/2 factor law(bend) per length.
+
+        Returns law, its first and second derivative by the bend, and the mean and half the
+        difference of the factors of the cell's two halves.
+        """
+        cells, k = self.chain.cells, ca.SX.sym("bend", self.chain.n_cells)
+        middle = cells.mean(axis=1)
+        halves = [np.stack(pair, axis=1) for pair in ((cells[:, 0], middle), (middle, cells[:, 1]))]
+        law, first, second = k**2, ca.SX(1), ca.SX(1)
+        for effect, local in self._slot(SectionLaw):
+            factor = effect.factor(k, cells, self.cable, local)
+            if ca.depends_on(factor, k) or not self.bowed:
+                law = law * factor
+            else:
+                first = first * effect.factor(k, halves[0], self.cable, local)
+                second = second * effect.factor(k, halves[1], self.cable, local)
+        slope = ca.gradient(ca.sum1(law), k)
+        function = ca.Function("law", [k, self._p], [law, slope, ca.gradient(ca.sum1(slope), k)])
+        return *function(bend, self._p), (first + second) / 2, (first - second) / 2
+
+    def _bending_energy(self, curve: Curve) -> ca.SX:
+        """Bending energy [J]; to second order in the bows, orthogonal to the cell's mean bend."""
+        width = ca.DM(np.diff(self.chain.cells, axis=1).ravel())
+        law, slope, curvature, mean, difference = self._section(curve.strain - self._rest)
+        density = mean * law
+        if self.bowed:
+            # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
+            bowed = 4 / np.sqrt(3) * curve.bow / (width * self._stretch)
+            density += mean * curvature * bowed**2 / 2 + difference * slope * bowed
+        return self._p[0] / 2 * ca.dot(width, density) * self._stretch
 
     def _energy(self, curve: Curve) -> ca.SX:
         """Energy of bending, weight, loads and holders [J], without stretching."""
-        cells = self.chain.cells
-        bend = curve.strain - self._rest
-        density = self._p[0] / 2 * bend**2
-        for effect, local in self._slot(SectionLaw):
-            density = density * effect.factor(bend, cells, self.cable, local)
-        width = ca.DM(np.diff(cells, axis=1).ravel())
-        energy = ca.dot(width, density) * self._stretch
-
+        energy = self._bending_energy(curve)
         gravity = ca.SX(ca.DM(self.gravity))
         loads = self._slot(Load)
         for effect, local in loads:
@@ -292,7 +344,7 @@ class CableModel:
         rows = []
         if self.end != "free":
             rows.append(curve.nodes[self.n, :].T - held.end)
-        if self.element == "arc":
+        if self.chain.nodal:
             if self.start == "clamped":
                 rows.append(curve.start_direction - held.start_heading)
             if self.end == "clamped":
@@ -301,35 +353,59 @@ class CableModel:
 
     @cached_property
     def _lagrangian(self) -> tuple[ca.SX, Curve]:
-        """Lagrangian and the stretched curve, functions of headings and multipliers."""
-        if not self.extensible:
-            curve = self._curve()
-            return self._energy(curve) + ca.dot(self._lam, self._conditions(curve)), curve
-        ratio = ca.SX.sym("ratio", self.n)
-        curve = self._curve(ratio)
+        """Lagrangian and the stretched, bowed curve, functions of headings and multipliers."""
+        ratio, bow = ca.SX.sym("ratio", self.n), ca.SX.sym("bow", self.n)
+        uniform, none = ca.SX.ones(self.n) * self._stretch, ca.SX.zeros(self.n)
+        curve = self._curve(ratio if self.extensible else uniform, bow if self.bowed else none)
         plain = self._energy(curve) + ca.dot(self._lam, self._conditions(curve))
-        uniform = ca.SX.ones(self.n) * self._stretch
-        tension = ca.substitute(-ca.gradient(plain, ratio) / self.chain.h, ratio, uniform)
-        stored = self._compliance * self.chain.h * ca.sumsqr(tension) / 2
-        lagrangian = ca.substitute(plain, ratio, uniform) - stored
-        return lagrangian, self._curve(uniform + self._compliance * tension)
+
+        def rigid(*expressions: ca.SX) -> list[ca.SX]:
+            """Without stretching and bowing."""
+            found: list[ca.SX] = ca.substitute([*expressions], [ratio, bow], [uniform, none])
+            return found
+
+        (lagrangian,) = rigid(plain)
+        stretched, bowed = uniform, none
+        if self.extensible:
+            (tension,) = rigid(-ca.gradient(plain, ratio) / self.chain.h)
+            lagrangian -= self._compliance * self.chain.h * ca.sumsqr(tension) / 2
+            stretched = uniform + self._compliance * tension
+        if self.bowed:
+            torque, ones = ca.gradient(plain, bow), ca.SX.ones(self.n)
+            elastic = ca.jtimes(ca.gradient(self._bending_energy(curve), bow), bow, ones)
+            torque, stiffness, elastic = rigid(torque, ca.jtimes(torque, bow, ones), elastic)
+            bowed = -torque / (elastic * _stiffening(stiffness / elastic - 1))
+            lagrangian += ca.dot(torque, bowed) / 2
+        return lagrangian, self._curve(stretched, bowed)
+
+    @property
+    def n_inner(self) -> int:
+        """Number of coordinates of `potential` beside the headings."""
+        return self.n * (self.extensible + self.bowed)
 
     @cached_property
     def potential(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         """Symbols (coordinates, parameters), energy [J] and end conditions of the minimisation.
 
-        min V(coordinates) s.t. conditions = 0. The coordinates are the headings and, for an
-        extensible cable, one a_e per element with the axial strain sqrt(C) a_e and the energy
-        h a_e^2 / 2. The parameters stack p, rest, ends, deviation.
+        min V(coordinates) s.t. conditions = 0. The coordinates are the headings, for an
+        extensible cable one a_e per element with the axial strain sqrt(C) a_e and the energy
+        h a_e^2 / 2, and for quadratic elements their bows. The parameters stack p, rest, ends,
+        deviation.
         """
         parameters = ca.vertcat(self._p, self._rest, self._ends, self._deviation)
-        if not self.extensible:
-            curve = self._curve()
-            return self._phi, parameters, self._energy(curve), self._conditions(curve)
-        axial = ca.SX.sym("axial", self.n)
-        curve = self._curve(self._stretch + ca.sqrt(self._compliance) * axial)
-        energy = self._energy(curve) + self.chain.h * ca.sumsqr(axial) / 2
-        return ca.vertcat(self._phi, axial), parameters, energy, self._conditions(curve)
+        axial = ca.SX.sym("axial", self.n if self.extensible else 0)
+        bow = ca.SX.sym("bow", self.n if self.bowed else 0)
+        ratio = self._stretch + ca.sqrt(self._compliance) * axial if self.extensible else None
+        curve = self._curve(ratio, bow if self.bowed else None)
+        energy, conditions = self._energy(curve), self._conditions(curve)
+        if self.bowed:
+            # To second order in the bows, as in the Lagrangian.
+            torque = ca.gradient(energy, bow)
+            stiffness = ca.jtimes(torque, bow, ca.SX.ones(self.n))
+            straight = ca.substitute([energy, torque, stiffness], [bow], [ca.SX.zeros(self.n)])
+            energy = straight[0] + ca.dot(straight[1], bow) + ca.dot(straight[2], bow**2) / 2
+        energy += self.chain.h * ca.sumsqr(axial) / 2
+        return ca.vertcat(self._phi, axial, bow), parameters, energy, conditions
 
     # ---- numerical functions -----------------------------------------------------------------
 
@@ -380,18 +456,18 @@ class CableModel:
         pushed = ca.jtimes(image, point, slope) if maps else slope
         move = ca.Function("move", [point, slope, heading, self._p, self._ends], [image, pushed])
         headings = curve.node_headings
-        slopes = curve.node_slopes if self.element == "arc" else ca.SX.zeros(self.n + 1, 2)
+        slopes = curve.node_slopes if self.chain.nodal else ca.SX.zeros(self.n + 1, 2)
         for i in range(self.n + 1):
             position, direction = move(
                 nodes[i, :].T, slopes[i, :].T, headings[i], self._p, self._ends
             )
             rows.append(ca.horzcat(position.T, direction.T))
         table = ca.vertcat(*rows)
-        return ca.densify(ca.vec(table if self.element == "arc" else table[:, :2]))
+        return ca.densify(ca.vec(table if self.chain.nodal else table[:, :2]))
 
     @cached_property
     def observation(self) -> ca.Function:
-        """Same arguments -> measured curve z and its derivatives by phi+lam, p, deviation.
+        """Same arguments -> measured curve z, its derivatives by phi+lam, p, rest, deviation.
 
         z stacks the columns x, y of the nodes and, for arcs, dx/ds, dy/ds: with cubic Hermite
         interpolation every measured point is a fixed linear function of z.
@@ -399,7 +475,8 @@ class CableModel:
         z = self._observed
         unknowns = ca.vertcat(self._phi, self._lam)
         blocks = [
-            ca.densify(ca.jacobian(z, symbol)) for symbol in (unknowns, self._p, self._deviation)
+            ca.densify(ca.jacobian(z, symbol))
+            for symbol in (unknowns, self._p, self._rest, self._deviation)
         ]
         return ca.Function("observation", self._arguments, [z, *blocks])
 

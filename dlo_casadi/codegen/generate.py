@@ -106,7 +106,7 @@ def numbers_of(split: Split, groups: list[Group]) -> list[float]:
 def _values(split: Split, groups: list[Group], prefix: str, digest: str) -> dict[str, str]:
     """What the templates' marks stand for."""
     model = split.model
-    kernels, loops = kernels_to_c(groups, split.n_x, model.extensible)
+    kernels, loops = kernels_to_c(groups, split.n_x, model.yields)
     rows = len(table_of(groups, split.slots))
     clamped = {side: int(getattr(model, side) == "clamped") for side in ("start", "end")}
     links = model.element == "link"
@@ -130,7 +130,8 @@ def _values(split: Split, groups: list[Group], prefix: str, digest: str) -> dict
         "FIRST": str(split.first),
         "LOW": str(clamped["start"]),
         "HIGH": str(split.n_x - clamped["end"]),
-        "ELASTIC": str(int(model.extensible)),
+        "STRETCHES": str(int(model.extensible)),
+        "ELASTIC": str(int(model.yields)),
         "PLACE": "0.5" if links else "0.0",
         "TABLE": table_to_c(numbers_of(split, groups)),
         "WIDTHS": str(rows),

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.codegen.program import Program
+from dlo_casadi.codegen.program import Program, on_symbols
 from dlo_casadi.errors import DloError
 from dlo_casadi.model import DEVIATIONS, CableModel
 
@@ -107,6 +107,22 @@ class Split:
             parts = [out[k] for k in self._program.operands(i)]
             low = min((part[0] for part in parts), default=self.n_x)
             out.append((low, max((part[1] for part in parts), default=-1)))
+        return out
+
+    @cached_property
+    def _known(self) -> list[float | None]:
+        """Value of each node that depends on numbers and the rest curvature only, else None."""
+        out: list[float | None] = []
+        for i, node in enumerate(self._program.nodes):
+            if node.op == ca.OP_CONST:
+                out.append(node.value)
+            elif node.op == ca.OP_INPUT:
+                out.append(float(self.rest[node.args[1]]) if node.args[0] == _REST else None)
+            else:
+                parts = [out[k] for k in self._program.operands(i)]
+                given = [ca.SX(part) for part in parts if part is not None]
+                known = len(given) == len(parts)
+                out.append(float(on_symbols(node.op, given)) if known else None)
         return out
 
     def _number(self, i: int) -> float | None:
@@ -234,17 +250,15 @@ class Split:
     def _text(self, i: int, j: int, numbers: list[float]) -> str:
         """Postfix text of a term; numbers are replaced by '#' and appended."""
         node = self._program.nodes[i]
+        known = self._known[i]
+        if known is not None:
+            numbers.append(known)
+            return "#"
         if node.op == ca.OP_INPUT:
             which, element = node.args
             if which == _X:
                 return "b" if element > j else "a"
             if which == _LAM:
                 return "uv"[element]
-            if which == _REST:
-                numbers.append(float(self.rest[element]))
-                return "#"
             raise DloError("the shape would depend on the place of the start fixture")
-        if node.op == ca.OP_CONST:
-            numbers.append(node.value)
-            return "#"
         return " ".join([*(self._text(k, j, numbers) for k in node.args), f"@{node.op}"])

@@ -324,7 +324,7 @@ class ModelOptions(Section):
 
     n: Annotated[int, Field(strict=True, ge=2, le=2000)] | None = None
     """Number of elements; chosen from the data when absent."""
-    element: Literal["arc", "link"] = "arc"
+    element: Literal["quadratic", "arc", "link"] = "quadratic"
     """arc (heading varies linearly in an element) or link (straight, as in the paper)."""
     effects: tuple[Annotated[DeclaredEffect, BeforeValidator(_as_effect)], ...] = ()
     """Effects beside bending and weight."""

@@ -224,17 +224,17 @@ class BatchProblem:
     ) -> Linearization:
         """Residuals and derivatives for given derivatives of the shapes and parameters."""
         p, rest = self.unknowns.p(point.theta), self.unknowns.rest(point.theta)
-        z, by_x, by_p, by_dev = self.sweep.observe(point.shapes, p, rest)
+        seen = self.sweep.observe(point.shapes, p, rest)
         columns = self.sweep.used_deviations
         out = Linearization([], [], [], [], [], sens)
         for j, s in zip(self.used, point.feet, strict=True):
-            curve = NodeCurve.of(self.unknowns.model.chain, z[j])
+            curve = NodeCurve.of(self.unknowns.model.chain, seen.z[j])
             normals = curve.normals(s)
             rows = normal_rows(curve, s, normals)
             white = self.whitening(j, s)
             d = ((self.measured[j].points - curve.at(s)) * normals).sum(axis=1)
-            theta_z = by_x[j] @ sens.theta[j] + by_p[j] @ slopes
-            deviation_z = (by_x[j] @ sens.deviation[j] + by_dev[j])[:, columns]
+            theta_z = seen.by_theta(j, sens, slopes)
+            deviation_z = seen.by_own(j, sens)[:, columns]
             out.residuals.append(white @ d)
             directions = -rows @ np.concatenate([theta_z, deviation_z], axis=1)
             whitened = white @ directions

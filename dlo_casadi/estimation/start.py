@@ -15,7 +15,7 @@ from dlo_casadi.estimation.observation import (
     chord_places,
     normal_rows,
 )
-from dlo_casadi.estimation.sweep import Sensitivities, Shapes
+from dlo_casadi.estimation.sweep import Sensitivities, Shapes, Sweep
 from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.floating]
@@ -37,6 +37,8 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     model, used = problem.unknowns.model, problem.used
     chain = model.chain
     m = len(problem.measured)
+    # Without forces an element does not know its bow.
+    sweep = problem.sweep if chain.element != "quadratic" else Sweep(model.with_mesh(chain.n, "arc"), problem.sweep.poses)
     flat = np.zeros(chain.n_cells)
     phi = np.array([guesses(model, item.pose, flat)[0] for item in problem.measured])
     feet: list[FloatArray] = []
@@ -46,13 +48,13 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
         feet.append(places)
     shapes = Shapes(phi, np.zeros((m, model.n_conditions)), np.zeros((m, len(DEVIATIONS))))
     for iteration in range(_KINEMATIC_STEPS + 1):
-        z, by_x, _, _ = problem.sweep.observe(shapes, model.nominal, flat)
+        seen = sweep.observe(shapes, model.nominal, flat)
         for k, j in enumerate(used):
-            curve = NodeCurve.of(chain, z[j])
+            curve = NodeCurve.of(chain, seen.z[j])
             if iteration > 1:
                 feet[k] = curve.feet(problem.measured[j].points, feet[k])
             if iteration < _KINEMATIC_STEPS:
-                slopes = by_x[j][:, : chain.n_headings]
+                slopes = seen.by_x[j][:, : chain.n_headings]
                 phi[j] += _kinematic_step(
                     problem.measured[j], model, curve, slopes, phi[j], feet[k]
                 )
@@ -200,16 +202,16 @@ def _predicted(
     """Whitened residuals after the correction, and their Jacobians by theta and deviations."""
     unknowns, sweep = problem.unknowns, problem.sweep
     p, rest = unknowns.p(point.theta), unknowns.rest(point.theta)
-    z, by_x, by_p, by_dev = sweep.observe(point.shapes, p, rest)
+    seen = sweep.observe(point.shapes, p, rest)
     out = []
     for j, s in zip(problem.used, point.feet, strict=True):
-        curve = NodeCurve.of(unknowns.model.chain, z[j])
+        curve = NodeCurve.of(unknowns.model.chain, seen.z[j])
         normals = curve.normals(s)
         rows = normal_rows(curve, s, normals)
         d = ((problem.measured[j].points - curve.at(s)) * normals).sum(axis=1)
-        d = d - rows @ (by_x[j] @ correction[j])
+        d = d - rows @ (seen.by_x[j] @ correction[j])
         white = problem.whitening(j, s)
-        theta_z = by_x[j] @ sens.theta[j] + by_p[j] @ slopes
-        deviation_z = (by_x[j] @ sens.deviation[j] + by_dev[j])[:, sweep.used_deviations]
+        theta_z = seen.by_theta(j, sens, slopes)
+        deviation_z = seen.by_own(j, sens)[:, sweep.used_deviations]
         out.append((white @ d, -white @ (rows @ theta_z), -white @ (rows @ deviation_z)))
     return out

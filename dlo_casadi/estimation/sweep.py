@@ -47,11 +47,38 @@ class Sensitivities:
     """Derivatives of the stacked equilibria.
 
     `theta` (m, N, size) by the unknowns, `deviation` (m, N, len(DEVIATIONS)) by each pose's own
-    deviation; N counts headings and multipliers.
+    deviation; N counts headings and multipliers. `rest` (m, n_cells, size) is that of the rest
+    curvature which each pose finds.
     """
 
     theta: FloatArray
     deviation: FloatArray
+    rest: FloatArray
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Measured curves `z` (m, nz) and their direct derivatives (m, nz, ...).
+
+    `by_x` by headings and multipliers, `by_p`, `by_rest` by the rest curvature that the pose
+    finds, `by_deviation`.
+    """
+
+    z: FloatArray
+    by_x: FloatArray
+    by_p: FloatArray
+    by_rest: FloatArray
+    by_deviation: FloatArray
+
+    def by_theta(self, j: int, sens: Sensitivities, slopes: FloatArray) -> FloatArray:
+        """Derivative (nz, size) of pose j by the unknowns, through its equilibrium."""
+        return (
+            self.by_x[j] @ sens.theta[j] + self.by_p[j] @ slopes + self.by_rest[j] @ sens.rest[j]
+        )
+
+    def by_own(self, j: int, sens: Sensitivities) -> FloatArray:
+        """Derivative (nz, len(DEVIATIONS)) of pose j by its deviation."""
+        return self.by_x[j] @ sens.deviation[j] + self.by_deviation[j]
 
 
 class _Mapped:
@@ -247,26 +274,28 @@ class Sweep:
         if not self.model.has_state:
             right = np.concatenate([direct + by_rest @ rest_slopes, by_deviation], axis=2)
             solved = -np.linalg.solve(matrix, right)
-            return Sensitivities(solved[:, :, :size], solved[:, :, size:])
+            found = np.broadcast_to(rest_slopes, (self.m, *rest_slopes.shape))
+            return Sensitivities(solved[:, :, :size], solved[:, :, size:], found)
         solved = -np.linalg.solve(matrix, np.concatenate([direct, by_rest, by_deviation], axis=2))
         n_cells = rest_slopes.shape[0]
         carry = self._carry(shapes, p, rests)
         change = rest_slopes
-        rows = []
+        rows, found = [], []
         for j in range(self.m):
+            found.append(change)
             total = solved[j, :, :size] + solved[j, :, size : size + n_cells] @ change
             rows.append(total)
             by_phi, by_before, by_own = carry[j]
             change = by_phi @ total[: self.n_phi] + by_before @ change + by_own @ slopes
-        return Sensitivities(np.array(rows), solved[:, :, size + n_cells :])
+        return Sensitivities(np.array(rows), solved[:, :, size + n_cells :], np.array(found))
 
     def observe(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Observation vectors (m, nz) and their derivatives by unknowns, p and deviation."""
+    ) -> Observations:
+        """Measured curves and their derivatives."""
         rests = self.rests(shapes, p, rest)
-        z, by_x, by_p, by_deviation = self._call("observation", shapes, p, rests)
-        return z[:, :, 0], by_x, by_p, by_deviation
+        z, *slopes = self._call("observation", shapes, p, rests)
+        return Observations(z[:, :, 0], *slopes)
 
     def shapes_seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Observation vectors (m, nz) only."""

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.chain import ELEMENTS
 from dlo_casadi.config import Config, dump_yaml, read_yaml
 from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
 from dlo_casadi.errors import ConfigError, DloError
@@ -312,7 +313,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     model = CableModel(
         cable=cable,
         n=int(document["n"]),
-        element=_one_of(document["element"], ("arc", "link"), "element"),
+        element=_one_of(document["element"], ELEMENTS, "element"),
         start=_one_of(boundary["start"], ("pinned", "clamped"), "boundary.start"),
         end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary.end"),
         gravity=(float(gravity[0]), float(gravity[1])),

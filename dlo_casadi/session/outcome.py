@@ -169,7 +169,7 @@ class Discretization:
     """Mesh of the model and the largest shape error [m] it causes, from two meshes."""
 
     n: int
-    element: Literal["arc", "link"]
+    element: Literal["quadratic", "arc", "link"]
     error: float
 
 
