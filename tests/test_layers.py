@@ -25,7 +25,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 # A session: what is declared and measured -> stages and findings -> one outcome.
 MAY_IMPORT["session"] = set(MAY_IMPORT)
 MAY_IMPORT["report"] = set(MAY_IMPORT)
-MAY_IMPORT["predict"] = MECHANICS | {"config", "estimation", "report"}
+MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 
