@@ -21,6 +21,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": MECHANICS | {"config", "measurements"},
     "diagnosis": MECHANICS | {"config", "measurements", "estimation"},
     "codegen": MECHANICS | {"config"},
+    "executors": {"errors"},
+    "parallel": {"errors", "executors", "vision"},
 }
 # A session: what is declared and measured -> stages and findings -> one outcome.
 MAY_IMPORT["session"] = set(MAY_IMPORT)
