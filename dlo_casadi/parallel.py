@@ -141,7 +141,7 @@ def map_as_completed(
 
     def room() -> int:
         # Asked anew each time: workers of a cluster come and go.
-        most: int = in_flight or getattr(executor, "capacity", 2)
+        most = in_flight or int(getattr(executor, "capacity", 2))
         return max(0, most - len(under_way))
 
     def submit(task: _Task[Item]) -> None:
