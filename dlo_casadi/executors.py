@@ -14,21 +14,39 @@ import os
 import platform
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from dlo_casadi.errors import DloError
 
-# Read by BLAS and OpenMP when they are loaded: set before a worker starts.
-THREADS = (
-    *("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
-    "VECLIB_MAXIMUM_THREADS",
+# Read by BLAS, OpenMP and OpenCV when they are loaded.
+THREADS = dict.fromkeys(
+    (
+        *("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
+        *("VECLIB_MAXIMUM_THREADS", "OPENCV_FOR_THREADS_NUM"),
+    ),
+    "1",
 )
 # How long a scheduler may take to answer, and to have a worker [s].
 PATIENCE = 30.0
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set variables of the environment; what was set before is put back."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 class InProcess(Executor):
@@ -66,8 +84,9 @@ class Pool(Executor):
         self.capacity = 2 * workers
         self.logs = logs
         self._others = set(multiprocessing.active_children())
-        self._before = {name: os.environ.get(name) for name in THREADS}
-        os.environ.update(dict.fromkeys(THREADS, "1"))
+        # A worker inherits it, and loads its libraries after that.
+        self._environment = ExitStack()
+        self._environment.enter_context(environment(THREADS))
         self._inner = self._start()
 
     def _start(self) -> ProcessPoolExecutor:
@@ -95,11 +114,7 @@ class Pool(Executor):
         if not wait:
             for process in own:
                 process.terminate()
-        for name, value in self._before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        self._environment.close()
 
 
 class Cluster(Executor):
@@ -231,6 +246,9 @@ def _begin_worker(logs: str | None) -> None:
     if logs is not None:
         stream = open(log_file(Path(logs)), "a")  # noqa: SIM115 (as long as the process)
         faulthandler.enable(stream)
+        # What libraries print would tear the progress of the parent.
+        for number in (1, 2):
+            os.dup2(stream.fileno(), number)
 
 
 def _end_with(sentinel: int) -> None:

@@ -21,12 +21,14 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": MECHANICS | {"config", "measurements"},
     "diagnosis": MECHANICS | {"config", "measurements", "estimation"},
     "codegen": MECHANICS | {"config"},
+    "durable": {"errors"},
     "executors": {"errors"},
     "parallel": {"errors", "executors", "vision"},
 }
 # A session: what is declared and measured -> stages and findings -> one outcome.
 MAY_IMPORT["session"] = set(MAY_IMPORT)
 MAY_IMPORT["report"] = set(MAY_IMPORT)
+MAY_IMPORT["fleet"] = set(MAY_IMPORT)
 MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 

@@ -16,6 +16,7 @@ from dlo_casadi.cli.guard import BAD_INPUT, OK, guarded
 # Subcommand -> what it does. Its module of the same name is imported only when it is called.
 COMMANDS = {
     "fit": "fit a cable to its photographs or centre-lines and report what was found",
+    "fit-many": "fit many sessions, on many cores or machines, into one table",
     "predict": "predict the shape of a fitted cable from where its ends are held",
     "generate-solver": "write the C solver of a fitted cable for planners to embed",
 }
