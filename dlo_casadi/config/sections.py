@@ -341,6 +341,8 @@ class EstimationOptions(Section):
     """Its inner minimisation: ipopt, or cobyla as in the paper (about 1 s a pose)."""
     robust: Switch = False
     """Whether outlying points weigh less."""
+    plausibility: Switch = True
+    """Whether lines that contradict units, ends or gravity as declared stop the fit."""
     rest_curvature_coefficients: Count | None = None
     """Number of coefficients of the rest curvature; chosen from the data when absent."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -24,17 +24,27 @@ def read_poses(
 ) -> tuple[tuple[PoseInput, ...], tuple[MeasuredPose, ...]]:
     """Read all poses in the order in which they were taken.
 
-    A pose that cannot be read keeps its end conditions, for the history, and says why.
+    Raises
+    ------
+    MeasurementError
+        If no fit pose can be read; its text lists the reasons.
+
+    See Also
+    --------
+    read_inputs : the first half, which raises nothing.
+    measured_poses : the second half.
+    """
+    inputs = read_inputs(config, step)
+    return inputs, measured_poses(config, inputs)
+
+
+def read_inputs(config: Config, step: Callable[[str, int, int], None]) -> tuple[PoseInput, ...]:
+    """Read all poses; one that cannot be read keeps its name and says why.
 
     Parameters
     ----------
     step : callable
         Called with the pose's file name, how many are done and how many there are.
-
-    Raises
-    ------
-    MeasurementError
-        If no fit pose can be read; its text lists the reasons.
     """
     skipped = {item.name: item.reason for item in config.skipped}
     poses = config.experiment.poses
@@ -49,14 +59,45 @@ def read_poses(
             item = PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=error.message)
         inputs.append(item)
     step("", len(poses), len(poses))
+    return tuple(inputs)
+
+
+def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[MeasuredPose, ...]:
+    """What was read, with its end conditions, for the fit.
+
+    A pose that cannot be read keeps its end conditions, for the history.
+
+    Raises
+    ------
+    MeasurementError
+        If no fit pose could be read; its text lists the reasons.
+    """
     if not any(len(item.points) and item.role == "fit" for item in inputs):
         reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
         raise MeasurementError(f"no fit pose could be read:\n{reasons}")
-    measured = tuple(
+    return tuple(
         MeasuredPose(conditions(pose), item.points, item.weight, pose.role == "held_out")
-        for pose, item in zip(poses, inputs, strict=True)
+        for pose, item in zip(config.experiment.poses, inputs, strict=True)
     )
-    return tuple(inputs), measured
+
+
+def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
+    """The line (K, 2) [m] in a photograph as if its end were free; None if there is none.
+
+    It ends where the cable does, and not where the configuration says.
+    """
+    try:
+        image = vision.read_image(pose.file)
+        return vision.extract_centerline(
+            image,
+            view_of(config, image),
+            start=pose.start,
+            end=None,
+            diameter=config.cable.diameter,
+            length=config.cable.length,
+        ).points
+    except MeasurementError:
+        return None
 
 
 def conditions(pose: DeclaredPose) -> Pose:

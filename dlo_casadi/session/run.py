@@ -17,6 +17,7 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import stiffness_interval
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model import CableModel
+from dlo_casadi.session.checks import raise_if_implausible
 from dlo_casadi.session.declared import Declared, declared_model, straight
 from dlo_casadi.session.findings import candidate_rows, effect_rows, next_pose_row, unexplained_row
 from dlo_casadi.session.fitting import (
@@ -26,7 +27,7 @@ from dlo_casadi.session.fitting import (
     reweighted,
     solved_by_ipopt,
 )
-from dlo_casadi.session.measure import read_poses
+from dlo_casadi.session.measure import measured_poses, read_inputs
 from dlo_casadi.session.outcome import Discretization, MeasurementSummary, Outcome, PoseInput, Stage
 from dlo_casadi.session.progress import Clock, Progress, Silent
 from dlo_casadi.session.remarks import fit_warnings, reading_warnings
@@ -39,7 +40,7 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     Raises
     ------
     MeasurementError
-        If no fit pose can be read.
+        If no fit pose can be read, or if the lines contradict the configuration beyond doubt.
     ConfigError
         If the configuration names an unknown effect.
     EstimationError
@@ -47,9 +48,11 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     """
     progress = progress or Silent()
     clock = Clock()
-    inputs, measured = read_poses(config, lambda name, k, m: progress.step(f"read {name}", k, m))
+    inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
+    odd = raise_if_implausible(config, inputs)
+    measured = measured_poses(config, inputs)
     clock.lap("vision")
-    warnings = [*config.warnings, *reading_warnings(inputs)]
+    warnings = [*config.warnings, *reading_warnings(inputs), *odd]
     declared = declared_model(config, _center(inputs), _pixel(inputs))
 
     progress.step("fit the declared model", 0, 1)
