@@ -17,6 +17,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -159,8 +160,32 @@ class Cluster(Executor):
                 f"the Dask scheduler at {address} has had no worker for {PATIENCE:g} s.\n"
                 f"  Try: `dask worker {address} --nworkers 2 --nthreads 1`"
             ) from None
+        try:
+            self._check_software()
+        except DloError:
+            self._client.close()
+            raise
         # Equal calls are different tasks: each is one row, one sample.
         self._inner = self._client.get_executor(pure=False)
+
+    def _check_software(self) -> None:
+        """Other versions give other digits: results must not depend on the worker."""
+        own = software()
+        try:
+            theirs: dict[str, dict[str, str]] = self._client.run(software)
+        except ImportError as error:
+            raise DloError(
+                f"a worker of the cluster cannot import dlo_casadi: {error}.\n"
+                "  Try: the same environment on all machines."
+            ) from None
+        for worker, found in theirs.items():
+            other = [f"{name} {found[name]}" for name in own if found[name] != own[name]]
+            if other:
+                mine = ", ".join(f"{name} {own[name]}" for name in own if found[name] != own[name])
+                raise DloError(
+                    f"worker {worker} has {', '.join(other)}, this machine {mine}.\n"
+                    "  Try: the same environment on all machines."
+                )
 
     @property
     def workers(self) -> int:
@@ -255,6 +280,12 @@ def _end_with(sentinel: int) -> None:
     """A worker whose parent was killed would wait for work for ever."""
     multiprocessing.connection.wait([sentinel])
     os._exit(1)
+
+
+def software() -> dict[str, str]:
+    """Versions on which the digits of results depend."""
+    packages = ("dlo-casadi", "casadi", "numpy", "scipy", "opencv-contrib-python-headless")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
 def worker_name() -> str:

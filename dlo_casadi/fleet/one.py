@@ -14,7 +14,6 @@ from dlo_casadi.fleet.columns import Row, empty_row, row_of
 from dlo_casadi.fleet.discover import Session
 from dlo_casadi.fleet.store import write_row
 from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import run_session
 
 
@@ -87,6 +86,9 @@ def _fitted(job: Job, begin: float) -> Row:
         diagnosis = config.diagnosis.model_copy(update={"enabled": False})
         config = replace(config, diagnosis=diagnosis)
     if job.options.reports:
+        # It brings the libraries that draw; without figures a worker starts in half the time.
+        from dlo_casadi.report.writer import ResultsFolder
+
         with ResultsFolder(job.folder) as folder:
             outcome = run_session(config)
             folder.write(outcome)
