@@ -88,14 +88,8 @@ def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
     """
     try:
         image = vision.read_image(pose.file)
-        return vision.extract_centerline(
-            image,
-            view_of(config, image),
-            start=pose.start,
-            end=None,
-            diameter=config.cable.diameter,
-            length=config.cable.length,
-        ).points
+        free = pose.model_copy(update={"end": None})
+        return _extract(config, free, image, view_of(config, image)).points
     except MeasurementError:
         return None
 
@@ -124,15 +118,12 @@ def _read_csv(pose: DeclaredPose) -> PoseInput:
 
 def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
     image = vision.read_image(pose.file)
-    view = view_of(config, image)
-    line = vision.extract_centerline(
-        image,
-        view,
-        start=pose.start,
-        end=pose.end,
-        diameter=config.cable.diameter,
-        length=config.cable.length,
-    )
+    try:
+        view = view_of(config, image)
+        line = _extract(config, pose, image, view)
+    except MeasurementError as error:
+        hint = _turned(config, pose, image)
+        raise MeasurementError(f"{error.message}{hint}") from None
     kept = slice(None, None, max(1, -(-len(line.points) // MOST_POINTS)))
     return PoseInput(
         pose.name,
@@ -146,8 +137,79 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
         weight=(line.std / np.median(line.std))[kept],
         coverage=line.coverage,
         confidence=line.confidence,
-        messages=line.messages,
+        messages=(*line.messages, *_marker_messages(config, view)),
+        markers=view.numbers,
     )
+
+
+def _extract(
+    config: Config,
+    pose: DeclaredPose,
+    image: np.ndarray,
+    view: vision.View,
+    workings: vision.Workings | None = None,
+) -> vision.Centerline:
+    return vision.extract_centerline(
+        image,
+        view,
+        start=pose.start,
+        end=pose.end,
+        diameter=config.cable.diameter,
+        length=config.cable.length,
+        workings=workings,
+    )
+
+
+def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
+    """Pictures (h, w, 3) of each step of the camera, as far as it comes, by the step's name.
+
+    Raises
+    ------
+    VisionError
+        If the photograph cannot be read.
+    """
+    image = vision.read_image(pose.file)
+    view, line, workings = None, None, vision.Workings()
+    try:
+        view = view_of(config, image)
+        line = _extract(config, pose, image, view, workings)
+    except MeasurementError:  # the pictures show how far it came; the table says why
+        pass
+    return vision.draw_steps(image, view, workings, line, pose.start, pose.end)
+
+
+def _marker_messages(config: Config, view: vision.View) -> list[str]:
+    """Sentences on markers of the board that were not used."""
+    measurement = config.experiment.measurement
+    if measurement.kind != "images" or measurement.board is None:
+        return []
+    declared = set(measurement.board.marker_centers)
+    used = f"{len(view.numbers)} of {len(declared)} are used"
+    lost = sorted(declared - set(view.numbers) - set(view.misplaced))
+    messages = [f"marker {n} not found; {used}" for n in lost]
+    messages += [f"marker {n} is not where it is declared; {used}" for n in view.misplaced]
+    return messages
+
+
+def _turned(config: Config, pose: DeclaredPose, image: np.ndarray) -> str:
+    """Sentence for a photograph that can be measured once it is turned.
+
+    A board's markers tell the way up; two reference points do not.
+    """
+    measurement = config.experiment.measurement
+    if measurement.kind != "images" or measurement.reference is None:
+        return ""
+    for quarters in (2, 1, 3):
+        turned = np.ascontiguousarray(np.rot90(image, quarters))
+        try:
+            _extract(config, pose, turned, view_of(config, turned))
+        except MeasurementError:
+            continue
+        return (
+            f" The cable is found once the photograph is turned by {90 * quarters} degrees "
+            "counter-clockwise: turn it, or read the reference's pixels again."
+        )
+    return ""
 
 
 def view_of(config: Config, image: np.ndarray) -> vision.View:
@@ -158,6 +220,7 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
         reference = vision.Reference(
             np.array(measurement.reference.pixels), np.array(measurement.reference.points)
         )
+        _check_reference(reference.pixels, image.shape)
         return vision.from_reference(reference, image.shape)
     assert measurement.board is not None
     declared = measurement.board
@@ -170,3 +233,15 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
             np.array(measurement.camera.matrix), np.array(measurement.camera.distortion)
         )
     return vision.locate_board(image, board, camera)
+
+
+def _check_reference(pixels: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Raise if a reference point lies outside of the photograph."""
+    height, width = shape[:2]
+    for u, v in pixels:
+        if not (0 <= u < width and 0 <= v < height):
+            raise MeasurementError(
+                f"the reference point ({u:g}, {v:g}) px lies outside of the picture of {width} x "
+                f"{height} px. Try: was the picture turned by 90 degrees or made smaller since "
+                "the pixels were read?"
+            )
