@@ -51,7 +51,10 @@ def main(argv: Sequence[str]) -> int:
         diagnosis = config.diagnosis.model_copy(update={"enabled": False})
         config = replace(config, diagnosis=diagnosis)
     output = chosen.output or Path("results") / config.name
-    with ResultsFolder(output) as folder, Watch(Console(stderr=True), chosen.quiet) as watch:
+    with (
+        ResultsFolder(output, config) as folder,
+        Watch(Console(stderr=True), chosen.quiet) as watch,
+    ):
         outcome = run_session(config, watch)
         watch.step("write the results", 0, 1)
         folder.write(outcome)

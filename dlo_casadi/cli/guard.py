@@ -45,7 +45,8 @@ def guarded(work: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         return _interrupted()
     except DloError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        notes = getattr(error, "__notes__", [])
+        print("\n".join([f"{type(error).__name__}: {error}", *notes]), file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
         # The reader of the output has gone, as `head` does; nothing is left to be said.

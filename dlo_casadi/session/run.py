@@ -11,6 +11,7 @@ import numpy as np
 
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.fit import SETTLED_MODES, Fit, refine_mesh
 from dlo_casadi.estimation.observation import MeasuredPose
@@ -49,6 +50,17 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     progress = progress or Silent()
     clock = Clock()
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
+    try:
+        return fit_session(config, inputs, clock, progress)
+    except DloError as error:
+        error.poses = inputs  # for whoever tells what had been read
+        raise
+
+
+def fit_session(
+    config: Config, inputs: Sequence[PoseInput], clock: Clock, progress: Progress
+) -> Outcome:
+    """Fit and report a session whose poses have been read; raises as `run_session` does."""
     odd = raise_if_implausible(config, inputs)
     measured = measured_poses(config, inputs)
     clock.lap("vision")
@@ -74,7 +86,7 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     warnings += fit_warnings(fit, error)
     outcome = Outcome(
         config=config,
-        poses=inputs,
+        poses=tuple(inputs),
         measurement=_summary(config, measured, fit),
         stages=tuple(stages),
         discretization=Discretization(fit.model.n, fit.model.element, error),
