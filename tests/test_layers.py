@@ -28,6 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 # A session: what is declared and measured -> stages and findings -> one outcome.
 MAY_IMPORT["session"] = set(MAY_IMPORT)
 MAY_IMPORT["report"] = set(MAY_IMPORT)
+MAY_IMPORT["shape_table"] = MECHANICS | {"codegen", "durable", "parallel"}
 MAY_IMPORT["fleet"] = set(MAY_IMPORT)
 MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)

@@ -18,6 +18,7 @@ COMMANDS = {
     "fit": "fit a cable to its photographs or centre-lines and report what was found",
     "fit-many": "fit many sessions, on many cores or machines, into one table",
     "predict": "predict the shape of a fitted cable from where its ends are held",
+    "shape-table": "predict the shapes of a fitted cable in very many poses",
     "generate-solver": "write the C solver of a fitted cable for planners to embed",
 }
 
