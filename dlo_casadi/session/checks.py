@@ -60,7 +60,7 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
         [item.name for item in read], [item.points for item in read]
     )
     if not any(item.certain for item in found):
-        found += hangs_upwards(config, read)
+        found += hangs_elsewhere(config, read)
     return found
 
 
@@ -98,11 +98,12 @@ def _lines(config: Config, points: dict[str, FloatArray]) -> Lines:
     )
 
 
-def hangs_upwards(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
-    """Whether the shapes fit only if gravity, or the y axis of the points, is turned around.
+def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Whether the shapes fit only with gravity turned, or the points mirrored.
 
     Shapes of a straight cable of the declared stiffness, and of others up to a hundred times as
-    soft or stiff, are predicted under both directions of gravity and laid beside the points.
+    soft or stiff, are predicted with gravity as declared and turned by quarters, and laid beside
+    the points; and beside the points mirrored at the height of the start.
     """
     declared = {pose.name: pose for pose in config.experiment.poses}
     shown = read[:: max(1, -(-len(read) // _POSES))]
@@ -110,25 +111,28 @@ def hangs_upwards(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion,
         return ()
     measured = [MeasuredPose(conditions(declared[item.name]), item.points) for item in shown]
     model = straight(declared_model(config).model).with_mesh(_MESH)
-    x, y = model.gravity
     length = config.cable.length
-    downwards = _distance(model, measured, CONTRADICTS * length)
-    if downwards < CONTRADICTS * length:
+    own = _distance(model, measured, CONTRADICTS * length)
+    if own < CONTRADICTS * length:
         return ()
-    mirrored = []
-    for item in measured:
-        height = item.pose.start[1]
-        points = np.column_stack([item.points[:, 0], 2 * height - item.points[:, 1]])
-        mirrored.append(MeasuredPose(item.pose, points))
-    upwards = min(_distance(replace(model, gravity=(-x, -y)), measured), _distance(model, mirrored))
-    if upwards > MUCH_BETTER * downwards:
+    mirrored = [
+        replace(item, points=item.points * [1.0, -1.0] + [0.0, 2 * item.pose.start[1]])
+        for item in measured
+    ]
+    x, y = model.gravity
+    found = {"y pointing up in the points, which now points down": _distance(model, mirrored)}
+    for turned in ((-x, -y), (y, -x), (-y, x)):
+        said = f"gravity ({turned[0] + 0.0:g}, {turned[1] + 0.0:g}) m/s^2"
+        found[said] = _distance(replace(model, gravity=turned), measured)
+    what, rms = min(found.items(), key=lambda item: item[1])
+    if rms > MUCH_BETTER * own:
         return ()
     return (
         Suspicion(
-            f"the cable hangs upwards: its shapes are {downwards:.3g} m RMS from those under "
-            f"gravity ({x:g}, {y:g}) m/s^2, and {upwards:.3g} m once that, or the y axis of the "
-            "points, is turned around. Try: y axis up in points, start, end and gravity "
-            "(gravity: [0.0, -9.81]).",
+            f"the cable does not hang along gravity ({x:g}, {y:g}) m/s^2: its shapes are "
+            f"{own:.3g} m RMS from those of any stiffness, but {rms:.3g} m with {what}. Try: "
+            "points, start, end and gravity in one frame, x to the right and y up, gravity: "
+            "[0.0, -9.81].",
             True,
         ),
     )
