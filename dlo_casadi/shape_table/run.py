@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_casadi import __version__
 from dlo_casadi.codegen.shapes import STATUSES
@@ -142,7 +143,7 @@ def _computed(
                 yield Chunk(index, chunk)
 
     with (plan.parts / "draft.parquet").open("wb") as stream:
-        writer = pq.ParquetWriter(
+        with pq.ParquetWriter(
             stream,
             schema,
             use_dictionary=["status"],
@@ -150,31 +151,35 @@ def _computed(
             use_byte_stream_split=["points.list.element"],
             compression="zstd",
             compression_level=1,
-        )
+        ) as writer:
 
-        def append() -> None:
-            nonlocal written
-            while written in there:
-                part = np.load(plan.part(written))
-                if part.dtype != part_type(plan.model.n):
-                    raise DloError(f"{plan.part(written)} is no part of this table: --restart")
-                counts[:] += np.bincount(part["status"], minlength=len(STATUSES))
-                writer.write_table(table_of(part, schema, plan.model))
-                written += 1
+            def append() -> None:
+                nonlocal written
+                while written in there:
+                    part = _read_part(plan, written)
+                    counts[:] += np.bincount(part["status"], minlength=len(STATUSES))
+                    writer.write_table(table_of(part, schema, plan.model))
+                    written += 1
 
-        append()
-        tasks = map_as_completed(
-            executor,
-            partial(solve_chunk, plan),
-            missing(),
-            total=total - len(there),
-            progress=progress,
-        )
-        for done in tasks:
-            _ = done.value  # a chunk that fails ends the run; finished ones are kept
-            there.add(done.item.index)
             append()
-        writer.close()
+            tasks = map_as_completed(
+                executor,
+                partial(solve_chunk, plan),
+                missing(),
+                total=total - len(there),
+                progress=progress,
+            )
+            for done in tasks:
+                _ = done.value  # a chunk that fails ends the run; finished ones are kept
+                there.add(done.item.index)
+                append()
         stream.flush()
         os.fsync(stream.fileno())
     return {name: int(n) for name, n in zip(STATUSES, counts, strict=True) if n}
+
+
+def _read_part(plan: Plan, index: int) -> NDArray[np.void]:
+    part: NDArray[np.void] = np.load(plan.part(index))
+    if part.dtype != part_type(plan.model.n):
+        raise DloError(f"{plan.part(index)} is no part of this table.\n  Try: --restart")
+    return part
