@@ -15,11 +15,17 @@ from dlo_casadi.cli.guard import BAD_INPUT, OK, guarded
 
 # Subcommand -> what it does. Its module of the same name is imported only when it is called.
 COMMANDS = {
+    "new": "write a commented configuration to start from",
+    "check": "check a configuration and its photographs in seconds, without fitting",
     "fit": "fit a cable to its photographs or centre-lines and report what was found",
     "fit-many": "fit many sessions, on many cores or machines, into one table",
+    "diagnose": "fit, and print the search for missing effects in full",
     "predict": "predict the shape of a fitted cable from where its ends are held",
     "shape-table": "predict the shapes of a fitted cable in very many poses",
     "generate-solver": "write the C solver of a fitted cable for planners to embed",
+    "schema": "print the JSON schema of a configuration, for editors",
+    "reproduce": "compare with the paper's results (needs a checkout)",
+    "benchmark": "time the C solver beside other solvers (needs a checkout)",
 }
 
 EXAMPLES = """\

@@ -271,6 +271,28 @@ def _quantity(name: str, row: dict[str, Any]) -> str:
     return f"{name} {plus_minus(row['value'], row['std'] or 0.0)} {row['unit']}".strip()
 
 
+def candidate_table(outcome: Outcome) -> Table:
+    """Every effect that was tried, the likeliest first."""
+    table = _table("Effects that were tried, the likeliest first")
+    table.add_column("effect")
+    for column in ("score", "p-value", "cross-validated error"):
+        table.add_column(column, justify="right")
+    table.add_column("")
+    added = {effect["name"] for effect in outcome.effects}
+    rivals = {name for effect in outcome.effects for name in effect["indistinguishable_from"]}
+    for row in outcome.candidates:
+        name, p = row["name"], row["p_value"]
+        remark = "added" if name in added else "cannot be told apart from it" * (name in rivals)
+        table.add_row(
+            name,
+            f"{row['score']:.1f}",
+            "-" if p is None else f"{p:.2g}",
+            _mm(row["rmse_cross_validated"]),
+            remark,
+        )
+    return table
+
+
 # ---- timing ------------------------------------------------------------------------------------
 
 
