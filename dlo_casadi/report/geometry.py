@@ -14,6 +14,11 @@ def magnified(pose: PoseInput, shape: PoseShape, std: float, factor: int) -> Flo
     """The predicted curve, its distance from the measured points multiplied."""
     if factor == 1 or not len(pose.points):
         return shape.curve
+    return beside(pose, shape, std, factor)
+
+
+def beside(pose: PoseInput, shape: PoseShape, std: float, factor: float = 1.0) -> FloatArray:
+    """Points (K, 2) [m] of the prediction beside the measured ones, distances multiplied."""
     places = np.linspace(0.0, 1.0, len(shape.curve))
     slope = np.gradient(shape.curve, places, axis=0)
     length = max(float(np.hypot(*np.diff(shape.curve, axis=0).T).sum()), 1e-12)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from functools import cache
 from typing import Any
 
 from bokeh.resources import INLINE
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from dlo_casadi.report.page_charts import charts
 from dlo_casadi.report.page_data import page_data
@@ -56,6 +57,16 @@ def render(template: str, scripts: list[str], **data: Any) -> str:
     )
 
 
+def units(text: str) -> str:
+    """Units as they are printed: N m^2 becomes N m², and is not broken."""
+    return text.replace(" N m^2", "\u00a0N\u00a0m^2").replace("^2", "²").replace("^3", "³")
+
+
+def breakable(name: str) -> Markup:
+    """A name in code that may be broken after its underscores and dots."""
+    return Markup(re.sub(r"([_.])", r"\1<wbr>", str(escape(name))))
+
+
 def page_script() -> str:
     """The page's own script."""
     return _text("page.js")
@@ -71,13 +82,15 @@ def as_data(text: str) -> Markup:
 
 @cache
 def _environment() -> Environment:
-    return Environment(
+    environment = Environment(
         loader=PackageLoader("dlo_casadi.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters |= {"units": units, "breakable": breakable}
+    return environment
 
 
 def _text(name: str) -> str:

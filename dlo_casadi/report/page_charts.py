@@ -12,8 +12,10 @@ from bokeh.models import (
     BoxAnnotation,
     ColumnDataSource,
     DataRange1d,
+    FixedTicker,
     HoverTool,
     Model,
+    PrintfTickFormatter,
     Range1d,
     Span,
     TapTool,
@@ -91,8 +93,9 @@ def errors_chart(outcome: Outcome) -> Model:
         y_range=labels[::-1],
         x_axis_type="log",
         x_range=_log_range([value for *_, value in rows] + [floor]),
-        x_axis_label="distance of the measured points from the prediction, RMS [mm]",
+        x_axis_label="RMS distance [mm]",
     )
+    _plain_numbers(chart)
     chart.ygrid.grid_line_color = None
     chart.add_layout(Span(location=floor, dimension="height", line_color=INK, line_dash="dashed"))
     shift = {"fit": 0.18, "cross-validated": 0.0, "held out": -0.18}
@@ -125,6 +128,17 @@ def _log_range(values: list[float]) -> Range1d:
     return Range1d(min(known) / 1.6, max(known) * 1.6)
 
 
+def _plain_numbers(chart: figure) -> None:
+    """Numbers such as 0.1 and 0.5 along a logarithmic axis, not powers of ten."""
+    low, high = chart.x_range.start, chart.x_range.end
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    steps = (1,) if high / low > 300 else (1, 3) if high / low > 30 else (1, 2, 5)
+    chart.xaxis.ticker = FixedTicker(
+        ticks=[float(f"{step * tens:.0e}") for tens in decades for step in steps]
+    )
+    chart.xaxis.formatter = PrintfTickFormatter(format="%g")
+
+
 def poses_chart(outcome: Outcome) -> Model:
     """Error of every pose, before and after; a pose is chosen by a click."""
     before, after = before_after(outcome)
@@ -141,8 +155,9 @@ def poses_chart(outcome: Outcome) -> Model:
         y_range=names[::-1],
         x_axis_type="log",
         x_range=_log_range([*(e for *_, errors in found for e in errors), floor]),
-        x_axis_label="distance of the measured points from the prediction, RMS [mm]",
+        x_axis_label="RMS distance [mm]",
     )
+    _plain_numbers(chart)
     chart.add_layout(Span(location=floor, dimension="height", line_color=INK, line_dash="dashed"))
     roles = ["held out" if pose.role == "held_out" else "fit" for pose in outcome.poses]
     if len(found) == 2:
@@ -238,7 +253,7 @@ def _residual_lines(chart: figure, kind: str, stage: Stage, outcome: Outcome, co
     chosen = ColumnDataSource({"s": [], "r": []}, name=f"chosen-{kind}")
     chart.line("s", "r", source=chosen, line_color="white", line_width=5)
     chart.line("s", "r", source=chosen, line_color=color, line_width=2.5)
-    points = chart.scatter("s", "r", source=chosen, size=6, fill_color=color, line_color=None)
+    points = chart.scatter("s", "r", source=chosen, size=4, fill_color=color, line_color=None)
     chart.add_tools(
         _hover(
             ("pose", "@pose (@role)"),
@@ -296,14 +311,22 @@ def rest_chart(outcome: Outcome) -> Model:
 
 def _board(outcome: Outcome) -> figure:
     """The board with one scale on both axes, and the measured cables on it."""
+    ends = [
+        [point for point in (pose.start, pose.end) if point is not None]
+        for pose in outcome.config.experiment.poses
+    ]
+    drawn = np.concatenate([*ends, *(pose.points for pose in outcome.poses if len(pose.points))])
+    across, down = np.ptp(drawn, axis=0)
     chart = _figure(
         440,
         match_aspect=True,
-        x_range=DataRange1d(range_padding=0.06),
-        y_range=DataRange1d(range_padding=0.06),
+        x_range=DataRange1d(range_padding=0.08),
+        y_range=DataRange1d(range_padding=0.08),
         x_axis_label="x [m]",
         y_axis_label="y [m]",
     )
+    chart.sizing_mode = "scale_width"
+    chart.aspect_ratio = float(np.clip(across / max(down, 1e-9), 0.8, 1.8))
     measured = [pose for pose in outcome.poses if len(pose.points)]
     source = ColumnDataSource(
         {
@@ -360,7 +383,7 @@ def next_pose_chart(outcome: Outcome) -> Model:
     chart.text(
         [x],
         [y],
-        text=[f"next end ({x:.3f}, {y:.3f}) m"],
+        text=["next end"],
         x_offset=16,
         y_offset=-10,
         text_color=NEXT,

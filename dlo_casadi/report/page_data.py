@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass
 from typing import Any
 
 from dlo_casadi.config import Config
@@ -24,19 +23,13 @@ from dlo_casadi.session.outcome import Outcome, ParameterEstimate
 
 # Half the width of a 95 % interval in standard deviations.
 _TWO_SIDED = 1.96
+# Where a number does not exist.
+NOTHING = "–"
 VERDICT_WORDS = {
     "complete": "Complete",
     "effect_found": "Effect found",
     "unexplained": "Unexplained",
 }
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A number of a table with its share [0, 1] of the longest bar, if it has one."""
-
-    text: str
-    share: float | None = None
 
 
 def page_data(outcome: Outcome) -> dict[str, Any]:
@@ -55,6 +48,7 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "warnings": all_warnings(outcome),
         "before": None if before is None else label_of(before, outcome),
         "after": None if after is None else label_of(after, outcome),
+        "rest_before": before is not None and before.name == "batch",
         "stages": stage_rows(outcome),
         "noise": millimetres(m.std),
         "noise_source": m.std_source,
@@ -123,7 +117,7 @@ def stage_rows(outcome: Outcome) -> list[dict[str, Any]]:
             "fit": _mm(stage.rmse_fit),
             "validated": _mm(validated.get(stage.name)),
             "held_out": _mm(stage.rmse_held_out),
-            "chi2": "-" if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
+            "chi2": NOTHING if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
             "note": stage.note,
         }
         for stage in outcome.stages
@@ -151,13 +145,13 @@ def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
             {
                 "name": name,
                 "meaning": meaning(name),
-                "score": "-"
+                "score": NOTHING
                 if score is None
                 else f"{score:,.0f}"
                 if score >= 100
                 else f"{score:.2g}",
                 "share": 0.0 if not score or largest <= 0 else max(score, 0.0) / largest,
-                "p_value": "-" if p is None else f"{p:.2g}",
+                "p_value": NOTHING if p is None else f"{p:.2g}",
                 "validated": _mm(row["rmse_cross_validated"]),
                 "status": status[0],
                 "said": status[1],
@@ -169,7 +163,8 @@ def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
 def meaning(name: str) -> str:
     """What an effect is, in a line."""
     known = EFFECTS.get(name)
-    return (inspect.getdoc(known) or "").partition("\n")[0] if known is not None else ""
+    text = inspect.getdoc(known) or "" if known is not None else ""
+    return text.partition("\n")[0].replace("`", "")
 
 
 def parameter_rows(outcome: Outcome) -> list[dict[str, Any]]:
@@ -213,4 +208,4 @@ def configuration_text(config: Config) -> str:
 
 
 def _mm(value: float | None) -> str:
-    return "-" if value is None else millimetres(value)
+    return NOTHING if value is None else millimetres(value)

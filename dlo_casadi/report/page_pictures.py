@@ -20,7 +20,7 @@ from PIL import Image
 from dlo_casadi.config import Config
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.report.canvas import before_after, label_of, millimetres
-from dlo_casadi.report.geometry import magnified
+from dlo_casadi.report.geometry import beside
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.vision import read_image
 
@@ -33,6 +33,8 @@ PHOTOGRAPHS = 3_000_000
 _WIDEST = 1280  # px
 _NARROWEST = 320  # px
 _QUALITIES = (82, 70, 55)
+# Of a part of a photograph about the cable: its sides over those of the cable.
+_ROOM = 1.3
 _MM = 1e3
 _GRID = 100.0  # mm
 
@@ -62,15 +64,16 @@ class Picture:
 
     Parameters
     ----------
-    box : (left, top, width, height)
-        Of the coordinates of the lines.
+    box, whole : (left, top, width, height)
+        What is shown at first, the part with the cable; and all there is.
     photograph : str
         As a data URI; empty for a board.
     grid : tuple of (x1, y1, x2, y2)
         Lines of the board, every 100 mm.
     start, end : (u, v) or None
         Where the predicted cable begins and ends.
-    facts : tuple of (name, text)
+    facts : tuple of (kind, name, text)
+        The kind is that of the line that a fact is about.
     notes : tuple of str
         What the camera step noticed, or why the pose could not be read.
     """
@@ -79,12 +82,13 @@ class Picture:
     role: str
     alt: str
     box: Box
+    whole: Box
     photograph: str = ""
     grid: tuple[Box, ...] = ()
     lines: tuple[Line, ...] = ()
     start: tuple[float, float] | None = None
     end: tuple[float, float] | None = None
-    facts: tuple[tuple[str, str], ...] = ()
+    facts: tuple[tuple[str, str, str], ...] = ()
     problem: str = ""
     notes: tuple[str, ...] = field(default_factory=tuple)
 
@@ -115,11 +119,12 @@ def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Pict
                 role=pose.role,
                 alt=f"{_what(photograph)}, pose {pose.name}"
                 + (", with the measured line." if len(measured) else ": no cable was measured."),
-                box=box,
+                box=_about(box, [measured]) if photograph else box,
+                whole=box,
                 photograph=photograph,
                 grid=() if photograph else _grid(box),
                 lines=(Line("measured", _svg(measured, 2)),) if len(measured) else (),
-                facts=(("measured", _seen(pose)),) if len(measured) else (),
+                facts=(("measured", "measured", _seen(pose)),) if len(measured) else (),
                 problem=pose.problem,
                 notes=pose.messages,
             )
@@ -191,6 +196,7 @@ def _picture(
     std = outcome.measurement.std
     lines, facts = [], []
     measured = _placed(pose, place)
+    drawn = [measured]
     ends: list[tuple[float, float] | None] = [None, None]
     for kind, stage in (("before", before), ("after", after)):
         shape = None if stage is None else stage.shapes.get(pose.name)
@@ -199,23 +205,25 @@ def _picture(
         curve = np.asarray(place(shape.curve))
         near = ""
         if len(measured):
-            near = _svg(np.asarray(place(magnified(pose, shape, std, 1))), 2)
+            near = _svg(np.asarray(place(beside(pose, shape, std))), 2)
         lines.append(Line(kind, _svg(curve, 1), near))
+        drawn.append(curve)
         ends = [_point(curve[0]), _point(curve[-1])]
         if shape.rmse is not None:
-            facts.append((label_of(stage, outcome), millimetres(shape.rmse)))
+            facts.append((kind, label_of(stage, outcome), millimetres(shape.rmse)))
         if not shape.stable:
-            facts.append((label_of(stage, outcome), "not stable"))
+            facts.append((kind, label_of(stage, outcome), "not stable"))
     if len(measured):
         lines.append(Line("measured", _svg(measured, 2)))
-        facts.append(("measured", _seen(pose)))
+        facts.append(("measured", "measured", _seen(pose)))
     elif after is not None and pose.name not in after.shapes:
-        facts.append((label_of(after, outcome), "no equilibrium"))
+        facts.append(("after", label_of(after, outcome), "no equilibrium"))
     return Picture(
         name=pose.name,
         role=pose.role,
         alt=_alt(outcome, pose, after, _what(photograph)),
-        box=box,
+        box=_about(box, drawn) if photograph else box,
+        whole=box,
         photograph=photograph,
         grid=() if photograph else _grid(box),
         lines=tuple(lines),
@@ -224,6 +232,25 @@ def _picture(
         facts=tuple(facts),
         problem=pose.problem,
         notes=pose.messages,
+    )
+
+
+def _about(whole: Box, lines: Sequence[FloatArray]) -> Box:
+    """The part of a photograph about all lines, with its sides in the same ratio."""
+    left, top, width, height = whole
+    drawn = np.concatenate(lines)
+    corner, size = np.array([left, top]), np.array([width, height])
+    drawn = np.clip(drawn[np.isfinite(drawn).all(axis=1)], corner, corner + size)
+    if not len(drawn):
+        return whole
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    share = min(1.0, max(0.25, _ROOM * float(((high - low) / size).max())))
+    at = np.clip((low + high - share * size) / 2, corner, corner + (1 - share) * size)
+    return (
+        round(float(at[0]), 1),
+        round(float(at[1]), 1),
+        round(share * width, 1),
+        round(share * height, 1),
     )
 
 

@@ -99,10 +99,18 @@ function enlargeDeviations(factor) {
   }
 }
 
+// The part of a photograph with the cable, or all of it.
+function showWhole(yes) {
+  for (const svg of document.querySelectorAll("svg[data-whole]")) {
+    svg.setAttribute("viewBox", yes ? svg.dataset.whole : svg.dataset.cable);
+  }
+}
+
 for (const form of document.querySelectorAll(".layers")) {
   form.addEventListener("change", (event) => {
     const input = event.target;
     if (input.dataset.layer) {
+      if (input.dataset.layer === "whole") showWhole(input.checked);
       document.body.classList.toggle(`no-${input.dataset.layer}`, !input.checked);
       for (const twin of document.querySelectorAll(`[data-layer=${input.dataset.layer}]`)) {
         twin.checked = input.checked;
