@@ -89,7 +89,7 @@ def _fitted(job: Job, begin: float) -> Row:
         # It brings the libraries that draw; without figures a worker starts in half the time.
         from dlo_casadi.report.writer import ResultsFolder
 
-        with ResultsFolder(job.folder) as folder:
+        with ResultsFolder(job.folder, config) as folder:
             outcome = run_session(config)
             folder.write(outcome)
     else:

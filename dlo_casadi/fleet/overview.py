@@ -79,7 +79,7 @@ def _summary(judged: Sequence[Judged]) -> str:
 
 def _line(item: Judged, output: Path) -> str:
     row = item.row
-    name = _link(str(row["session"]), output)
+    name = _link(row, output)
     odd = f'<span class="odd">{escape(", ".join(item.reasons))}</span>' if item.reasons else ""
     if row["status"] != "done":
         text = f'<pre class="odd">{escape(str(row["message"]))}</pre>'
@@ -105,9 +105,10 @@ def _line(item: Judged, output: Path) -> str:
     return "<tr>" + "".join(f'<td class="{kind}">{text}</td>' for kind, text in cells) + "</tr>"
 
 
-def _link(key: str, output: Path) -> str:
-    """The session's page, or what there is of its results."""
-    for name in ("report.html", "report.json"):
+def _link(row: Row, output: Path) -> str:
+    """The session's page: of its results, or of why there are none."""
+    key = str(row["session"])
+    for name in ("report.html", "report.json") if row["status"] == "done" else ("failed.html",):
         if (output / "sessions" / key / name).is_file():
             return f'<a href="{quote(f"sessions/{key}/{name}")}">{escape(key)}</a>'
     return escape(key)
