@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import threading
 import time
@@ -237,14 +238,15 @@ def _run(
     function: Callable[[Item], Result], item: Item, index: int, logs: str | None
 ) -> tuple[Result | None, Exception | None, float, str]:
     """Run one task, timed and logged; an exception is returned."""
-    log = worker_log(logs)
+    # Tasks within a task have no log of their own.
+    log = worker_log(logs) if logs is not None else logging.getLogger("dlo_casadi.unlogged")
     with _one_at_a_time, one_thread():
         begin = time.perf_counter()
         log.info("task %d begins: %.200r", index, item)
         try:
             result = function(item)
         except Exception as error:
-            log.exception("task %d failed", index)
+            log.info("task %d failed", index, exc_info=True)
             return None, error, time.perf_counter() - begin, worker_name()
         seconds = time.perf_counter() - begin
         log.info("task %d done in %.3f s", index, seconds)
