@@ -1,38 +1,60 @@
 """Models of electrical cables from photographs: fit, diagnose, predict, embed."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
 
-from dlo_casadi.codegen import CompiledSolver
-from dlo_casadi.config import Config, load_config
-from dlo_casadi.effects import EFFECTS, Cable
-from dlo_casadi.equilibrium import Equilibrium, Pose, solve_equilibrium
-from dlo_casadi.errors import (
-    ConfigError,
-    DloError,
-    EquilibriumError,
-    EstimationError,
-    MeasurementError,
-    VisionError,
-)
-from dlo_casadi.model import CableModel
-from dlo_casadi.session import Outcome, run_session
+if TYPE_CHECKING:
+    from dlo_casadi.codegen import CompiledSolver as CompiledSolver
+    from dlo_casadi.config import Config as Config
+    from dlo_casadi.config import load_config as load_config
+    from dlo_casadi.effects import EFFECTS as EFFECTS
+    from dlo_casadi.effects import Cable as Cable
+    from dlo_casadi.equilibrium import Equilibrium as Equilibrium
+    from dlo_casadi.equilibrium import Pose as Pose
+    from dlo_casadi.equilibrium import solve_equilibrium as solve_equilibrium
+    from dlo_casadi.errors import ConfigError as ConfigError
+    from dlo_casadi.errors import DloError as DloError
+    from dlo_casadi.errors import EquilibriumError as EquilibriumError
+    from dlo_casadi.errors import EstimationError as EstimationError
+    from dlo_casadi.errors import MeasurementError as MeasurementError
+    from dlo_casadi.errors import VisionError as VisionError
+    from dlo_casadi.model import CableModel as CableModel
+    from dlo_casadi.prediction import PredictedShape as PredictedShape
+    from dlo_casadi.prediction import predict as predict
+    from dlo_casadi.session import Outcome as Outcome
+    from dlo_casadi.session import run_session as run_session
 
-__all__ = [
-    "EFFECTS",
-    "Cable",
-    "CableModel",
-    "CompiledSolver",
-    "Config",
-    "ConfigError",
-    "DloError",
-    "Equilibrium",
-    "EquilibriumError",
-    "EstimationError",
-    "MeasurementError",
-    "Outcome",
-    "Pose",
-    "VisionError",
-    "load_config",
-    "run_session",
-    "solve_equilibrium",
-]
+# Module -> its public names. They are imported when they are first asked for, so that the command
+# answers at once and an interrupt finds it ready.
+_PUBLIC = {
+    "codegen": ("CompiledSolver",),
+    "config": ("Config", "load_config"),
+    "effects": ("EFFECTS", "Cable"),
+    "equilibrium": ("Equilibrium", "Pose", "solve_equilibrium"),
+    "errors": (
+        "ConfigError",
+        "DloError",
+        "EquilibriumError",
+        "EstimationError",
+        "MeasurementError",
+        "VisionError",
+    ),
+    "model": ("CableModel",),
+    "prediction": ("PredictedShape", "predict"),
+    "session": ("Outcome", "run_session"),
+}
+_HOMES = {name: f"{__name__}.{module}" for module, names in _PUBLIC.items() for name in names}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

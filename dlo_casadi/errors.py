@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 class DloError(Exception):
@@ -12,11 +13,17 @@ class DloError(Exception):
     ----------
     message : str
         What happened, with numbers and units, and what to try.
+
+    Attributes
+    ----------
+    poses : tuple of PoseInput
+        Where a session has failed: its poses as far as they had been read.
     """
 
     def __init__(self, message: str) -> None:
         super().__init__(message)
         self.message = message
+        self.poses: tuple[Any, ...] = ()
 
 
 class ConfigError(DloError):

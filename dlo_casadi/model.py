@@ -11,7 +11,7 @@ loads. An equilibrium is a stationary point; the chain's coordinates stay the he
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -101,6 +101,10 @@ class CableModel:
                     f"two effects are both labelled {effect.label!r}; give one another label, "
                     f"e.g. {type(effect).__name__}(label='{effect.label}_2')"
                 )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What the model was made of: CasADi's expressions are built anew in another process."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     # ---- composition -------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
-"""Benchmark of the generated C solver; prints the compiler and its flags.
+"""Benchmark of the generated C solver and of many sessions; prints the compiler and its flags.
 
-    python scripts/benchmark.py --output DIR [--only speed growth throughput random ipopt memory]
+    python scripts/benchmark.py --output DIR [--only PART ...]
 
 Saves benchmark.json and benchmark.png. Everything runs on one machine in one run; medians and
 99th percentiles are over all solves, "best" is the median over the poses of each pose's fastest.
@@ -17,9 +17,9 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks import memory, random_cables, speed
+from benchmarks import fleet, memory, random_cables, speed
 
-PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory")
+PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory", "fleet")
 
 
 def run_speed() -> dict[str, Any]:
@@ -138,6 +138,7 @@ def main() -> int:
         "random": lambda: run_random(chosen.cables, 100),
         "ipopt": lambda: run_ipopt(chosen.ipopt_problems),
         "memory": memory.run,
+        "fleet": fleet.run,
     }
     result: dict[str, Any] = {"compiler": speed.compiler(), "flags": list(speed.FLAGS)}
     print(json.dumps(result), flush=True)

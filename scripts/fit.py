@@ -1,12 +1,8 @@
-"""Fit a cable: python scripts/fit.py configs/cable.yaml [--output DIR]."""
+"""Fit a cable: python scripts/fit.py configs/cable.yaml, the same as `dlo fit`."""
 
-import os
 import sys
 
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")  # the matrices are small: threads would only cost
-
-from dlo_casadi.cli import main_fit  # noqa: E402
+from dlo_casadi.cli import main
 
 if __name__ == "__main__":
-    sys.exit(main_fit())
+    sys.exit(main(["fit", *sys.argv[1:]]))

@@ -1,12 +1,8 @@
-"""Predict a pose: python scripts/predict.py results/cable/parameters.yaml --end X Y."""
+"""Predict a pose: python scripts/predict.py results/cable --end X Y, the same as `dlo predict`."""
 
-import os
 import sys
 
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")  # the matrices are small: threads would only cost
-
-from dlo_casadi.cli import main_predict  # noqa: E402
+from dlo_casadi.cli import main
 
 if __name__ == "__main__":
-    sys.exit(main_predict())
+    sys.exit(main(["predict", *sys.argv[1:]]))

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dlo_casadi import cli
-from dlo_casadi.cli import main_fit, main_predict
+from dlo_casadi.cli import fit as fit_command
+from dlo_casadi.cli import main
+from dlo_casadi.cli.predict import plain_numbers
 from dlo_casadi.config import dump_yaml, read_yaml
 
 ROOT = Path(__file__).parents[1]
@@ -71,7 +72,7 @@ def test_predict_prints_what_the_file_says(run, capsys):
     results = str(folder / "results" / "rope")
     figure = folder / "results" / "shape.png"
 
-    assert main_predict([results, "--end", "0.3", "-1e-1", "--figure", str(figure)]) == 0
+    assert main(["predict", results, "--end", "0.3", "-1e-1", "--figure", str(figure)]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "end (0.3, -0.1) m" in text
     assert "smallest bend radius" in text
@@ -83,7 +84,7 @@ def test_predict_prints_json(run, capsys):
     folder, _ = run
     path = str(folder / "results" / "rope" / "parameters.yaml")
 
-    assert main_predict([path, "--end", "-0.2", "-.1", "--branch", "cw", "--json"]) == 0
+    assert main(["predict", path, "--end", "-0.2", "-.1", "--branch", "cw", "--json"]) == 0
     shape = json.loads(capsys.readouterr().out)
     assert shape["end"] == [-0.2, -0.1]
     assert np.array(shape["points"]).shape == (101, 2)
@@ -94,7 +95,7 @@ def test_predict_prints_json(run, capsys):
 def test_predict_out_of_reach_is_bad_input(run, capsys):
     folder, _ = run
 
-    assert main_predict([str(folder / "results" / "rope"), "--end", "9", "0"]) == 2
+    assert main(["predict", str(folder / "results" / "rope"), "--end", "9", "0"]) == 2
     said = capsys.readouterr()
     assert "EquilibriumError" in said.err
     assert "9.0000 m from the start" in said.err
@@ -106,9 +107,9 @@ def test_predict_names_the_kinds_of_figure(run, tmp_path, capsys):
     folder, _ = run
     arguments = [str(folder / "results" / "rope"), "--end", "0.3", "0", "--figure"]
 
-    assert main_predict([*arguments, str(tmp_path / "shape.gif")]) == 2
+    assert main(["predict", *arguments, str(tmp_path / "shape.gif")]) == 2
     assert "must end in .png, .pdf, .svg, .jpg" in capsys.readouterr().err
-    assert main_predict([*arguments, str(tmp_path / "no" / "shape.png")]) == 2
+    assert main(["predict", *arguments, str(tmp_path / "no" / "shape.png")]) == 2
     assert "cannot be written: No such file or directory" in capsys.readouterr().err
 
 
@@ -116,7 +117,7 @@ def test_fit_reports_bad_input_without_a_traceback(tmp_path, capsys):
     bad = tmp_path / "bad.yaml"
     bad.write_text(SESSION.read_text().replace("length: 0.55", "length: -0.55"))
 
-    assert main_fit([str(bad), "--output", str(tmp_path / "out")]) == 2
+    assert main(["fit", str(bad), "--output", str(tmp_path / "out")]) == 2
     said = capsys.readouterr()
     assert "ConfigError" in said.err
     assert "bad.yaml, line 1" in said.err
@@ -125,15 +126,15 @@ def test_fit_reports_bad_input_without_a_traceback(tmp_path, capsys):
 
 
 def test_fit_reports_a_missing_configuration(tmp_path, capsys):
-    assert main_fit([str(tmp_path / "cable.yaml")]) == 2
+    assert main(["fit", str(tmp_path / "cable.yaml")]) == 2
     assert "no such file" in capsys.readouterr().err
 
 
 def test_fit_checks_the_output_before_it_works(config, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "run_session", lambda *_: pytest.fail("started"))
+    monkeypatch.setattr(fit_command, "run_session", lambda *_: pytest.fail("started"))
     (tmp_path / "file").touch()
 
-    assert main_fit([str(config), "--output", str(tmp_path / "file"), "--quiet"]) == 2
+    assert main(["fit", str(config), "--output", str(tmp_path / "file"), "--quiet"]) == 2
     assert "cannot be written: it is a file" in capsys.readouterr().err
 
 
@@ -141,10 +142,10 @@ def test_an_interrupted_fit_keeps_the_earlier_results(config, tmp_path, capsys, 
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "run_session", interrupted)
+    monkeypatch.setattr(fit_command, "run_session", interrupted)
     (tmp_path / "report.json").write_text('{"schema": "dlo-report/1"}')
 
-    assert main_fit([str(config), "--output", str(tmp_path)]) == 130
+    assert main(["fit", str(config), "--output", str(tmp_path)]) == 130
     assert capsys.readouterr().err.strip() == "interrupted; earlier results are as they were"
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
@@ -168,9 +169,9 @@ def test_a_bug_is_told_apart_from_bad_input(config, tmp_path, capsys, monkeypatc
     def broken(*_):
         raise ZeroDivisionError("oops")
 
-    monkeypatch.setattr(cli, "run_session", broken)
+    monkeypatch.setattr(fit_command, "run_session", broken)
 
-    assert main_fit([str(config), "--output", str(tmp_path / "out")]) == 1
+    assert main(["fit", str(config), "--output", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err
     assert "ZeroDivisionError: oops" in error
     assert "This is a bug. Please report it" in error
@@ -179,7 +180,7 @@ def test_a_bug_is_told_apart_from_bad_input(config, tmp_path, capsys, monkeypatc
 
 def test_unknown_arguments_are_bad_input(capsys):
     with pytest.raises(SystemExit) as caught:
-        main_fit(["configs/cable.yaml", "--outptu", "x"])
+        main(["fit", "configs/cable.yaml", "--outptu", "x"])
     assert caught.value.code == 2
     assert "unrecognized arguments: --outptu x" in capsys.readouterr().err
 
@@ -189,4 +190,4 @@ def test_unknown_arguments_are_bad_input(capsys):
     [("-1e-1", "-0.1"), ("-5.", "-5.0"), ("-.5", "-0.5"), ("-2E3", "-2000.0"), ("--end", "--end")],
 )
 def test_negative_numbers_are_no_options(text, number):
-    assert cli._plain_numbers([text]) == [number]
+    assert plain_numbers([text]) == [number]

@@ -11,6 +11,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 CHAIN = ["errors", "parameters", "chain", "rest", "effects", "model", "initial", "equilibrium"]
 MECHANICS = set(CHAIN)
+PARALLEL = {"executors", "parallel"}
 
 # layer -> what it may import beside itself. A new module gets its line here.
 MAY_IMPORT: dict[str, set[str]] = {
@@ -18,14 +19,19 @@ MAY_IMPORT: dict[str, set[str]] = {
     "config": {"errors", "parameters"},
     "measurements": {"errors", "config"},
     "vision": {"errors"},
-    "estimation": MECHANICS | {"config", "measurements"},
-    "diagnosis": MECHANICS | {"config", "measurements", "estimation"},
+    "estimation": MECHANICS | {"config", "measurements"} | PARALLEL,
+    "diagnosis": MECHANICS | {"config", "measurements", "estimation"} | PARALLEL,
     "codegen": MECHANICS | {"config"},
+    "durable": {"errors"},
+    "executors": {"errors"},
+    "parallel": {"errors", "executors", "vision"},
 }
 # A session: what is declared and measured -> stages and findings -> one outcome.
 MAY_IMPORT["session"] = set(MAY_IMPORT)
 MAY_IMPORT["report"] = set(MAY_IMPORT)
-MAY_IMPORT["predict"] = MECHANICS | {"config", "estimation", "report"}
+MAY_IMPORT["shape_table"] = MECHANICS | {"codegen", "durable", "parallel"}
+MAY_IMPORT["fleet"] = set(MAY_IMPORT)
+MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 

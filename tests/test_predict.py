@@ -9,7 +9,7 @@ import pytest
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.predict import predict
+from dlo_casadi.prediction import predict
 from dlo_casadi.report import parameters_file
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import read_poses

@@ -9,7 +9,15 @@ from typing import Any, get_args
 
 from pydantic_core import ErrorDetails
 
-from dlo_casadi.config.problems import Contradiction, Place, Problem, did_you_mean, kind_of, show
+from dlo_casadi.config.problems import (
+    PLACEHOLDER,
+    Contradiction,
+    Place,
+    Problem,
+    did_you_mean,
+    kind_of,
+    show,
+)
 from dlo_casadi.config.sections import File, Section
 
 _NUMBER = r"[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?"
@@ -75,6 +83,11 @@ def _help(section: type[Section], key: str) -> str:
     return f": {text.rstrip('.')}" if text else ""
 
 
+def _what(section: type[Section], key: object) -> str:
+    """Help on a key, where the section knows it."""
+    return _help(section, str(key)) if key in section.model_fields else ""
+
+
 def _about_number(value: object) -> str:
     """Guess why text stands where a number belongs."""
     text = str(value).strip()
@@ -125,7 +138,9 @@ def explain(errors: Sequence[ErrorDetails], data: Any) -> list[Problem]:
         place, context = error["loc"], error.get("ctx", {})
         section, label = _section_at(place[:-1]), _label(place, data)
         kind = error["type"]
-        if kind == "missing":
+        if error["input"] == PLACEHOLDER:
+            text = f"{label} is still to be filled in{_what(section, place[-1])}"
+        elif kind == "missing":
             if place in suggested:
                 continue
             key = place[-1]

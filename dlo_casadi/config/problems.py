@@ -10,6 +10,10 @@ Place = tuple[str | int, ...]
 """Keys and indices that lead from the top of a file to a value."""
 
 
+PLACEHOLDER = "FILL_IN"
+"""What stands in a new configuration where only its user knows the value."""
+
+
 class Problem(NamedTuple):
     """Something wrong, and where in the file."""
 

@@ -22,6 +22,11 @@ from pydantic import (
 from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean, show
 
 
+def _optional(section: type[Section]) -> BeforeValidator:
+    """Let a section be empty: `model:` with nothing behind it."""
+    return BeforeValidator(_empty_section, json_schema_input_type=section | None)
+
+
 def _pair(value: object) -> object:
     if not isinstance(value, list | tuple) or len(value) != 2:
         raise ValueError(f"two numbers [x, y] belong here, found {show(value)}")
@@ -38,7 +43,9 @@ Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 NonNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Switch = Annotated[bool, Field(strict=True)]
-Vector = Annotated[tuple[Number, Number], BeforeValidator(_pair)]
+Vector = Annotated[
+    tuple[Number, Number], BeforeValidator(_pair, json_schema_input_type=tuple[Number, Number])
+]
 Row = tuple[Number, Number, Number]
 
 
@@ -287,7 +294,7 @@ class Experiment(Section):
     """How the two ends are held: {start: pinned | clamped, end: pinned | clamped | free}."""
     measurement: Annotated[Images | Centerlines, Field(discriminator="kind")]
     """What the files of the poses are: kind: images or kind: centerlines."""
-    tolerances: Annotated[Tolerances, BeforeValidator(_empty_section)] = Tolerances()
+    tolerances: Annotated[Tolerances, _optional(Tolerances)] = Tolerances()
     """How well the declared values are known."""
     poses: tuple[Pose, ...]
     """The poses, in the order in which they were taken."""
@@ -315,7 +322,13 @@ class DeclaredEffect(Section):
 
     name: str
     """Name of the effect, such as lumped_mass."""
-    parameters: dict[str, Annotated[EffectParameter, BeforeValidator(_as_parameter)]] = {}
+    parameters: dict[
+        str,
+        Annotated[
+            EffectParameter,
+            BeforeValidator(_as_parameter, json_schema_input_type=float | EffectParameter),
+        ],
+    ] = {}
     """Initial guess of each parameter by its name; {value: ..., fixed: true} keeps a value."""
 
 
@@ -326,7 +339,13 @@ class ModelOptions(Section):
     """Number of elements; chosen from the data when absent."""
     element: Literal["quadratic", "arc", "link"] = "quadratic"
     """arc (heading varies linearly in an element) or link (straight, as in the paper)."""
-    effects: tuple[Annotated[DeclaredEffect, BeforeValidator(_as_effect)], ...] = ()
+    effects: tuple[
+        Annotated[
+            DeclaredEffect,
+            BeforeValidator(_as_effect, json_schema_input_type=str | DeclaredEffect),
+        ],
+        ...,
+    ] = ()
     """Effects beside bending and weight."""
 
 
@@ -341,6 +360,8 @@ class EstimationOptions(Section):
     """Its inner minimisation: ipopt, or cobyla as in the paper (about 1 s a pose)."""
     robust: Switch = False
     """Whether outlying points weigh less."""
+    plausibility: Switch = True
+    """Whether lines that contradict units, ends or gravity as declared stop the fit."""
     rest_curvature_coefficients: Count | None = None
     """Number of coefficients of the rest curvature; chosen from the data when absent."""
 
@@ -411,9 +432,9 @@ class File(Section):
     """The cable: length, mass, diameter, youngs_modulus or bending_stiffness."""
     experiment: Experiment
     """The experiment: gravity, boundary, measurement, poses."""
-    model: Annotated[ModelOptions, BeforeValidator(_empty_section)] = ModelOptions()
+    model: Annotated[ModelOptions, _optional(ModelOptions)] = ModelOptions()
     """The declared model."""
-    estimation: Annotated[EstimationOptions, BeforeValidator(_empty_section)] = EstimationOptions()
+    estimation: Annotated[EstimationOptions, _optional(EstimationOptions)] = EstimationOptions()
     """How the parameters are estimated."""
-    diagnosis: Annotated[DiagnosisOptions, BeforeValidator(_empty_section)] = DiagnosisOptions()
+    diagnosis: Annotated[DiagnosisOptions, _optional(DiagnosisOptions)] = DiagnosisOptions()
     """The search for missing effects."""

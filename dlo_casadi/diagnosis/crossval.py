@@ -14,7 +14,9 @@ Beirami et al., On optimal generalizability in parametric learning, NeurIPS 2017
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,8 @@ from numpy.typing import NDArray
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.sweep import Shapes
+from dlo_casadi.executors import InProcess
+from dlo_casadi.parallel import map_in_order
 
 FloatArray = NDArray[np.floating]
 
@@ -65,8 +69,12 @@ class CrossValidation:
         return bool(gap.mean() > factor * error)
 
 
-def cross_validate(fit: Fit) -> CrossValidation:
-    """Leave each fit pose out once (of a single pose, each stretch of its arc)."""
+def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:
+    """Leave each fit pose out once (of a single pose, each stretch of its arc).
+
+    All folds are predicted in one sweep, some 6 ms each. Only where a state is carried is each a
+    task of its own; it runs in this process unless an executor is given.
+    """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
     problem, lin = fit.problem, fit.linearization
@@ -82,7 +90,7 @@ def cross_validate(fit: Fit) -> CrossValidation:
             g_j = g_j - cross.T @ solved[:, -1]
         thetas.append(_without(fit, total.hessian - h_j, total.gradient - g_j))
     squares, counts, complete = [], [], True
-    curves = _predicted(fit, thetas)
+    curves = _predicted(fit, thetas, executor or InProcess())
     for j, curve in zip(problem.used, curves, strict=True):
         points = problem.measured[j].points
         counts.append(len(points))
@@ -111,17 +119,15 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> FloatArray:
     return np.clip(fit.point.theta + step, lower, upper)
 
 
-def _predicted(fit: Fit, thetas: list[FloatArray]) -> list[NodeCurve | None]:
+def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[NodeCurve | None]:
     """Curve of each fitted pose at its own unknowns, from the declared end conditions."""
     problem, sweep = fit.problem, fit.problem.sweep
     unknowns, model = problem.unknowns, fit.model
     shapes = fit.point.shapes
     plain = Shapes(shapes.phi, shapes.lam, np.zeros_like(shapes.deviation))
     if model.has_state:
-        return [
-            _predict_all(fit, plain, theta)[j]
-            for j, theta in zip(problem.used, thetas, strict=True)
-        ]
+        folds = map_in_order(executor, partial(_predict_all, fit, plain), thetas)
+        return [curves[j] for j, curves in zip(problem.used, folds, strict=True)]
     p = np.repeat(fit.p[None], sweep.m, axis=0)
     rest = np.repeat(fit.rest[None], sweep.m, axis=0)
     for j, theta in zip(problem.used, thetas, strict=True):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -18,6 +20,8 @@ from dlo_casadi.diagnosis.screening import Screen, Screened, survival
 from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import Fit, fit_model, settle
+from dlo_casadi.executors import InProcess
+from dlo_casadi.parallel import map_in_order
 
 FloatArray = NDArray[np.floating]
 Verdict = Literal["complete", "effect_found", "unexplained"]
@@ -110,6 +114,7 @@ def diagnose(
     significance: float = 0.005,
     max_effects: int = 4,
     step: Callable[[str, int, int], None] = lambda name, done, total: None,
+    executor: Executor | None = None,
 ) -> Diagnosis:
     """Search for effects that a fitted model lacks.
 
@@ -128,7 +133,10 @@ def diagnose(
     max_effects : int
     step : callable
         Told how far the search has come.
+    executor : Executor, optional
+        Where candidates are refitted, half a second to two each; in this process by default.
     """
+    executor = executor or InProcess()
     current, validation = fit, cross_validate(fit)
     before, first_structure = validation, structure_of(fit)
     added: list[AddedEffect] = []
@@ -140,7 +148,7 @@ def diagnose(
         significant = [
             item for item, p in zip(screened, corrected, strict=True) if p < significance
         ]
-        confirmed = _confirmed(current, significant, validation)
+        confirmed = _confirmed(current, significant, validation, executor)
         if k == 0:
             ranked = _ranking(screened, corrected, confirmed)
         chosen = _choose(confirmed)
@@ -219,18 +227,19 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
 
 
 def _confirmed(
-    current: Fit, significant: Sequence[Screened], validation: CrossValidation
+    current: Fit,
+    significant: Sequence[Screened],
+    validation: CrossValidation,
+    executor: Executor,
 ) -> list[Confirmed]:
     """Refits of the leading candidates that improve the fit and what it predicts."""
     if not significant:
         return []
     top = max(item.score for item in significant)
-    leading = sorted(significant, key=lambda item: -item.score)
+    leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
+    worthy = [item for item in leading if item.score >= WORTH * top]
     out = []
-    for item in leading[:REFITTED]:
-        if item.score < WORTH * top:
-            continue
-        tried = confirm(current, item)
+    for tried in map_in_order(executor, partial(confirm, current), worthy):
         if tried is None or tried.bic <= 0 or not tried.validation.complete:
             continue
         # An effect that explains the fitted poses but predicts the others worse is none.

@@ -132,6 +132,10 @@ class Sweep:
         self._maps: dict[str, _Mapped] = {}
         self.used_deviations = [DEVIATIONS.index(name) for name in model.deviations]
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without compiled functions: another process makes its own."""
+        return {**self.__dict__, "_maps": {}}
+
     def _call(self, name: str, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[FloatArray]:
         """Evaluate a function of the model for all poses; each output (m, rows, columns)."""
         if name not in self._maps:

@@ -27,8 +27,9 @@ from dlo_casadi.report.canvas import (
     label_of,
     millimetres,
 )
+from dlo_casadi.report.geometry import magnified, measured_line
 from dlo_casadi.report.overlay import write_overlays
-from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape, Stage
+from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 
 FloatArray = NDArray[np.floating]
 
@@ -152,7 +153,7 @@ def _draw_pose(
     for stage, color, style in lines:
         shape = stage.shapes.get(pose.name)
         if shape is not None:
-            axes.plot(*_magnified(pose, shape, std, factor).T, color=color, ls=style)
+            axes.plot(*magnified(pose, shape, std, factor).T, color=color, ls=style)
     if len(pose.points):
         axes.plot(*pose.points[:: max(1, len(pose.points) // 60)].T, ".", color=BLACK, ms=2.5)
     axes.set_aspect("equal")
@@ -174,20 +175,6 @@ def _draw_pose(
         axes.title.set_color(_HELD_OUT_TEXT)
         for spine in axes.spines.values():
             spine.set(visible=True, color=_HELD_OUT, linewidth=2)
-
-
-def _magnified(pose: PoseInput, shape: PoseShape, std: float, factor: int) -> FloatArray:
-    """The predicted curve, its distance from the measured points multiplied."""
-    if factor == 1 or not len(pose.points):
-        return shape.curve
-    places = np.linspace(0.0, 1.0, len(shape.curve))
-    slope = np.gradient(shape.curve, places, axis=0)
-    length = max(float(np.hypot(*np.diff(shape.curve, axis=0).T).sum()), 1e-12)
-    at = np.clip(shape.s / length, 0.0, 1.0)
-    tangent = np.stack([np.interp(at, places, slope[:, i]) for i in (0, 1)], axis=1)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.hypot(*tangent.T)[:, None]
-    moved = pose.points - factor * std * shape.residual[:, None] * normal
-    return np.asarray(moved)
 
 
 def _common_frame(outcome: Outcome, poses: Sequence[PoseInput]) -> tuple[FloatArray, FloatArray]:
@@ -382,7 +369,7 @@ def draw_unexplained(path: Path, outcome: Outcome) -> None:
     with figure(path, (8.5, 7.0)) as drawing:
         axes = drawing.subplots()
         for name, force in zip(names, forces, strict=False):
-            line = _measured_line(outcome, name)
+            line = measured_line(outcome, name)
             if line is None:
                 continue
             places, points = line
@@ -410,19 +397,3 @@ def draw_unexplained(path: Path, outcome: Outcome) -> None:
             "model",
             fontsize=12,
         )
-
-
-def _measured_line(outcome: Outcome, name: str) -> tuple[FloatArray, FloatArray] | None:
-    """Measured points of a pose between its fixtures with their places along the cable [m]."""
-    measured = next((pose for pose in outcome.poses if pose.name == name), None)
-    declared = next((p for p in outcome.config.experiment.poses if p.name == name), None)
-    if measured is None or declared is None or not len(measured.points):
-        return None
-    parts = [np.array([declared.start]), measured.points]
-    if declared.end is not None:
-        parts.append(np.array([declared.end]))
-    points = np.concatenate(parts)
-    places = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    if declared.end is not None:
-        places *= outcome.config.cable.length / places[-1]
-    return places, points

@@ -11,9 +11,9 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dlo_casadi.report.canvas import STAGE_LABELS, label_of
+from dlo_casadi.report.canvas import label_of
 from dlo_casadi.report.json_report import all_warnings
-from dlo_casadi.session.outcome import Outcome, ParameterEstimate, Stage
+from dlo_casadi.session.outcome import Outcome, ParameterEstimate, StageName
 
 # Parts of the run in the order in which they are done.
 TIMED = {
@@ -76,7 +76,7 @@ def parameter_table(outcome: Outcome) -> Table:
         table.add_column(column, no_wrap=bool(column))
     for name, estimate in outcome.stages[-1].parameters.items():
         table.add_row(name, *describe(estimate))
-    for row in _rest_rows(outcome.stages[-1], outcome):
+    for row in rest_rows(outcome):
         table.add_row(*row)
     for row in nuisance_rows(outcome):
         table.add_row(*row)
@@ -167,10 +167,11 @@ def footnotes(outcome: Outcome) -> list[str]:
     return lines
 
 
-def _rest_rows(stage: Stage, outcome: Outcome) -> list[tuple[str, str, str, str]]:
+def rest_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
+    """The rest curvature of the last stage in a line."""
     if outcome.config.cable.rest_shape == "straight":
         return [("rest curvature", "0 1/m", "", "fixed: declared straight")]
-    rest = stage.rest_curvature
+    rest = outcome.stages[-1].rest_curvature
     if not len(rest.value):
         return []
     low, high = rest.value.min(), rest.value.max()
@@ -185,10 +186,7 @@ def error_table(outcome: Outcome) -> Table:
     """Errors of the stages: fit, cross-validated, held out, chi-square, beside the noise."""
     table = _table("Distance of the measured points from the predicted shape, RMS")
     table.add_column("stage")
-    validated = {"batch": None, "closed": None}
-    if outcome.effects:
-        validated["batch"] = outcome.effects[0]["rmse_cross_validated_before"]
-        validated["closed"] = outcome.effects[-1]["rmse_cross_validated_after"]
+    validated = cross_validated(outcome)
     columns = ["fit", "cross-validated", "held out", "chi2/dof"]
     if not outcome.effects:
         columns.remove("cross-validated")
@@ -201,12 +199,21 @@ def error_table(outcome: Outcome) -> Table:
             "held out": _mm(stage.rmse_held_out),
             "chi2/dof": "-" if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
         }
-        label = STAGE_LABELS[stage.name] if stage.name != "closed" else label_of(stage, outcome)
-        table.add_row(label, *(cells[column] for column in columns))
+        table.add_row(label_of(stage, outcome), *(cells[column] for column in columns))
     table.add_section()
     floor = [_mm(outcome.measurement.std)] + [""] * (len(columns) - 1)
     table.add_row(f"noise ({outcome.measurement.std_source})", *floor)
     return table
+
+
+def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
+    """Cross-validated errors [m] of the stages for which the diagnosis has computed them."""
+    if not outcome.effects:
+        return {}
+    return {
+        "batch": outcome.effects[0]["rmse_cross_validated_before"],
+        "closed": outcome.effects[-1]["rmse_cross_validated_after"],
+    }
 
 
 # ---- verdict -----------------------------------------------------------------------------------
@@ -264,6 +271,28 @@ def _quantity(name: str, row: dict[str, Any]) -> str:
     return f"{name} {plus_minus(row['value'], row['std'] or 0.0)} {row['unit']}".strip()
 
 
+def candidate_table(outcome: Outcome) -> Table:
+    """Every effect that was tried, the likeliest first."""
+    table = _table("Effects that were tried, the likeliest first")
+    table.add_column("effect")
+    for column in ("score", "p-value", "cross-validated error"):
+        table.add_column(column, justify="right")
+    table.add_column("")
+    added = {effect["name"] for effect in outcome.effects}
+    rivals = {name for effect in outcome.effects for name in effect["indistinguishable_from"]}
+    for row in outcome.candidates:
+        name, p = row["name"], row["p_value"]
+        remark = "added" if name in added else "cannot be told apart from it" * (name in rivals)
+        table.add_row(
+            name,
+            f"{row['score']:.1f}",
+            "-" if p is None else f"{p:.2g}",
+            _mm(row["rmse_cross_validated"]),
+            remark,
+        )
+    return table
+
+
 # ---- timing ------------------------------------------------------------------------------------
 
 
@@ -273,20 +302,30 @@ def timing_table(outcome: Outcome) -> Table:
     table.add_column("part")
     table.add_column("seconds", justify="right")
     table.add_column("")
+    *parts, total = timing_rows(outcome)
+    for row in parts:
+        table.add_row(*row)
+    table.add_section()
+    table.add_row(*total)
+    return table
+
+
+def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
+    """Part of the run, seconds and remark; the total comes last."""
     timing = outcome.timing
     photographs = sum(pose.image is not None for pose in outcome.poses)
     rest = timing["total"] - sum(timing.get(name, 0.0) for name in TIMED)
+    rows = []
     for name, label in TIMED.items():
         remark = ""
         if name == "vision" and photographs:
             remark = f"{timing[name] / photographs:.2f} s a photograph ({photographs})"
         elif name == "vision":
             label = "centre-lines"
-        table.add_row(label, f"{timing.get(name, 0.0):.2f}", remark)
-    table.add_row("other fits and predictions", f"{max(rest, 0.0):.2f}", "")
-    table.add_section()
-    table.add_row("total", f"{timing['total']:.2f}", "")
-    return table
+        rows.append((label, f"{timing.get(name, 0.0):.2f}", remark))
+    rows.append(("other fits and predictions", f"{max(rest, 0.0):.2f}", ""))
+    rows.append(("total", f"{timing['total']:.2f}", ""))
+    return rows
 
 
 # ---- one predicted pose ------------------------------------------------------------------------

@@ -9,31 +9,39 @@ import tempfile
 from pathlib import Path
 from types import TracebackType
 
+from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError
 from dlo_casadi.measurements import write_centerline
 from dlo_casadi.report.figures import write_figures
 from dlo_casadi.report.json_report import report_text
+from dlo_casadi.report.page import GENERATOR, report_page
+from dlo_casadi.report.page_failure import write_failure_page
 from dlo_casadi.report.parameters_file import parameters_text
 from dlo_casadi.session.outcome import Outcome
 
 # What a run writes; nothing else in the folder is ever touched.
-OWNED = ("report.json", "parameters.yaml", "centerlines", "figures")
+OWNED = ("report.json", "report.html", "parameters.yaml", "centerlines", "figures")
+# What a run that fails writes, and the next one that does not removes.
+FAILURE = "failed.html"
 
 
 class ResultsFolder:
     """Where the results go: opened before the work starts, filled at its end.
 
-        with ResultsFolder("results/cable") as folder:   # raises if it cannot be written
+        with ResultsFolder("results/cable", config) as folder:   # raises if it cannot be written
             outcome = run_session(config)
             folder.write(outcome)
 
     Everything is written to a hidden draft first and moved into place only when complete, so
-    that a run that fails or is interrupted leaves earlier results as they were.
+    that a run that fails or is interrupted leaves earlier results as they were. A run that fails
+    with a DloError leaves `failed.html` beside them: what went wrong, pose by pose.
 
     Parameters
     ----------
     path : str or Path
         The folder; made if it does not exist.
+    config : Config, optional
+        What is run; without it a failure leaves no page.
 
     Raises
     ------
@@ -41,8 +49,9 @@ class ResultsFolder:
         If the folder cannot be written, or holds files of the same names from elsewhere.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, config: Config | None = None) -> None:
         self.path = Path(path).resolve()
+        self.config = config
         self._made: list[Path] = []
         self._draft: Path | None = None
 
@@ -65,6 +74,13 @@ class ResultsFolder:
         trace: TracebackType | None,
     ) -> None:
         self._undo()
+        if isinstance(error, DloError) and self.config is not None:
+            page = self.path / FAILURE
+            try:
+                write_failure_page(page, self.config, error, error.poses)
+            except OSError:
+                return  # the error itself is what the user must see
+            error.add_note(f"Pose by pose: {page}")
 
     def write(self, outcome: Outcome) -> Path:
         """Write all results, then put them in place of the previous ones."""
@@ -107,6 +123,7 @@ class ResultsFolder:
 def fill(folder: Path, outcome: Outcome) -> None:
     """Write all results of a run into an empty folder."""
     (folder / "report.json").write_text(report_text(outcome), encoding="utf-8")
+    (folder / "report.html").write_text(report_page(outcome), encoding="utf-8")
     (folder / "parameters.yaml").write_text(parameters_text(outcome), encoding="utf-8")
     lines = folder / "centerlines"
     lines.mkdir()
@@ -127,9 +144,13 @@ def _check_owner(path: Path) -> None:
         )
     try:
         taken = [name for name in OWNED if (path / name).exists()]
-    except OSError:
+        if _is_ours(path / "report.json"):
+            taken = []
+        if (path / FAILURE).exists() and GENERATOR not in (path / FAILURE).read_text("utf-8"):
+            taken.append(FAILURE)
+    except (OSError, UnicodeDecodeError):
         taken = []
-    if taken and not _is_ours(path / "report.json"):
+    if taken:
         raise DloError(
             f"{path} holds {', '.join(taken)} that no earlier fit has written; they would be "
             "replaced.\n  Try: another folder with --output, or move them away."
@@ -152,7 +173,7 @@ def _swap(complete: Path, target: Path, previous: Path) -> None:
     previous.mkdir()
     moved: list[tuple[Path, Path]] = []
     try:
-        for name in OWNED:
+        for name in (*OWNED, FAILURE):
             for origin, goal in (
                 (target / name, previous / name),
                 (complete / name, target / name),

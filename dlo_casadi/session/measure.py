@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -24,17 +24,27 @@ def read_poses(
 ) -> tuple[tuple[PoseInput, ...], tuple[MeasuredPose, ...]]:
     """Read all poses in the order in which they were taken.
 
-    A pose that cannot be read keeps its end conditions, for the history, and says why.
+    Raises
+    ------
+    MeasurementError
+        If no fit pose can be read; its text lists the reasons.
+
+    See Also
+    --------
+    read_inputs : the first half, which raises nothing.
+    measured_poses : the second half.
+    """
+    inputs = read_inputs(config, step)
+    return inputs, measured_poses(config, inputs)
+
+
+def read_inputs(config: Config, step: Callable[[str, int, int], None]) -> tuple[PoseInput, ...]:
+    """Read all poses; one that cannot be read keeps its name and says why.
 
     Parameters
     ----------
     step : callable
         Called with the pose's file name, how many are done and how many there are.
-
-    Raises
-    ------
-    MeasurementError
-        If no fit pose can be read; its text lists the reasons.
     """
     skipped = {item.name: item.reason for item in config.skipped}
     poses = config.experiment.poses
@@ -49,14 +59,39 @@ def read_poses(
             item = PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=error.message)
         inputs.append(item)
     step("", len(poses), len(poses))
+    return tuple(inputs)
+
+
+def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[MeasuredPose, ...]:
+    """What was read, with its end conditions, for the fit.
+
+    A pose that cannot be read keeps its end conditions, for the history.
+
+    Raises
+    ------
+    MeasurementError
+        If no fit pose could be read; its text lists the reasons.
+    """
     if not any(len(item.points) and item.role == "fit" for item in inputs):
         reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
         raise MeasurementError(f"no fit pose could be read:\n{reasons}")
-    measured = tuple(
+    return tuple(
         MeasuredPose(conditions(pose), item.points, item.weight, pose.role == "held_out")
-        for pose, item in zip(poses, inputs, strict=True)
+        for pose, item in zip(config.experiment.poses, inputs, strict=True)
     )
-    return tuple(inputs), measured
+
+
+def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
+    """The line (K, 2) [m] in a photograph as if its end were free; None if there is none.
+
+    It ends where the cable does, and not where the configuration says.
+    """
+    try:
+        image = vision.read_image(pose.file)
+        free = pose.model_copy(update={"end": None})
+        return _extract(config, free, image, view_of(config, image)).points
+    except MeasurementError:
+        return None
 
 
 def conditions(pose: DeclaredPose) -> Pose:
@@ -83,15 +118,12 @@ def _read_csv(pose: DeclaredPose) -> PoseInput:
 
 def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
     image = vision.read_image(pose.file)
-    view = view_of(config, image)
-    line = vision.extract_centerline(
-        image,
-        view,
-        start=pose.start,
-        end=pose.end,
-        diameter=config.cable.diameter,
-        length=config.cable.length,
-    )
+    try:
+        view = view_of(config, image)
+        line = _extract(config, pose, image, view)
+    except MeasurementError as error:
+        hint = _turned(config, pose, image)
+        raise MeasurementError(f"{error.message}{hint}") from None
     kept = slice(None, None, max(1, -(-len(line.points) // MOST_POINTS)))
     return PoseInput(
         pose.name,
@@ -105,8 +137,79 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
         weight=(line.std / np.median(line.std))[kept],
         coverage=line.coverage,
         confidence=line.confidence,
-        messages=line.messages,
+        messages=(*line.messages, *_marker_messages(config, view)),
+        markers=view.numbers,
     )
+
+
+def _extract(
+    config: Config,
+    pose: DeclaredPose,
+    image: np.ndarray,
+    view: vision.View,
+    workings: vision.Workings | None = None,
+) -> vision.Centerline:
+    return vision.extract_centerline(
+        image,
+        view,
+        start=pose.start,
+        end=pose.end,
+        diameter=config.cable.diameter,
+        length=config.cable.length,
+        workings=workings,
+    )
+
+
+def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
+    """Pictures (h, w, 3) of each step of the camera, as far as it comes, by the step's name.
+
+    Raises
+    ------
+    VisionError
+        If the photograph cannot be read.
+    """
+    image = vision.read_image(pose.file)
+    view, line, workings = None, None, vision.Workings()
+    try:
+        view = view_of(config, image)
+        line = _extract(config, pose, image, view, workings)
+    except MeasurementError:  # the pictures show how far it came; the table says why
+        pass
+    return vision.draw_steps(image, view, workings, line, pose.start, pose.end)
+
+
+def _marker_messages(config: Config, view: vision.View) -> list[str]:
+    """Sentences on markers of the board that were not used."""
+    measurement = config.experiment.measurement
+    if measurement.kind != "images" or measurement.board is None:
+        return []
+    declared = set(measurement.board.marker_centers)
+    used = f"{len(view.numbers)} of {len(declared)} are used"
+    lost = sorted(declared - set(view.numbers) - set(view.misplaced))
+    messages = [f"marker {n} not found; {used}" for n in lost]
+    messages += [f"marker {n} is not where it is declared; {used}" for n in view.misplaced]
+    return messages
+
+
+def _turned(config: Config, pose: DeclaredPose, image: np.ndarray) -> str:
+    """Sentence for a photograph that can be measured once it is turned.
+
+    A board's markers tell the way up; two reference points do not.
+    """
+    measurement = config.experiment.measurement
+    if measurement.kind != "images" or measurement.reference is None:
+        return ""
+    for quarters in (2, 1, 3):
+        turned = np.ascontiguousarray(np.rot90(image, quarters))
+        try:
+            _extract(config, pose, turned, view_of(config, turned))
+        except MeasurementError:
+            continue
+        return (
+            f" The cable is found once the photograph is turned by {90 * quarters} degrees "
+            "counter-clockwise: turn it, or read the reference's pixels again."
+        )
+    return ""
 
 
 def view_of(config: Config, image: np.ndarray) -> vision.View:
@@ -117,6 +220,7 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
         reference = vision.Reference(
             np.array(measurement.reference.pixels), np.array(measurement.reference.points)
         )
+        _check_reference(reference.pixels, image.shape)
         return vision.from_reference(reference, image.shape)
     assert measurement.board is not None
     declared = measurement.board
@@ -129,3 +233,15 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
             np.array(measurement.camera.matrix), np.array(measurement.camera.distortion)
         )
     return vision.locate_board(image, board, camera)
+
+
+def _check_reference(pixels: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Raise if a reference point lies outside of the photograph."""
+    height, width = shape[:2]
+    for u, v in pixels:
+        if not (0 <= u < width and 0 <= v < height):
+            raise MeasurementError(
+                f"the reference point ({u:g}, {v:g}) px lies outside of the picture of {width} x "
+                f"{height} px. Try: was the picture turned by 90 degrees or made smaller since "
+                "the pixels were read?"
+            )

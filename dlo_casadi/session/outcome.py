@@ -130,8 +130,12 @@ class PoseInput:
         Size of a pixel on the board.
     weight : (K,), optional
         Relative standard deviations of the points.
-    coverage, confidence : float, optional
+    coverage : float, optional
         Share of the cable that was seen; 0 to 1.
+    confidence : float, optional
+        Share of the line that was measured soundly; 0 to 1.
+    markers : tuple of int, optional
+        Numbers of the board's markers that were used.
     messages : tuple of str
         What the camera step noticed.
     """
@@ -148,6 +152,7 @@ class PoseInput:
     weight: FloatArray | None = None
     coverage: float | None = None
     confidence: float | None = None
+    markers: tuple[int, ...] | None = None
     messages: tuple[str, ...] = ()
 
 

@@ -11,12 +11,14 @@ import numpy as np
 
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.fit import SETTLED_MODES, Fit, refine_mesh
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import stiffness_interval
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model import CableModel
+from dlo_casadi.session.checks import raise_if_implausible
 from dlo_casadi.session.declared import Declared, declared_model, straight
 from dlo_casadi.session.findings import candidate_rows, effect_rows, next_pose_row, unexplained_row
 from dlo_casadi.session.fitting import (
@@ -26,7 +28,7 @@ from dlo_casadi.session.fitting import (
     reweighted,
     solved_by_ipopt,
 )
-from dlo_casadi.session.measure import read_poses
+from dlo_casadi.session.measure import measured_poses, read_inputs
 from dlo_casadi.session.outcome import Discretization, MeasurementSummary, Outcome, PoseInput, Stage
 from dlo_casadi.session.progress import Clock, Progress, Silent
 from dlo_casadi.session.remarks import fit_warnings, reading_warnings
@@ -39,7 +41,7 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     Raises
     ------
     MeasurementError
-        If no fit pose can be read.
+        If no fit pose can be read, or if the lines contradict the configuration beyond doubt.
     ConfigError
         If the configuration names an unknown effect.
     EstimationError
@@ -47,9 +49,22 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     """
     progress = progress or Silent()
     clock = Clock()
-    inputs, measured = read_poses(config, lambda name, k, m: progress.step(f"read {name}", k, m))
+    inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
+    try:
+        return fit_session(config, inputs, clock, progress)
+    except DloError as error:
+        error.poses = inputs  # for whoever tells what had been read
+        raise
+
+
+def fit_session(
+    config: Config, inputs: Sequence[PoseInput], clock: Clock, progress: Progress
+) -> Outcome:
+    """Fit and report a session whose poses have been read; raises as `run_session` does."""
+    odd = raise_if_implausible(config, inputs)
+    measured = measured_poses(config, inputs)
     clock.lap("vision")
-    warnings = [*config.warnings, *reading_warnings(inputs)]
+    warnings = [*config.warnings, *reading_warnings(inputs), *odd]
     declared = declared_model(config, _center(inputs), _pixel(inputs))
 
     progress.step("fit the declared model", 0, 1)
@@ -71,7 +86,7 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     warnings += fit_warnings(fit, error)
     outcome = Outcome(
         config=config,
-        poses=inputs,
+        poses=tuple(inputs),
         measurement=_summary(config, measured, fit),
         stages=tuple(stages),
         discretization=Discretization(fit.model.n, fit.model.element, error),

@@ -3,7 +3,9 @@
 from dlo_casadi.vision.board import Board, locate_board
 from dlo_casadi.vision.centerline import Centerline, extract_centerline
 from dlo_casadi.vision.image import read_image
+from dlo_casadi.vision.pictures import draw_steps, write_picture
 from dlo_casadi.vision.view import Camera, Reference, View, from_reference
+from dlo_casadi.vision.workings import Workings
 
 __all__ = [
     "Board",
@@ -11,8 +13,11 @@ __all__ = [
     "Centerline",
     "Reference",
     "View",
+    "Workings",
+    "draw_steps",
     "extract_centerline",
     "from_reference",
     "locate_board",
     "read_image",
+    "write_picture",
 ]

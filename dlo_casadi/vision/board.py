@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -73,7 +73,7 @@ def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None =
             f"a standoff of {board.standoff:g} m needs a camera: without one only the board's own "
             "plane can be measured. Try: give camera.matrix, or standoff: 0."
         )
-    found = _detect(image, board)
+    seen = found = _detect(image, board)
     places = {marker: board.corners(marker) for marker in found}
     homography, errors = _fit(found, places, board.standoff, camera)
     majority = len(found) // 2 + 1
@@ -85,9 +85,39 @@ def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None =
             f"the markers {sorted(found)} are {rms:.1f} px RMS off their declared places. "
             "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
             f"The picture is {image.shape[1]} x {image.shape[0]} px."
+            f"{_other_axes(seen, board, camera)}"
         )
-    height, width = image.shape[:2]
-    return View(homography, (height, width), camera, rms, np.array(list(found.values())))
+    return View(
+        homography,
+        (image.shape[0], image.shape[1]),
+        camera,
+        rms,
+        np.array(list(found.values())),
+        tuple(sorted(found)),
+        tuple(sorted(set(seen) - set(found))),
+    )
+
+
+# Mistakes in marker_centers: what was written -> the board's axes, x right and y up.
+_AXES = {
+    "y pointing up": np.array([[1.0, 0.0], [0.0, -1.0]]),
+    "x pointing right": np.array([[-1.0, 0.0], [0.0, 1.0]]),
+    "x and y exchanged": np.array([[0.0, 1.0], [1.0, 0.0]]),
+    "both turned by 90 degrees": np.array([[0.0, 1.0], [-1.0, 0.0]]),
+    "both turned by -90 degrees": np.array([[0.0, -1.0], [1.0, 0.0]]),
+    "both turned by 180 degrees": np.array([[-1.0, 0.0], [0.0, -1.0]]),
+}
+
+
+def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) -> str:
+    """Sentence on the axes with which the declared places would fit, if some do."""
+    for what, axes in _AXES.items():
+        centers = {n: axes @ np.asarray(board.marker_centers[n], float) for n in found}
+        turned = replace(board, marker_centers=centers)
+        _, errors = _fit(found, {n: turned.corners(n) for n in found}, board.standoff, camera)
+        if len(found) > 1 and max(errors.values()) < _MAX_ERROR_PX:
+            return f" With {what} in marker_centers they fit."
+    return ""
 
 
 def _detect(image: NDArray[np.uint8], board: Board) -> dict[int, Array]:
@@ -98,9 +128,7 @@ def _detect(image: NDArray[np.uint8], board: Board) -> dict[int, Array]:
         raise VisionError(f"unknown ArUco dictionary {board.dictionary!r}. Try: {known}, ...")
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
-    quads, numbers, _ = detector.detectMarkers(grey)
-    seen = [] if numbers is None else [int(n) for n in numbers.ravel()]
-    found = {n: q.reshape(4, 2) for n, q in zip(seen, quads, strict=True)}
+    found = _markers(detector, grey)
     ours = {n: _refine(grey, q) for n, q in found.items() if n in board.marker_centers}
     if not ours:
         other = f"only markers {sorted(found)}" if found else "no marker at all"
@@ -108,8 +136,23 @@ def _detect(image: NDArray[np.uint8], board: Board) -> dict[int, Array]:
             f"board not found: {other} of {board.dictionary} in the picture, but the board has "
             f"{sorted(board.marker_centers)}. Try: the right dictionary; markers flat, in focus, "
             f"inside the picture, with a white margin (mean brightness {grey.mean():.0f} of 255)."
+            f"{_mirrored(detector, grey, board)}"
         )
     return ours
+
+
+def _markers(detector: cv2.aruco.ArucoDetector, grey: NDArray[np.uint8]) -> dict[int, Array]:
+    """Corners (4, 2) [px] of all markers by their numbers."""
+    quads, numbers, _ = detector.detectMarkers(grey)
+    seen = [] if numbers is None else [int(n) for n in numbers.ravel()]
+    return {n: q.reshape(4, 2) for n, q in zip(seen, quads, strict=True)}
+
+
+def _mirrored(detector: cv2.aruco.ArucoDetector, grey: NDArray[np.uint8], board: Board) -> str:
+    """Sentence for a mirrored photograph."""
+    flipped = _markers(detector, np.ascontiguousarray(grey[:, ::-1]))
+    ours = sorted(set(flipped) & set(board.marker_centers))
+    return f" The picture is mirrored: in its mirror image there are {ours}." if ours else ""
 
 
 def _refine(grey: NDArray[np.uint8], quad: Array) -> Array:

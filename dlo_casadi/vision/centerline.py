@@ -11,12 +11,15 @@ from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.search import find_cable
 from dlo_casadi.vision.trace import Trace, trace_cable
 from dlo_casadi.vision.view import Array, View
+from dlo_casadi.vision.workings import Workings
 from dlo_casadi.vision.workplane import rectify
 
 _SPACING = 0.0025  # m
 _MOST_POINTS = 400
 _FAR = 0.2  # of the length: a line that ends so far from a fixture in the picture is not the cable
 _LEAST = 0.2  # of the length: what must be measured
+_DOUBTFUL = 0.8  # confidence below which a user is told why
+_SHORT = 0.97  # of the length: a line that ends at both fixtures and is shorter is not to scale
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ def extract_centerline(
     end: ArrayLike | None,
     diameter: float,
     length: float,
+    workings: Workings | None = None,
 ) -> Centerline:
     """Isolate the cable, order it from start to end and refine it to sub-pixel.
 
@@ -71,6 +75,8 @@ def extract_centerline(
         The fixtures in the board frame; `end` is None for a free end.
     diameter, length : scalar [m]
         Of the cable.
+    workings : Workings, optional
+        Is filled with what the steps have seen, also where one of them fails.
 
     Raises
     ------
@@ -84,8 +90,13 @@ def extract_centerline(
     first = np.asarray(start, float)
     last = None if end is None else np.asarray(end, float)
     plane = rectify(image, view, start=first, end=last, diameter=diameter, length=length)
-    chain = find_cable(plane, start=first, end=last, diameter=diameter, length=length)
+    workings = workings or Workings()
+    workings.plane = plane
+    chain = find_cable(
+        plane, start=first, end=last, diameter=diameter, length=length, workings=workings
+    )
     trace = trace_cable(image, view, chain.strands, start=first, end=last, diameter=diameter)
+    workings.trace = trace
 
     step = max(_SPACING, float(trace.t[-1] - trace.t[0]) / _MOST_POINTS)
     kept = np.nonzero(trace.sound)[0]
@@ -108,16 +119,19 @@ def extract_centerline(
     points = trace.points[kept]
     gaps = tuple(int(i) for i in np.nonzero(missing)[0])
     _check_fixtures(points, view, first, last, length)
+    confidence = float(np.clip(trace.sound.sum() / max(1, trace.inside.sum()), 0.0, 1.0))
     return Centerline(
         points,
         trace.std[kept],
         view.to_pixels(points),
         min(1.0, seen / length),
         gaps,
-        float(np.clip(trace.sound.sum() / max(1, trace.inside.sum()), 0.0, 1.0)),
+        confidence,
         (
-            *_messages(trace, kept, gaps, seen, first, last, length),
+            *_gap_messages(trace, kept, gaps, length),
+            *_messages(points, seen, first, last, length),
             *_width_message(trace.width, diameter, 1.0 / view.scale),
+            *_confidence_message(confidence),
         ),
     )
 
@@ -155,26 +169,41 @@ def _width_message(width: float, diameter: float, pixel: float) -> tuple[str, ..
     )
 
 
-def _messages(
-    trace: Trace,
-    kept: NDArray[np.intp],
-    gaps: tuple[int, ...],
-    seen: float,
-    start: Array,
-    end: Array | None,
-    length: float,
-) -> tuple[str, ...]:
-    """Sentences on what is missing and what does not fit."""
+def _confidence_message(confidence: float) -> tuple[str, ...]:
+    if confidence >= _DOUBTFUL:
+        return ()
+    return (
+        f"only {100 * confidence:.0f} % of the line look like a cable with an edge on both sides: "
+        "a sharper photograph, a plainer background or more contrast would help",
+    )
+
+
+def _gap_messages(
+    trace: Trace, kept: NDArray[np.intp], gaps: tuple[int, ...], length: float
+) -> list[str]:
+    """Sentences on what is missing along the line: how much, where and why."""
     messages = []
-    points = trace.points[kept]
     for i in gaps:
-        wide = float(np.linalg.norm(points[i + 1] - points[i]))
-        hidden = trace.inside[kept[i] : kept[i + 1]].all()
-        what = "hidden" if hidden else "outside the picture"
-        messages.append(
-            f"the cable is {what} for about {wide:.3f} m, "
-            f"{trace.t[kept[i]]:.3f} m along the measured line"
-        )
+        missing = slice(kept[i], kept[i + 1])
+        before, after = trace.t[kept[i]], trace.t[kept[i + 1]]
+        share = f"{100 * (after - before) / length:.0f} % of the cable"
+        where = f"between {before:.2f} and {after:.2f} m of the measured line"
+        if not trace.inside[missing].all():
+            messages.append(f"{share}, {where}, are outside the picture")
+        elif trace.glare[missing].mean() > 0.3:
+            messages.append(
+                f"glare hides {share}, {where}: a lamp from the side or a softer one would help"
+            )
+        else:
+            messages.append(f"{share}, {where}, are hidden or do not look like it")
+    return messages
+
+
+def _messages(
+    points: Array, seen: float, start: Array, end: Array | None, length: float
+) -> list[str]:
+    """Sentences on how the line fits the fixtures and the length."""
+    messages = []
     ends = [("start", start, 0)]
     if end is not None:
         ends.append(("end", end, -1))
@@ -185,11 +214,17 @@ def _messages(
     whole = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
     if end is not None:
         whole += float(np.linalg.norm(points[0] - start) + np.linalg.norm(points[-1] - end))
+    off = f"{100 * abs(whole / length - 1):.1f} %"
     if whole > 1.03 * length:
         messages.append(
-            f"the measured line is {whole:.3f} m long, {100 * (whole / length - 1):.1f} % longer "
-            "than the cable: check the scale and the length"
+            f"the line found is {off} longer than declared ({whole:.3f} of {length:g} m): "
+            "check the scale and the length"
+        )
+    elif end is not None and whole < _SHORT * length:
+        messages.append(
+            f"the line found is {off} shorter than declared ({whole:.3f} of {length:g} m, up to "
+            "both fixtures): check the scale and the length"
         )
     elif end is None and seen < 0.9 * length:
         messages.append(f"only {seen:.3f} m of {length:g} m were measured")
-    return tuple(messages)
+    return messages

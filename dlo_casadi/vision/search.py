@@ -15,6 +15,7 @@ from dlo_casadi.vision.contrast import candidate_maps, local_contrast, threshold
 from dlo_casadi.vision.ordering import Chain, order_strands
 from dlo_casadi.vision.strands import find_strands
 from dlo_casadi.vision.view import Array
+from dlo_casadi.vision.workings import Workings
 from dlo_casadi.vision.workplane import WorkPlane
 
 _GOOD = -0.7  # cost per length of a cable that is seen nearly from fixture to fixture
@@ -47,7 +48,13 @@ class _Finding:
 
 
 def find_cable(
-    plane: WorkPlane, *, start: Array, end: Array | None, diameter: float, length: float
+    plane: WorkPlane,
+    *,
+    start: Array,
+    end: Array | None,
+    diameter: float,
+    length: float,
+    workings: Workings | None = None,
 ) -> Chain:
     """Try the candidate pictures in turn and keep the chain of least cost.
 
@@ -72,6 +79,9 @@ def find_cable(
             mask = (candidate > cut) & plane.reachable
             lines = _lines(mask, candidate, plane, fixtures, diameter)
             longest = max([longest, *(line.length for line in lines)])
+            if workings is not None and best is None:
+                workings.candidate, workings.cut = candidate, cut
+                workings.lines = [line.points for line in lines]
             chain = order_strands(
                 [line.points for line in lines],
                 [line.width for line in lines],
@@ -82,6 +92,10 @@ def find_cable(
             )
             if chain is not None and (best is None or chain.cost < best.chain.cost):
                 best = _Finding(chain, [lines[i] for i in chain.used], candidate, cut)
+                if workings is not None:
+                    workings.candidate, workings.cut = candidate, cut
+                    workings.lines = [line.points for line in lines]
+                    workings.chosen = chain.strands
         if best is not None and best.chain.cost < _GOOD * length:
             break
     if best is None or best.chain.supported < _LEAST * length:

@@ -12,6 +12,7 @@ from dlo_casadi.vision.curve import SmoothCurve, chord_length, fit_curve
 from dlo_casadi.vision.refine import (
     Crossings,
     EdgeShape,
+    Profiles,
     average,
     cable_direction,
     edge_shape,
@@ -22,6 +23,7 @@ from dlo_casadi.vision.view import Array, View
 
 _STEP = 1 / 8  # of the diameter: between profiles
 _RAW, _FINE = 0.15, 0.7  # of the diameter: average along the cable, to judge and to measure
+_WHITE = 248  # grey level
 _FLOOR_PX = 0.06  # what the sampling and compression of a photograph leave, along centimetres
 
 
@@ -41,6 +43,8 @@ class Trace:
         Whether the profile shows the cable and nothing else.
     inside : (K,) bool
         Whether it lies in the photograph.
+    glare : (K,) bool
+        Whether the place of the cable is overexposed.
     width : scalar [m]
         Typical distance of the two edges; 0 where no edges were found.
     """
@@ -50,6 +54,7 @@ class Trace:
     std: Array
     sound: NDArray[np.bool_]
     inside: NDArray[np.bool_]
+    glare: NDArray[np.bool_]
     width: float
 
 
@@ -96,12 +101,19 @@ def trace_cable(
     )
     points = curve.position(t) + fine.offset[:, None] * curve.normal(t)
     std = _std(rough.offset, fine.offset, sound, view)
-    return Trace(t, points, std, sound, raw.inside, shape.width)
+    return Trace(t, points, std, sound, raw.inside, _glare(raw, diameter), shape.width)
+
+
+def _glare(profiles: Profiles, diameter: float) -> NDArray[np.bool_]:
+    """Profiles (K,) of which half of the cable's width is white beyond measure."""
+    body = np.abs(profiles.offset) < 0.5 * diameter
+    return (profiles.values[:, body].min(axis=2) > _WHITE).mean(axis=1) > 0.5
 
 
 def _nothing(curve: SmoothCurve, t: Array, inside: NDArray[np.bool_]) -> Trace:
     """Trace without a sound profile."""
-    return Trace(t, curve.position(t), np.zeros(len(t)), np.zeros(len(t), bool), inside, 0.0)
+    none = np.zeros(len(t), bool)
+    return Trace(t, curve.position(t), np.zeros(len(t)), none, inside, none, 0.0)
 
 
 def _first_curve(

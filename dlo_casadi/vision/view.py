@@ -75,6 +75,10 @@ class View:
         Root mean square over the corners of the markers; 0 for two reference points.
     markers : (n, 4, 2) [px]
         Corners of the markers that were used.
+    numbers : tuple of int
+        Their numbers.
+    misplaced : tuple of int
+        Markers that were seen, but not where they are declared.
     """
 
     homography: Array
@@ -82,6 +86,8 @@ class View:
     camera: Camera | None = None
     reprojection_error: float = 0.0
     markers: Array = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    numbers: tuple[int, ...] = ()
+    misplaced: tuple[int, ...] = ()
 
     def to_board(self, pixels: ArrayLike) -> Array:
         """Points of the cable's plane [m] seen at pixels (K, 2) [px]; shape (K, 2)."""

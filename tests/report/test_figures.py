@@ -10,6 +10,7 @@ from matplotlib.image import imread
 from dlo_casadi.report import figures, overlay
 from dlo_casadi.report.canvas import before_after, label_of
 from dlo_casadi.report.drawing import draw_prediction
+from dlo_casadi.report.geometry import magnified
 from dlo_casadi.session.outcome import PoseInput
 
 PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"
@@ -116,9 +117,7 @@ def test_magnified_deviations_are_multiples_of_the_true_ones(outcome):
     pose, std = outcome.poses[0], outcome.measurement.std
     shape = outcome.stage("initial").shapes[pose.name]
 
-    distance = [
-        np.hypot(*(pose.points - figures._magnified(pose, shape, std, k)).T) for k in (5, 10)
-    ]
+    distance = [np.hypot(*(pose.points - magnified(pose, shape, std, k)).T) for k in (5, 10)]
     assert distance[1] == pytest.approx(2 * distance[0])
     # Normals of 201 drawn points: exact to a thousandth.
     assert distance[0] == pytest.approx(5 * std * np.abs(shape.residual), rel=1e-3)

@@ -13,7 +13,7 @@ from dlo_casadi.effects import ImageDistortion, RestCurvatureDrift
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.predict import predict
+from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_file import (
     covariance_si,
     final_rest,

@@ -10,6 +10,7 @@ from small_sessions import BENCH
 from dlo_casadi.errors import DloError
 from dlo_casadi.measurements import read_centerline
 from dlo_casadi.report import writer
+from dlo_casadi.report.page import GENERATOR
 from dlo_casadi.report.writer import OWNED, ResultsFolder
 
 
@@ -32,13 +33,14 @@ def tree(folder):
 
 @pytest.fixture
 def earlier(tmp_path):
-    """Results of an earlier run, with a note of the user's beside them."""
+    """Results of an earlier run, the page of one that failed, and a note of the user's."""
     folder = tmp_path / "results"
     (folder / "centerlines").mkdir(parents=True)
     (folder / "figures").mkdir()
     (folder / "report.json").write_text('{"schema": "dlo-report/1"}')
     (folder / "parameters.yaml").write_text("schema: dlo-parameters/1\n")
     (folder / "centerlines" / "old_pose.csv").write_text("x_m,y_m\n0,0\n1,0\n")
+    (folder / "failed.html").write_text(f"<!DOCTYPE html>{GENERATOR}")
     (folder / "notes.txt").write_text("mine")
     return folder
 
@@ -96,7 +98,7 @@ def test_a_run_that_stops_while_writing_leaves_no_trace(outcome, monkeypatch, ea
     assert tree(earlier) == before
 
 
-@pytest.mark.parametrize("moves", range(8))
+@pytest.mark.parametrize("moves", range(10))
 def test_a_failure_in_the_middle_of_the_swap_is_undone(outcome, quick, monkeypatch, earlier, moves):
     """Whichever of the renamings fails, the earlier results come back."""
     replace_, left = os.replace, [moves]

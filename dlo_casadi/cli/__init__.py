@@ -1,0 +1,90 @@
+"""The command `dlo`: one module per subcommand; the only package that prints or exits.
+
+Exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from types import ModuleType
+
+from dlo_casadi.cli.guard import BAD_INPUT, OK, guarded
+
+# Subcommand -> what it does. Its module of the same name is imported only when it is called.
+COMMANDS = {
+    "new": "write a commented configuration to start from",
+    "check": "check a configuration and its photographs in seconds, without fitting",
+    "fit": "fit a cable to its photographs or centre-lines and report what was found",
+    "fit-many": "fit many sessions, on many cores or machines, into one table",
+    "diagnose": "fit, and print the search for missing effects in full",
+    "predict": "predict the shape of a fitted cable from where its ends are held",
+    "shape-table": "predict the shapes of a fitted cable in very many poses",
+    "generate-solver": "write the C solver of a fitted cable for planners to embed",
+    "schema": "print the JSON schema of a configuration, for editors",
+    "reproduce": "compare with the paper's results (needs a checkout)",
+    "benchmark": "time the C solver beside other solvers (needs a checkout)",
+}
+
+EXAMPLES = """\
+examples:
+  dlo new rope.yaml --photographs photographs/     start a configuration
+  dlo check rope.yaml                              is everything as declared?
+  dlo fit rope.yaml                                results/rope/
+  dlo predict results/rope --end 0.3 -0.1          where will it hang?
+
+`dlo SUBCOMMAND --help` tells more."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `dlo SUBCOMMAND ...`.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        What follows `dlo`; the command line by default.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 1 a bug, 2 bad input, 130 interrupted.
+
+    Raises
+    ------
+    SystemExit
+        With 2 for unknown arguments, with 0 after `--help`.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments and arguments[0] in COMMANDS:
+        name, rest = arguments[0], arguments[1:]
+        return guarded(lambda: _module(name).main(rest))
+    if arguments[:1] in (["-h"], ["--help"]):
+        print(_overview())
+        return OK
+    if arguments[:1] == ["--version"]:
+        from dlo_casadi import __version__
+
+        print(f"dlo {__version__}")
+        return OK
+    said = f"no subcommand is called {arguments[0]!r}\n\n" if arguments else ""
+    print(said + _overview(), file=sys.stderr)
+    return BAD_INPUT
+
+
+def _module(name: str) -> ModuleType:
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")  # the matrices are small: threads would only cost
+    return import_module(f"dlo_casadi.cli.{name.replace('-', '_')}")
+
+
+def _overview() -> str:
+    width = max(map(len, COMMANDS))
+    listed = "\n".join(f"  {name:{width}}  {text}" for name, text in COMMANDS.items())
+    return (
+        "usage: dlo SUBCOMMAND ...\n\n"
+        "Models of electrical cables from photographs: fit, diagnose, predict, embed.\n\n"
+        f"subcommands:\n{listed}\n\n{EXAMPLES}\n\n"
+        "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
+    )

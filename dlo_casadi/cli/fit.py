@@ -1,0 +1,68 @@
+"""`dlo fit`: from a configuration to results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from dlo_casadi.cli.guard import OK
+from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.cli.watch import Watch
+from dlo_casadi.config import load_config
+from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.report.terminal import print_summary
+from dlo_casadi.report.writer import ResultsFolder
+from dlo_casadi.session import run_session
+
+EXAMPLES = """\
+dlo fit configs/cable.yaml                       writes results/cable/
+dlo fit rope.yaml --output results/monday        to a folder of your choice
+dlo fit rope.yaml --no-diagnosis                 only the declared model: much faster
+dlo fit rope.yaml --quiet --json > rope.json     report.json to a program"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run `dlo fit CONFIG [...]`."""
+    parser = command(
+        "fit",
+        "Fit a cable to its photographs or centre-lines and report what was found.",
+        EXAMPLES,
+        "on 2 and 130 earlier results are kept",
+    )
+    parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder of the results; default results/<config name>/",
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("--json", action="store_true", help="print report.json instead of tables")
+    parser.add_argument(
+        "--no-diagnosis", action="store_true", help="do not search for missing effects"
+    )
+    chosen = parser.parse_args(argv)
+
+    config = load_config(chosen.config)
+    if chosen.no_diagnosis:
+        diagnosis = config.diagnosis.model_copy(update={"enabled": False})
+        config = replace(config, diagnosis=diagnosis)
+    output = chosen.output or Path("results") / config.name
+    with (
+        ResultsFolder(output, config) as folder,
+        Watch(Console(stderr=True), chosen.quiet) as watch,
+    ):
+        outcome = run_session(config, watch)
+        watch.step("write the results", 0, 1)
+        folder.write(outcome)
+        watch.step("write the results", 1, 1)
+    if chosen.json:
+        print_json(report_dict(outcome))
+        return OK
+    page = console(quiet=chosen.quiet)
+    print_summary(page, outcome)
+    page.print(f"Results: {output}", soft_wrap=True)
+    return OK

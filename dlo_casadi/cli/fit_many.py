@@ -1,0 +1,104 @@
+"""`dlo fit-many`: many sessions on many cores or machines."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from dlo_casadi.cli.counter import Counter
+from dlo_casadi.cli.guard import OK
+from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.fleet import FleetResult, Options, find_sessions, fit_fleet
+from dlo_casadi.fleet.outliers import judge
+from dlo_casadi.parallel import open_executor
+
+EXAMPLES = """\
+dlo fit-many cables/                                  all configurations in it and below
+dlo fit-many 'cables/*/session.yaml' --jobs 8         on eight cores
+dlo fit-many cables/ --scheduler tcp://10.0.0.5:8786  on a Dask cluster
+dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run `dlo fit-many FOLDER [...]`."""
+    parser = command(
+        "fit-many",
+        "Fit many sessions: a table (table.parquet) with one row each, a page (index.html) that\n"
+        "shows the odd ones first, and the results of each. The same command goes on after an\n"
+        "interruption; what is finished and unchanged is not repeated.",
+        EXAMPLES,
+        "a session that fails is a row with its message",
+    )
+    parser.add_argument("where", metavar="FOLDER", help="folder, or a pattern in quotes")
+    add_workers(parser)
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead")
+    parser.add_argument(
+        "--output", type=Path, metavar="DIR", help="default results/fleet-<name of the folder>/"
+    )
+    parser.add_argument(
+        "--no-diagnosis", action="store_true", help="do not search for missing effects"
+    )
+    parser.add_argument(
+        "--no-reports", action="store_true", help="no folder of results for each session"
+    )
+    parser.add_argument(
+        "--retry-failed", action="store_true", help="try sessions again that have failed"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
+    chosen = parser.parse_args(argv)
+
+    base, sessions = find_sessions(chosen.where)
+    output = chosen.output or Path("results") / f"fleet-{base.name}"
+    options = Options(diagnosis=not chosen.no_diagnosis, reports=not chosen.no_reports)
+    with (
+        Counter(Console(stderr=True), "sessions", chosen.quiet) as counter,
+        open_executor(chosen.jobs, chosen.scheduler, output / "logs") as executor,
+    ):
+
+        def begin(taken_over: int, left: int) -> None:
+            before = f", {taken_over} are finished" if taken_over else ""
+            counter.message(f"{len(sessions)} sessions{before}; results in {output}")
+
+        result = fit_fleet(
+            sessions,
+            output,
+            executor,
+            options,
+            retry_failed=chosen.retry_failed,
+            begin=begin,
+            progress=counter.show,
+        )
+    if chosen.json:
+        print_json(list(result.rows))
+    else:
+        _summary(result, output, chosen.quiet)
+    return OK
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add `--jobs`."""
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="number of processes; default 1"
+    )
+
+
+def _summary(result: FleetResult, output: Path, quiet: bool) -> None:
+    """What to look at first."""
+    page = console(quiet)
+    odd = [item for item in judge(result.rows) if item.reasons]
+    for item in odd[:10]:
+        what = str(item.row["message"]).splitlines()[0] if item.row["message"] else ""
+        text = f"{item.row['session']}: {', '.join(item.reasons)}{': ' * bool(what)}{what}"
+        page.print(text, soft_wrap=True, markup=False)
+    if len(odd) > 10:
+        page.print(f"and {len(odd) - 10} more", markup=False)
+    page.print(
+        f"{len(result.rows)} sessions, {len(result.failed)} without results: "
+        f"{output / 'index.html'}, {output / 'table.parquet'}",
+        soft_wrap=True,
+        markup=False,
+    )

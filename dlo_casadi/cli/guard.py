@@ -1,0 +1,71 @@
+"""What goes wrong becomes a message and an exit code."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from types import FrameType
+
+from dlo_casadi.errors import DloError
+
+OK, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+
+class _Signals:
+    """Whether a signal has come: a library underneath may swallow the exception that it raises."""
+
+    def __init__(self) -> None:
+        self.received = False
+
+    def interrupt(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal."""
+        self.received = True
+        raise KeyboardInterrupt
+
+    def check(self) -> None:
+        """Raise what has been swallowed."""
+        if self.received:
+            raise KeyboardInterrupt
+
+
+signals = _Signals()
+
+
+def guarded(work: Callable[[], int]) -> int:
+    """Run a command, its imports included, and return its exit code."""
+    # SIGINT, too: a shell may have started the command with it ignored.
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signals.received = False
+    try:
+        for number in before:
+            signal.signal(number, signals.interrupt)
+        return work()
+    except KeyboardInterrupt:
+        return _interrupted()
+    except DloError as error:
+        notes = getattr(error, "__notes__", [])
+        print("\n".join([f"{type(error).__name__}: {error}", *notes]), file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:
+        # The reader of the output has gone, as `head` does; nothing is left to be said.
+        sys.stdout = None
+        return OK
+    except Exception:
+        if signals.received:  # an import that was interrupted may end as any error
+            return _interrupted()
+        traceback.print_exc()
+        print(
+            "This is a bug. Please report it with the lines above and your configuration.",
+            file=sys.stderr,
+        )
+        return BUG
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _interrupted() -> int:
+    print("interrupted; earlier results are as they were", file=sys.stderr)
+    return INTERRUPTED

@@ -1,0 +1,82 @@
+"""`dlo new`: a configuration to start from."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from dlo_casadi.cli.guard import OK
+from dlo_casadi.cli.options import command, print_json
+from dlo_casadi.config.schema import schema_text
+from dlo_casadi.config.template import template
+from dlo_casadi.errors import DloError
+
+EXAMPLES = """\
+dlo new rope.yaml
+dlo new rope.yaml --photographs photographs/
+dlo new rope.yaml --centerlines measured/"""
+
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run `dlo new FILE [--photographs DIR | --centerlines DIR]`."""
+    parser = command(
+        "new",
+        "Write a commented configuration to start from: one pose for each file that is found,\n"
+        "and FILL_IN wherever only you know the value. Nothing is asked, nothing replaced.",
+        EXAMPLES,
+    )
+    parser.add_argument("file", type=Path, help="the configuration to write, such as rope.yaml")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--photographs", type=Path, metavar="DIR", help="folder of photographs")
+    source.add_argument("--centerlines", type=Path, metavar="DIR", help="folder of CSV files")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+    chosen = parser.parse_args(argv)
+
+    target: Path = chosen.file
+    if target.suffix not in (".yaml", ".yml"):
+        raise DloError(f"{target}: the name of a configuration ends in .yaml")
+    files: list[str] = []
+    if chosen.photographs is not None:
+        files = _listed(chosen.photographs, _PHOTOGRAPHS, "photograph", target.parent)
+    elif chosen.centerlines is not None:
+        files = _listed(chosen.centerlines, (".csv",), "CSV file", target.parent)
+    text = template(target.stem, files, "images" if chosen.centerlines is None else "centerlines")
+    schema = target.with_name("schema.json")
+    written = [target]
+    try:
+        with target.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+        if not schema.exists():
+            schema.write_text(schema_text(), encoding="utf-8")
+            written.append(schema)
+    except FileExistsError:
+        raise DloError(f"{target} exists already, and nothing is replaced") from None
+    except OSError as error:
+        raise DloError(f"{target} cannot be written: {error.strerror}") from None
+    if chosen.json:
+        print_json({"files": [str(path) for path in written], "poses": len(files)})
+    elif not chosen.quiet:
+        left = text.count("FILL_IN") - 1  # one is in a comment
+        print(f"{target}: {len(files)} poses, {left} places to fill in, each marked FILL_IN")
+        print(f"then: dlo check {target}")
+    return OK
+
+
+def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list[str]:
+    """Files of a folder in the order of their names, pose_2 before pose_10, relative to `base`."""
+    try:
+        found = [path for path in folder.iterdir() if path.suffix.lower() in endings]
+    except OSError as error:
+        raise DloError(f"{folder} cannot be read: {error.strerror}") from None
+    if not found:
+        raise DloError(f"{folder} holds no {what} ({', '.join(endings)})")
+    found.sort(key=lambda path: [int(t) if t.isdigit() else t for t in _PARTS.split(path.name)])
+    return [Path(os.path.relpath(path, base)).as_posix() for path in found]
+
+
+_PARTS = re.compile(r"(\d+)")

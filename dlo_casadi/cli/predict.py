@@ -1,0 +1,99 @@
+"""`dlo predict`: the shape of a fitted cable in a new pose."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dlo_casadi.cli.guard import OK
+from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.errors import DloError
+from dlo_casadi.prediction import PredictedShape, predict
+from dlo_casadi.report.drawing import draw_prediction
+from dlo_casadi.report.terminal import prediction_table
+
+DRAWN = (".png", ".pdf", ".svg", ".jpg")
+
+EXAMPLES = """\
+dlo predict results/cable --end 0.3 -0.1
+dlo predict results/cable --end 0.3 -0.1 --figure shape.png
+dlo predict results/cable --start 0.1 0 --end 0.3 -0.1 --branch cw --json
+dlo predict results/wire --end -0.12 0 --start-heading 0 --end-heading -6.2832"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run `dlo predict PARAMETERS --end X Y [...]`."""
+    parser = command(
+        "predict",
+        "Predict the shape of a fitted cable from where its ends are held.",
+        EXAMPLES,
+        "2 is also a pose without an equilibrium",
+    )
+    parser.add_argument("parameters", type=Path, help="parameters.yaml or its folder")
+    for side, remark in (("end", "; not for a free end"), ("start", "")):
+        parser.add_argument(
+            f"--{side}",
+            nargs=2,
+            type=float,
+            metavar=("X", "Y"),
+            help=f"where the {side} is held [m]{remark}",
+        )
+    parser.add_argument("--start-heading", type=float, metavar="R", help="clamped start [rad]")
+    parser.add_argument("--end-heading", type=float, metavar="R", help="clamped end [rad]")
+    parser.add_argument("--branch", choices=("ccw", "cw"), help="which way the cable turns")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}")
+    chosen = parser.parse_args(plain_numbers(argv))
+
+    figure = chosen.figure
+    if figure is not None and figure.suffix.lower() not in DRAWN:
+        raise DloError(f"--figure {figure}: the name must end in {', '.join(DRAWN)}")
+    shape = predict(
+        chosen.parameters,
+        chosen.end,
+        start=chosen.start,
+        start_heading=chosen.start_heading,
+        end_heading=chosen.end_heading,
+        branch=chosen.branch,
+    )
+    if figure is not None:
+        try:
+            draw_prediction(figure, shape.as_dict())
+        except OSError as error:
+            raise DloError(f"--figure {figure}: cannot be written: {error.strerror}") from None
+    if chosen.json:
+        print_json(shape.as_dict())
+        return OK
+    page = console(quiet=chosen.quiet)
+    page.print(prediction_table(shape.as_dict(), _notes(shape)))
+    if figure is not None:
+        page.print(f"Figure: {figure}", soft_wrap=True)
+    return OK
+
+
+def _notes(shape: PredictedShape) -> list[str]:
+    """What a reader of the prediction should know of the file it came from."""
+    metadata, notes = shape.cable.metadata, []
+    if metadata.edited:
+        notes.append("note: the model in this file was changed after it had been fitted")
+    if metadata.identifiable is False:
+        notes.append(
+            "note: the shapes did not determine the bending stiffness; the shape is more certain "
+            "than forces and energy"
+        )
+    return notes
+
+
+_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+
+
+def plain_numbers(argv: Sequence[str]) -> list[str]:
+    """Write -1e-2 as -0.01: argparse takes the former for an option."""
+    return [
+        np.format_float_positional(float(text), trim="0") if _NEGATIVE.fullmatch(text) else text
+        for text in argv
+    ]

@@ -1,0 +1,142 @@
+"""`dlo shape-table`: shapes of a fitted cable in very many poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from dlo_casadi.cli.counter import Counter
+from dlo_casadi.cli.fit_many import add_workers
+from dlo_casadi.cli.guard import OK
+from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.cli.predict import plain_numbers
+from dlo_casadi.errors import DloError
+from dlo_casadi.fleet.store import parquet_library
+from dlo_casadi.model import CableModel
+from dlo_casadi.parallel import open_executor
+from dlo_casadi.report.parameters_file import Parameters, load_parameters
+from dlo_casadi.shape_table import Grid, Plan, PoseList, shape_table
+from dlo_casadi.shape_table.poses import Poses
+
+EXAMPLES = """\
+dlo shape-table results/cable --grid -0.8 0.8 200 -0.8 0.8 200 --output shapes.parquet
+dlo shape-table results/cable --list ends.csv --output shapes.parquet --jobs 4
+dlo shape-table results/wire --grid -0.2 0 50 0 0.1 50 --end-heading -6.28 --output wire.parquet"""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run `dlo shape-table PARAMETERS --grid|--list ... --output FILE [...]`."""
+    parser = command(
+        "shape-table",
+        "Predict the shapes of a fitted cable over a grid or a list of end poses with the\n"
+        "compiled solver. The same command goes on after an interruption. Poses without a shape\n"
+        "say why in the column `status`.",
+        EXAMPLES,
+    )
+    parser.add_argument("parameters", type=Path, help="parameters.yaml or its folder")
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument(
+        "--grid",
+        nargs=6,
+        type=float,
+        metavar=("X0", "X1", "NX", "Y0", "Y1", "NY"),
+        help="end positions [m], x fastest",
+    )
+    which.add_argument(
+        "--list", type=Path, metavar="FILE", help="CSV or Parquet with end_x_m, end_y_m, ..."
+    )
+    parser.add_argument("--output", type=Path, required=True, metavar="FILE", help=".parquet")
+    parser.add_argument("--start", nargs=2, type=float, metavar=("X", "Y"), help="of all poses [m]")
+    parser.add_argument("--start-heading", type=float, metavar="R", help="of all poses [rad]")
+    parser.add_argument("--end-heading", type=float, metavar="R", help="of all poses [rad]")
+    parser.add_argument("--branch", choices=("ccw", "cw"), help="which way the cable turns")
+    parser.add_argument("--elements", type=int, help="number of elements, instead of the fit's")
+    add_workers(parser)
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead")
+    parser.add_argument("--restart", action="store_true", help="replace what lies there")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+    chosen = parser.parse_args(plain_numbers(argv))
+
+    parquet_library()
+    cable = load_parameters(chosen.parameters)
+    model, p, rest, metadata = cable
+    if chosen.elements:
+        if model.has_state:
+            raise DloError("the state of a drifting cable belongs to the fit's own elements")
+        model = model.with_mesh(chosen.elements)
+        rest = model.rest_basis @ metadata.coefficients
+    fixed, needed = _ends(cable, chosen.start, chosen.start_heading, chosen.end_heading)
+    poses: Poses
+    if chosen.grid is not None:
+        poses = _grid(model, chosen.grid, fixed, needed)
+    else:
+        poses = PoseList(chosen.list, tuple(needed), fixed)
+    output = chosen.output.resolve()
+    plan = Plan(model, p, rest, chosen.branch, output.with_name(f"{output.name}.parts"))
+    with (
+        Counter(Console(stderr=True), "poses", chosen.quiet, plan.chunk) as counter,
+        open_executor(chosen.jobs, chosen.scheduler) as executor,
+    ):
+        counts = shape_table(
+            plan,
+            poses,
+            output,
+            executor,
+            metadata={"parameters_model_hash": metadata.model_hash, "config": metadata.config},
+            restart=chosen.restart,
+            progress=counter.show,
+        )
+    if chosen.json:
+        print_json({"output": str(output), "model_hash": plan.digest, "poses": counts})
+    else:
+        said = ", ".join(f"{n} {status.replace('_', ' ')}" for status, n in counts.items())
+        console(chosen.quiet).print(f"{output}: {said or 'complete already'}", soft_wrap=True)
+    return OK
+
+
+def _ends(
+    cable: Parameters,
+    start: Sequence[float] | None,
+    start_heading: float | None,
+    end_heading: float | None,
+) -> tuple[dict[str, float], list[str]]:
+    """What all poses share, and the columns that a list must have beside it."""
+    model, shared = cable.model, cable.metadata.fixtures
+    x, y = start if start is not None else shared.get("start") or (0.0, 0.0)
+    fixed = {"start_x": float(x), "start_y": float(y)}
+    needed = [] if model.end == "free" else ["end_x_m", "end_y_m"]
+    for side, given in (("start", start_heading), ("end", end_heading)):
+        held = getattr(model, side)
+        if held != "clamped":
+            if given is not None:
+                raise DloError(f"--{side}-heading: the {side} of this cable is {held}")
+            continue
+        heading = given if given is not None else shared.get(f"{side}_heading")
+        if heading is None:
+            needed.append(f"{side}_heading_rad")
+        else:
+            fixed[f"{side}_heading"] = float(heading)
+    return fixed, needed
+
+
+def _grid(
+    model: CableModel, numbers: Sequence[float], fixed: dict[str, float], needed: Sequence[str]
+) -> Grid:
+    """The grid, if all that it does not say is known."""
+    if model.end == "free":
+        raise DloError("--grid: the end of this cable is free, it has no place; use --list")
+    headings = [name for name in needed if name.endswith("_rad")]
+    if headings:
+        raise DloError(
+            "--grid: this cable is clamped, and the session's poses do not share "
+            f"{' and '.join(name.removesuffix('_rad') for name in headings)}.\n"
+            "  Try: --start-heading, --end-heading [rad]"
+        )
+    x0, x1, nx, y0, y1, ny = numbers
+    for number in (nx, ny):
+        if number != int(number):
+            raise DloError(f"--grid: {number:g} is no number of places")
+    return Grid((x0, x1, int(nx)), (y0, y1, int(ny)), fixed)

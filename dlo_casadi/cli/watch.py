@@ -1,0 +1,96 @@
+"""How far a run has come: live on a terminal, line by line elsewhere."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from dlo_casadi.cli.guard import signals
+
+# Without a terminal: no more than one line in so many seconds about a part that is under way.
+_PATIENCE = 10.0
+
+
+@dataclass
+class Watch:
+    """Shows how far a run has come, and how long its part will take at most.
+
+    The remaining time is that of the named part, from the pace of what is done; a part that is
+    one piece has none.
+
+    Parameters
+    ----------
+    console : Console
+        Not the one of the results, so that those can be redirected alone.
+    quiet : bool
+    """
+
+    console: Console
+    quiet: bool = False
+    _bars: Progress | None = None
+    _tasks: dict[str, TaskID] = field(default_factory=dict)
+    _begun: dict[str, float] = field(default_factory=dict)
+    _spoken: float = field(default_factory=time.perf_counter)
+
+    def __enter__(self) -> Watch:
+        if not self.quiet and self.console.is_terminal:
+            self._bars = Progress(
+                SpinnerColumn(finished_text="+"),
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=24),
+                TextColumn("{task.fields[detail]}"),
+                TimeElapsedColumn(),
+                TextColumn("left, at most:"),
+                TimeRemainingColumn(),
+                console=self.console,
+            )
+            self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def step(self, name: str, done: int, total: int) -> None:
+        """`done` of `total` parts of the named work are finished."""
+        signals.check()
+        name, detail = ("read the poses", name[5:]) if name.startswith("read ") else (name, "")
+        first = name not in self._begun
+        begun = self._begun.setdefault(name, time.perf_counter())
+        if self.quiet:
+            return
+        if self._bars is not None:
+            if first:
+                self._tasks[name] = self._bars.add_task(name, total=total, detail="")
+            self._bars.update(self._tasks[name], completed=done, total=total, detail=detail)
+        else:
+            self._speak(name, done, total, time.perf_counter() - begun)
+
+    def _speak(self, name: str, done: int, total: int, seconds: float) -> None:
+        now = time.perf_counter()
+        if done >= total:
+            self.console.print(f"{name}: {seconds:.1f} s", highlight=False)
+        elif done and now - self._spoken > _PATIENCE:
+            left = seconds * (total - done) / done
+            self.console.print(
+                f"{name}: {done} of {total}, at most {left:.0f} s left", highlight=False
+            )
+        else:
+            return
+        self._spoken = now
+
+    def message(self, text: str) -> None:
+        """Something worth a line."""
+        if not self.quiet:
+            self.console.print(text, highlight=False)

@@ -1,0 +1,95 @@
+"""A commented configuration to start from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+from dlo_casadi.config.problems import PLACEHOLDER
+
+_TOP = """\
+# yaml-language-server: $schema=schema.json
+# Replace every FILL_IN; `dlo check` tells what is left and what does not fit together.
+# SI units: m, kg, s, N, rad. Frame: x to the right, y up, origin where you like, such as the start.
+cable:
+  name: {name}
+  length: FILL_IN            # m, along the cable between its two fixtures
+  mass: FILL_IN              # kg, of that length
+  diameter: FILL_IN          # m
+  bending_stiffness: FILL_IN # N m^2, a first guess: three decades off is good enough
+  # youngs_modulus: 1.0e+8   # Pa, instead of bending_stiffness; as crude
+  # rest_shape: straight     # if the cable is straight without load; default: curved
+experiment:
+  gravity: [0.0, -9.81]      # m/s^2
+  boundary: {{start: pinned, end: pinned}}   # pinned (free to turn) | clamped | free (end only)
+  # tolerances: {{length: 5.0e-4, end: 2.0e-4, heading: 1.0e-2, scale: 3.0e-4}}   # m, m, rad, -
+"""
+
+_IMAGES = """\
+  measurement:
+    kind: images             # photographs; or kind: centerlines for CSV files
+    board:                   # ArUco markers on the board behind the cable
+      dictionary: DICT_4X4_50
+      marker_size: FILL_IN   # m, side of the black square
+      standoff: 0.0          # m, cable axis in front of the board; other than 0 needs a camera
+      marker_centers:        # m, centre [x, y] of each marker by its number
+        0: FILL_IN
+        1: FILL_IN
+        2: FILL_IN
+        3: FILL_IN
+    # camera:                # makes up for the lens and the standoff; from a calibration
+    #   matrix: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]     # pixels
+    #   distortion: [k1, k2, p1, p2, k3]
+    # reference:             # instead of a board: two points known in all photographs
+    #   pixels: [[u, v], [u, v]]                          # u to the right, v down
+    #   points: [[x, y], [x, y]]                          # m
+"""
+
+_CENTERLINES = """\
+  measurement: {kind: centerlines}   # CSV files with the header x_m,y_m; or kind: images
+"""
+
+_POSES = """\
+  # In the order in which the poses were taken (below: the order of the names). role: held_out
+  # keeps a pose out of the fit, to check the prediction. A clamped side takes a heading [rad],
+  # start_heading or end_heading, counter-clockwise from +x; a free end has no end.
+  poses:
+"""
+
+
+def template(
+    name: str, files: Sequence[str] = (), kind: Literal["images", "centerlines"] = "images"
+) -> str:
+    """Text of a configuration with placeholders for what only its user knows.
+
+    Parameters
+    ----------
+    name : str
+        What to call the cable.
+    files : sequence of str
+        One pose each, relative to the configuration; one placeholder if there are none.
+    kind : "images" or "centerlines"
+        What the files are.
+
+    Returns
+    -------
+    str
+        Valid YAML. `load_config` names each placeholder that is left.
+    """
+    measurement = _IMAGES if kind == "images" else _CENTERLINES
+    poses = [
+        f"    - {{file: {_quoted(file)}, start: [0.0, 0.0], end: {PLACEHOLDER}, role: fit}}\n"
+        for file in files or [PLACEHOLDER]
+    ]
+    return _TOP.format(name=_quoted(name)) + measurement + _POSES + "".join(poses)
+
+
+def _quoted(text: str) -> str:
+    """Text in YAML's single quotes, where it needs them."""
+    plain = text.replace("_", "").replace("/", "").replace(".", "").replace("-", "")
+    if plain.isascii() and plain.isalnum() and text[0].isalpha() and plain.lower() not in _WORDS:
+        return text
+    return "'" + text.replace("'", "''") + "'"
+
+
+_WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}

@@ -1,0 +1,320 @@
+"""Where tasks run: in this process, in a pool of processes, or on a Dask cluster.
+
+Each is a `concurrent.futures.Executor`; `parallel.py` uses no more than that and what
+`capacity` and `losses` tell.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import logging
+import multiprocessing
+import multiprocessing.connection
+import os
+import platform
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from dlo_casadi.errors import DloError
+
+# Read by BLAS, OpenMP and OpenCV when they are loaded.
+THREADS = dict.fromkeys(
+    (
+        *("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
+        *("VECLIB_MAXIMUM_THREADS", "OPENCV_FOR_THREADS_NUM"),
+    ),
+    "1",
+)
+# How long a scheduler may take to answer, and to have a worker [s].
+PATIENCE = 30.0
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set variables of the environment; what was set before is put back."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+class InProcess(Executor):
+    """Runs each task at once, in the process that submits it."""
+
+    workers = 1
+    capacity = 1
+    losses: tuple[type[BaseException], ...] = ()
+    logs: Path | None = None
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run and return a finished future; an interrupt is raised here, not kept."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class Pool(Executor):
+    """A pool of spawned processes that is started anew when one of them was killed.
+
+    Parameters
+    ----------
+    workers : int
+    logs : Path, optional
+        Folder in which each process keeps a log of its own; a crash leaves its stack there.
+    """
+
+    losses: tuple[type[BaseException], ...] = (BrokenExecutor,)
+
+    def __init__(self, workers: int, logs: Path | None = None) -> None:
+        self.workers = workers
+        self.capacity = 2 * workers
+        self.logs = logs
+        self._others = set(multiprocessing.active_children())
+        # A worker inherits it, and loads its libraries after that.
+        self._environment = ExitStack()
+        self._environment.enter_context(environment(THREADS))
+        self._inner = self._start()
+
+    def _start(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(
+            self.workers,
+            # A forked copy of a process with threads and solvers in it may hang.
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_begin_worker,
+            initargs=(None if self.logs is None else str(self.logs),),
+        )
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit to the pool, to a new one if a worker of the last was killed."""
+        try:
+            return self._inner.submit(fn, *args, **kwargs)
+        except BrokenExecutor:
+            self._inner.shutdown()
+            self._inner = self._start()
+            return self._inner.submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the workers; with `wait=False` those in the middle of a task, too."""
+        own = set(multiprocessing.active_children()) - self._others
+        self._inner.shutdown(wait, cancel_futures=cancel_futures)
+        if not wait:
+            for process in own:
+                process.terminate()
+        self._environment.close()
+
+
+class Cluster(Executor):
+    """The workers of a Dask scheduler, by its address.
+
+    Parameters
+    ----------
+    address : str
+        Such as tcp://192.168.1.5:8786.
+    logs : Path, optional
+        As of `Pool`; on a file system that the workers see.
+
+    Raises
+    ------
+    DloError
+        If `distributed` is missing, or no scheduler or worker answers.
+    """
+
+    def __init__(self, address: str, logs: Path | None = None) -> None:
+        try:
+            import distributed
+        except ImportError:
+            raise DloError(
+                "--scheduler needs Dask.\n  Try: pip install 'dlo-casadi[dask]'"
+            ) from None
+        self.losses: tuple[type[BaseException], ...] = (distributed.KilledWorker,)
+        self.logs = logs
+        try:
+            self._client = distributed.Client(
+                address, timeout=PATIENCE, set_as_default=False, name="dlo-casadi"
+            )
+        except (OSError, ValueError) as error:
+            raise DloError(
+                f"no Dask scheduler answers at {address} within {PATIENCE:g} s: {error}.\n"
+                "  Try: `dask scheduler` there, and the address that it prints."
+            ) from None
+        try:
+            self._client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            self._client.close()
+            raise DloError(
+                f"the Dask scheduler at {address} has had no worker for {PATIENCE:g} s.\n"
+                f"  Try: `dask worker {address} --nworkers 2 --nthreads 1`"
+            ) from None
+        try:
+            self._check_software()
+        except DloError:
+            self._client.close()
+            raise
+        # Equal calls are different tasks: each is one row, one sample.
+        self._inner = self._client.get_executor(pure=False)
+
+    def _check_software(self) -> None:
+        """Other versions give other digits: results must not depend on the worker."""
+        own = software()
+        try:
+            theirs: dict[str, dict[str, str]] = self._client.run(software)
+        except ImportError as error:
+            raise DloError(
+                f"a worker of the cluster cannot import dlo_casadi: {error}.\n"
+                "  Try: the same environment on all machines."
+            ) from None
+        for worker, found in theirs.items():
+            other = [f"{name} {found[name]}" for name in own if found[name] != own[name]]
+            if other:
+                mine = ", ".join(f"{name} {own[name]}" for name in own if found[name] != own[name])
+                raise DloError(
+                    f"worker {worker} has {', '.join(other)}, this machine {mine}.\n"
+                    "  Try: the same environment on all machines."
+                )
+
+    @property
+    def workers(self) -> int:
+        """Processes that take tasks now; they may come and go."""
+        return max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+
+    @property
+    def capacity(self) -> int:
+        """Tasks that may be under way."""
+        return 2 * self.workers
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit to the cluster."""
+        future: Future[Any] = self._inner.submit(fn, *args, **kwargs)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let go of the cluster; what was not awaited is cancelled."""
+        self._client.close()
+
+
+AnyExecutor = InProcess | Pool | Cluster
+
+
+@contextmanager
+def open_executor(
+    jobs: int = 1, scheduler: str | None = None, logs: Path | None = None
+) -> Iterator[AnyExecutor]:
+    """Open the executor that a command's `--jobs` and `--scheduler` ask for.
+
+        with open_executor(jobs=4) as executor:
+            for done in map_as_completed(executor, function, items):
+                ...
+
+    On an exception, an interrupt too, waiting tasks are cancelled and running ones ended.
+
+    Parameters
+    ----------
+    jobs : int
+        1 runs in this process, more in a pool of so many processes.
+    scheduler : str, optional
+        Address of a Dask scheduler, instead.
+    logs : Path, optional
+        Folder of the workers' logs, made if it is missing.
+
+    Raises
+    ------
+    DloError
+        If jobs is not positive, both are asked for, or the cluster does not answer.
+    """
+    if jobs < 1:
+        raise DloError(f"--jobs {jobs}: at least one process must do the work")
+    if scheduler is not None and jobs > 1:
+        raise DloError(
+            f"--jobs {jobs} and --scheduler {scheduler}: a cluster has its own number of workers; "
+            "give one of the two"
+        )
+    if logs is not None:
+        logs = logs.resolve()
+        logs.mkdir(parents=True, exist_ok=True)
+    executor: AnyExecutor
+    if scheduler is not None:
+        executor = Cluster(scheduler, logs)
+    else:
+        executor = InProcess() if jobs == 1 else Pool(jobs, logs)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        raise
+    executor.shutdown()
+
+
+# ---- in a worker -------------------------------------------------------------------------------
+
+
+def _begin_worker(logs: str | None) -> None:
+    """Leave interrupts to the parent, end with it, and keep the stack of a crash."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    if logs is not None:
+        stream = open(log_file(Path(logs)), "a")  # noqa: SIM115 (as long as the process)
+        faulthandler.enable(stream)
+        # What libraries print would tear the progress of the parent.
+        for number in (1, 2):
+            os.dup2(stream.fileno(), number)
+
+
+def _end_with(sentinel: int) -> None:
+    """A worker whose parent was killed would wait for work for ever."""
+    multiprocessing.connection.wait([sentinel])
+    os._exit(1)
+
+
+def software() -> dict[str, str]:
+    """Versions on which the digits of results depend."""
+    packages = ("dlo-casadi", "casadi", "numpy", "scipy", "opencv-contrib-python-headless")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def worker_name() -> str:
+    """Machine and process."""
+    return f"{platform.node()}-{os.getpid()}"
+
+
+def log_file(folder: Path) -> Path:
+    """Where this process keeps its log."""
+    return folder / f"worker-{worker_name()}.log"
+
+
+def worker_log(folder: str | None) -> logging.Logger:
+    """Logger of this process, to its own file in that folder if there is one."""
+    logger = logging.getLogger("dlo_casadi.worker")
+    if folder is None:
+        return logger
+    path = str(log_file(Path(folder)))
+    if any(getattr(old, "baseFilename", None) == path for old in logger.handlers):
+        return logger
+    for old in list(logger.handlers):
+        logger.removeHandler(old)
+        old.close()
+    try:
+        handler: logging.Handler = logging.FileHandler(path, encoding="utf-8")
+    except OSError:
+        # A machine of the cluster that does not see the folder: Dask keeps its own log there.
+        return logger
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    return logger

@@ -1,0 +1,126 @@
+"""Which sessions a folder or a pattern holds."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dlo_casadi import __version__
+from dlo_casadi.config import read_yaml
+from dlo_casadi.errors import DloError
+
+ENDINGS = (".yaml", ".yml")
+# A line that makes a YAML file a configuration, even one with mistakes.
+_SECTION = re.compile(rb"^(cable|experiment)\s*:", re.MULTILINE)
+
+
+@dataclass(frozen=True, order=True)
+class Session:
+    """One configuration of many.
+
+    Parameters
+    ----------
+    key : str
+        Its path below the folder that all have in common, with `/`: no two have the same.
+    path : Path
+        The YAML file, absolute.
+    """
+
+    key: str
+    path: Path
+
+
+def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
+    """Find all configurations in a folder and below, or of a pattern.
+
+    In a folder a YAML file counts if it has a `cable:` or an `experiment:` and is no result of
+    a fit; hidden folders are left out. What a pattern names counts without a question; `**`
+    stands for any folders.
+
+    Returns
+    -------
+    Path, tuple of Session
+        The folder that all have in common, and the sessions in the order of their keys.
+
+    Raises
+    ------
+    DloError
+        If there is none.
+    """
+    text = str(where)
+    folder = Path(text)
+    if folder.is_dir():
+        base = folder.resolve()
+        found = [path for path in _yaml_files(base) if _is_session(path)]
+    else:
+        paths = {Path(name).resolve() for name in glob.glob(text, recursive=True)}
+        found = [path for path in paths if path.is_file()]
+        base = Path(os.path.commonpath([path.parent for path in found])) if found else folder
+    if not found:
+        raise DloError(
+            f"no configuration in {text}: a YAML file with cable: and experiment: is looked for.\n"
+            "  Try: a folder, or a pattern in quotes, such as 'cables/*/session.yaml'."
+        )
+    sessions = sorted(Session(path.relative_to(base).as_posix(), path) for path in found)
+    return base, tuple(sessions)
+
+
+def _yaml_files(base: Path) -> list[Path]:
+    """All YAML files below a folder, none in hidden folders."""
+    found = []
+    for folder, inner, names in os.walk(base):
+        inner[:] = sorted(name for name in inner if not name.startswith("."))
+        found += [Path(folder, name) for name in names if name.lower().endswith(ENDINGS)]
+    return found
+
+
+def _is_session(path: Path) -> bool:
+    """Whether a YAML file is meant as a configuration."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return True  # its row will say why
+    return bool(_SECTION.search(content)) and not re.search(rb"^schema\s*:", content, re.MULTILINE)
+
+
+def digest_of(session: Session, options: tuple[Any, ...]) -> str:
+    """SHA-256 of what decides a session's results.
+
+    The package's version, the options of the run, the configuration's bytes, and the name and
+    bytes of each file that its poses name; a file that cannot be read counts as that.
+    """
+    digest = hashlib.sha256()
+
+    def add(content: bytes) -> None:
+        digest.update(len(content).to_bytes(8, "big"))
+        digest.update(content)
+
+    add(repr((__version__, options)).encode())
+    add(_content(session.path))
+    for name in _data_files(session.path):
+        add(name.encode())
+        add(_content(session.path.parent / name))
+    return digest.hexdigest()
+
+
+def _content(path: Path) -> bytes:
+    """SHA-256 of a file's bytes; nothing of one that cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").digest()
+    except OSError:
+        return b""
+
+
+def _data_files(path: Path) -> list[str]:
+    """Names of the poses' files as written, none where the configuration cannot be read."""
+    try:
+        poses = read_yaml(path)["experiment"]["poses"]
+        return [str(pose["file"]) for pose in poses if "file" in pose]
+    except (DloError, KeyError, TypeError):
+        return []

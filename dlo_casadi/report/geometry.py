@@ -1,0 +1,45 @@
+"""Lines that figures and the page draw: deviations enlarged, measured lines with their ends."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape
+
+FloatArray = NDArray[np.floating]
+
+
+def magnified(pose: PoseInput, shape: PoseShape, std: float, factor: int) -> FloatArray:
+    """The predicted curve, its distance from the measured points multiplied."""
+    if factor == 1 or not len(pose.points):
+        return shape.curve
+    return beside(pose, shape, std, factor)
+
+
+def beside(pose: PoseInput, shape: PoseShape, std: float, factor: float = 1.0) -> FloatArray:
+    """Points (K, 2) [m] of the prediction beside the measured ones, distances multiplied."""
+    places = np.linspace(0.0, 1.0, len(shape.curve))
+    slope = np.gradient(shape.curve, places, axis=0)
+    length = max(float(np.hypot(*np.diff(shape.curve, axis=0).T).sum()), 1e-12)
+    at = np.clip(shape.s / length, 0.0, 1.0)
+    tangent = np.stack([np.interp(at, places, slope[:, i]) for i in (0, 1)], axis=1)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.hypot(*tangent.T)[:, None]
+    moved = pose.points - factor * std * shape.residual[:, None] * normal
+    return np.asarray(moved)
+
+
+def measured_line(outcome: Outcome, name: str) -> tuple[FloatArray, FloatArray] | None:
+    """Measured points of a pose between its fixtures with their places along the cable [m]."""
+    measured = next((pose for pose in outcome.poses if pose.name == name), None)
+    declared = next((p for p in outcome.config.experiment.poses if p.name == name), None)
+    if measured is None or declared is None or not len(measured.points):
+        return None
+    parts = [np.array([declared.start]), measured.points]
+    if declared.end is not None:
+        parts.append(np.array([declared.end]))
+    points = np.concatenate(parts)
+    places = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    if declared.end is not None:
+        places *= outcome.config.cable.length / places[-1]
+    return places, points

@@ -1,0 +1,461 @@
+"""Charts of the page: errors, residuals, rest curvature, boards. The browser draws them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from bokeh.embed import json_item
+from bokeh.layouts import column
+from bokeh.models import (
+    BoxAnnotation,
+    ColumnDataSource,
+    DataRange1d,
+    FixedTicker,
+    HoverTool,
+    Model,
+    PrintfTickFormatter,
+    Range1d,
+    Span,
+    TapTool,
+)
+from bokeh.plotting import figure
+
+from dlo_casadi.report.canvas import before_after, label_of
+from dlo_casadi.report.geometry import measured_line
+from dlo_casadi.report.terminal import cross_validated
+from dlo_casadi.session.outcome import Outcome, Stage
+
+# Colours that the colour-blind can tell apart, each at least 4.5 to 1 against white.
+BEFORE, AFTER, HELD_OUT, NEXT = "#B35A00", "#0067A3", "#8C3B6C", "#9E2A00"
+INK, FAINT, GRID = "#1F2933", "#6B7280", "#E3E6EA"
+_BAND = "#E8EEF3"
+_SYMBOLS = {"fit": "circle", "cross-validated": "diamond", "held out": "square"}
+
+
+def charts(outcome: Outcome) -> dict[str, str]:
+    """Charts for which there is something to draw, as JSON by the name of their place."""
+    drawn: dict[str, Model] = {
+        "chart-errors": errors_chart(outcome),
+        "chart-poses": poses_chart(outcome),
+        "chart-residuals": residuals_chart(outcome),
+        "chart-rest": rest_chart(outcome),
+    }
+    if outcome.next_pose is not None:
+        drawn["chart-next"] = next_pose_chart(outcome)
+    if outcome.unexplained is not None:
+        drawn["chart-pull"] = pull_chart(outcome)
+    return {name: json.dumps(json_item(model)) for name, model in drawn.items()}
+
+
+def _figure(height: int, **options: Any) -> figure:
+    """An empty chart as wide as its place, which neither drags nor swallows the scrolling."""
+    chart = figure(
+        height=height, sizing_mode="stretch_width", toolbar_location=None, tools="", **options
+    )
+    chart.outline_line_color = None
+    chart.grid.grid_line_color = GRID
+    chart.axis.axis_label_text_font_style = "normal"
+    chart.axis.axis_label_text_font_size = "13px"
+    chart.axis.major_label_text_font_size = "12px"
+    for part in ("axis_label_text_color", "major_label_text_color"):
+        setattr(chart.axis, part, INK)
+    chart.axis.axis_line_color = FAINT
+    chart.axis.major_tick_line_color = FAINT
+    chart.axis.minor_tick_line_color = None
+    return chart
+
+
+def _hover(*rows: tuple[str, str], renderers: list[Any], **options: Any) -> HoverTool:
+    return HoverTool(tooltips=list(rows), renderers=renderers, **options)
+
+
+# ---- errors ------------------------------------------------------------------------------------
+
+
+def errors_chart(outcome: Outcome) -> Model:
+    """Errors of the stages as points on a logarithmic scale, beside the noise floor."""
+    validated = cross_validated(outcome)
+    rows: list[tuple[str, str, float]] = []
+    for stage in outcome.stages:
+        values = {
+            "fit": stage.rmse_fit,
+            "cross-validated": validated.get(stage.name),
+            "held out": stage.rmse_held_out,
+        }
+        label = label_of(stage, outcome)
+        rows += [(label, kind, 1e3 * value) for kind, value in values.items() if value]
+    labels = [label_of(stage, outcome) for stage in outcome.stages]
+    floor = 1e3 * outcome.measurement.std
+    chart = _figure(
+        70 + 42 * len(labels),
+        y_range=labels[::-1],
+        x_axis_type="log",
+        x_range=_log_range([value for *_, value in rows] + [floor]),
+        x_axis_label="RMS distance [mm]",
+    )
+    _plain_numbers(chart)
+    chart.ygrid.grid_line_color = None
+    chart.add_layout(Span(location=floor, dimension="height", line_color=INK, line_dash="dashed"))
+    shift = {"fit": 0.18, "cross-validated": 0.0, "held out": -0.18}
+    for kind, symbol in _SYMBOLS.items():
+        own = [(label, value) for label, k, value in rows if k == kind]
+        source = ColumnDataSource(
+            {
+                "stage": [label for label, _ in own],
+                "value": [value for _, value in own],
+                "y": [(label, shift[kind]) for label, _ in own],
+                "kind": [kind] * len(own),
+            }
+        )
+        drawn = chart.scatter("value", "y", source=source, marker=symbol, size=11, **_filled(kind))
+        chart.add_tools(
+            _hover(("stage", "@stage"), ("@kind", "@value{0.0000} mm"), renderers=[drawn])
+        )
+    return chart
+
+
+def _filled(kind: str) -> dict[str, Any]:
+    color = HELD_OUT if kind == "held out" else AFTER
+    fill = "white" if kind == "cross-validated" else color
+    return {"line_color": color, "fill_color": fill, "line_width": 2}
+
+
+def _log_range(values: list[float]) -> Range1d:
+    """Range of a logarithmic axis [mm] that leaves room on both sides."""
+    known = [value for value in values if value > 0]
+    return Range1d(min(known) / 1.6, max(known) * 1.6)
+
+
+def _plain_numbers(chart: figure) -> None:
+    """Numbers such as 0.1 and 0.5 along a logarithmic axis, not powers of ten."""
+    low, high = chart.x_range.start, chart.x_range.end
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    steps = (1,) if high / low > 300 else (1, 3) if high / low > 30 else (1, 2, 5)
+    chart.xaxis.ticker = FixedTicker(
+        ticks=[float(f"{step * tens:.0e}") for tens in decades for step in steps]
+    )
+    chart.xaxis.formatter = PrintfTickFormatter(format="%g")
+
+
+def poses_chart(outcome: Outcome) -> Model:
+    """Error of every pose, before and after; a pose is chosen by a click."""
+    before, after = before_after(outcome)
+    names = [pose.name for pose in outcome.poses]
+    floor = 1e3 * outcome.measurement.std
+    found: list[tuple[Stage, str, str, list[float]]] = []
+    for stage, color, marker in ((before, BEFORE, "triangle"), (after, AFTER, "circle")):
+        if stage is not None:
+            known = {name: shape.rmse for name, shape in stage.shapes.items() if shape.rmse}
+            errors = [1e3 * known.get(name, np.nan) for name in names]
+            found.append((stage, color, marker, errors))
+    chart = _figure(
+        70 + 24 * max(3, len(names)),
+        y_range=names[::-1],
+        x_axis_type="log",
+        x_range=_log_range([*(e for *_, errors in found for e in errors), floor]),
+        x_axis_label="RMS distance [mm]",
+    )
+    _plain_numbers(chart)
+    chart.add_layout(Span(location=floor, dimension="height", line_color=INK, line_dash="dashed"))
+    roles = ["held out" if pose.role == "held_out" else "fit" for pose in outcome.poses]
+    if len(found) == 2:
+        chart.segment(found[0][3], names, found[1][3], names, line_color=FAINT, line_width=1.5)
+    drawn: list[Any] = []
+    for stage, color, marker, errors in found:
+        source = ColumnDataSource(
+            {
+                "pose": names,
+                "role": roles,
+                "value": errors,
+                "stage": [label_of(stage, outcome)] * len(names),
+                "fill": ["white" if role == "held out" else color for role in roles],
+            },
+            name=f"errors-{len(drawn)}",
+        )
+        drawn.append(
+            chart.scatter(
+                "value",
+                "pose",
+                source=source,
+                marker=marker,
+                size=10,
+                line_color=color,
+                line_width=2,
+                fill_color="fill",
+                nonselection_alpha=1.0,
+                nonselection_fill_alpha=1.0,
+            )
+        )
+    chart.add_tools(
+        _hover(("pose", "@pose (@role)"), ("@stage", "@value{0.0000} mm"), renderers=drawn),
+        TapTool(renderers=drawn),
+    )
+    return chart
+
+
+# ---- residuals ---------------------------------------------------------------------------------
+
+
+def residuals_chart(outcome: Outcome) -> Model:
+    """Residual along the arc in noise units, before and after, of all poses and of a chosen one."""
+    across = Range1d(0.0, outcome.config.cable.length)
+    parts = []
+    before, after = before_after(outcome)
+    for kind, stage, color in (("before", before, BEFORE), ("after", after, AFTER)):
+        if stage is None:
+            continue
+        chart = _figure(
+            230 if kind == "before" else 260,
+            x_range=across,
+            y_range=DataRange1d(range_padding=0.08),
+            title=label_of(stage, outcome),
+            y_axis_label="residual [noise std]",
+        )
+        chart.title.text_color = INK
+        chart.title.text_font_size = "13px"
+        chart.add_layout(
+            BoxAnnotation(
+                bottom=-2,
+                top=2,
+                fill_color=_BAND,
+                fill_alpha=1.0,
+                level="underlay",
+                line_color=None,
+            )
+        )
+        chart.add_layout(Span(location=0, dimension="width", line_color=FAINT))
+        _residual_lines(chart, kind, stage, outcome, color)
+        parts.append(chart)
+    if parts:
+        parts[-1].xaxis.axis_label = "arc length from the start s [m]"
+    return column(parts, sizing_mode="stretch_width")
+
+
+def _residual_lines(chart: figure, kind: str, stage: Stage, outcome: Outcome, color: str) -> None:
+    """All poses thin, and a source that the page fills with the chosen one."""
+    shapes = [stage.shapes.get(pose.name) for pose in outcome.poses]
+    empty = np.zeros(0, dtype=np.float32)
+    all_poses = ColumnDataSource(
+        {
+            "s": [empty if x is None else x.s.astype(np.float32) for x in shapes],
+            "r": [empty if x is None else x.residual.astype(np.float32) for x in shapes],
+            "pose": [pose.name for pose in outcome.poses],
+            "role": ["held out" if p.role == "held_out" else "fit" for p in outcome.poses],
+            "dash": [[5, 3] if p.role == "held_out" else [] for p in outcome.poses],
+        },
+        name=f"all-{kind}",
+    )
+    thin = chart.multi_line(
+        "s", "r", source=all_poses, line_color=FAINT, line_alpha=0.55, line_dash="dash"
+    )
+    chosen = ColumnDataSource({"s": [], "r": []}, name=f"chosen-{kind}")
+    chart.line("s", "r", source=chosen, line_color="white", line_width=5)
+    chart.line("s", "r", source=chosen, line_color=color, line_width=2.5)
+    points = chart.scatter("s", "r", source=chosen, size=4, fill_color=color, line_color=None)
+    chart.add_tools(
+        _hover(
+            ("pose", "@pose (@role)"),
+            ("s", "$data_x{0.000} m"),
+            ("residual", "$data_y{0.0} std"),
+            renderers=[thin],
+            line_policy="nearest",
+        ),
+        _hover(("s", "@s{0.000} m"), ("residual", "@r{0.00} std"), renderers=[points]),
+    )
+
+
+# ---- rest curvature ----------------------------------------------------------------------------
+
+
+def rest_chart(outcome: Outcome) -> Model:
+    """Rest curvature of the last stage with its band, and of the fit that it improves on."""
+    before, after = before_after(outcome)
+    chart = _figure(
+        280,
+        x_range=Range1d(0.0, outcome.config.cable.length),
+        x_axis_label="arc length from the start s [m]",
+        y_axis_label="rest curvature [1/m]",
+    )
+    chart.add_layout(Span(location=0, dimension="width", line_color=FAINT))
+    if before is not None and before.name == "batch":
+        rest = before.rest_curvature
+        chart.line(rest.s, rest.value, line_color=BEFORE, line_dash="dashed", line_width=2)
+    if after is not None:
+        rest = after.rest_curvature
+        source = ColumnDataSource(
+            {
+                "s": rest.s,
+                "value": rest.value,
+                "low": rest.value - 1.96 * rest.std,
+                "high": rest.value + 1.96 * rest.std,
+            }
+        )
+        chart.varea("s", "low", "high", source=source, fill_color=AFTER, fill_alpha=0.22)
+        drawn = chart.line("s", "value", source=source, line_color=AFTER, line_width=2.5)
+        chart.add_tools(
+            _hover(
+                ("s", "@s{0.000} m"),
+                ("rest curvature", "@value{0.000} 1/m"),
+                ("95 % band", "@low{0.000} to @high{0.000}"),
+                renderers=[drawn],
+                mode="vline",
+            )
+        )
+    return chart
+
+
+# ---- boards ------------------------------------------------------------------------------------
+
+
+def _board(outcome: Outcome) -> figure:
+    """The board with one scale on both axes, and the measured cables on it."""
+    ends = [
+        [point for point in (pose.start, pose.end) if point is not None]
+        for pose in outcome.config.experiment.poses
+    ]
+    drawn = np.concatenate([*ends, *(pose.points for pose in outcome.poses if len(pose.points))])
+    across, down = np.ptp(drawn, axis=0)
+    chart = _figure(
+        440,
+        match_aspect=True,
+        x_range=DataRange1d(range_padding=0.08),
+        y_range=DataRange1d(range_padding=0.08),
+        x_axis_label="x [m]",
+        y_axis_label="y [m]",
+    )
+    chart.sizing_mode = "scale_width"
+    chart.aspect_ratio = float(np.clip(across / max(down, 1e-9), 0.8, 1.8))
+    measured = [pose for pose in outcome.poses if len(pose.points)]
+    source = ColumnDataSource(
+        {
+            "x": [pose.points[:: max(1, len(pose.points) // 60), 0] for pose in measured],
+            "y": [pose.points[:: max(1, len(pose.points) // 60), 1] for pose in measured],
+            "pose": [pose.name for pose in measured],
+        }
+    )
+    lines = chart.multi_line("x", "y", source=source, line_color="#9AA5B1", line_width=1.2)
+    chart.add_tools(_hover(("measured", "@pose"), renderers=[lines]))
+    board = getattr(outcome.config.experiment.measurement, "board", None)
+    if board is not None:
+        centers = np.array(list(board.marker_centers.values()))
+        chart.rect(
+            centers[:, 0],
+            centers[:, 1],
+            board.marker_size,
+            board.marker_size,
+            fill_color="#C9D0D8",
+            line_color=FAINT,
+        )
+    return chart
+
+
+def next_pose_chart(outcome: Outcome) -> Model:
+    """Where to hold the end in the next photograph, among those that were taken."""
+    assert outcome.next_pose is not None
+    chart = _board(outcome)
+    poses = [pose for pose in outcome.config.experiment.poses if pose.end is not None]
+    starts = np.unique(np.array([pose.start for pose in poses]), axis=0)
+    ends = ColumnDataSource(
+        {
+            "x": [pose.end[0] for pose in poses if pose.end],
+            "y": [pose.end[1] for pose in poses if pose.end],
+            "pose": [pose.name for pose in poses],
+        }
+    )
+    held = chart.scatter(
+        "x",
+        "y",
+        source=ends,
+        marker="circle",
+        size=9,
+        fill_color="white",
+        line_color=INK,
+        line_width=1.5,
+    )
+    chart.scatter(starts[:, 0], starts[:, 1], marker="square", size=11, color=INK)
+    x, y = outcome.next_pose["end"]
+    proposal = ColumnDataSource({"x": [x], "y": [y]})
+    star = chart.scatter(
+        "x", "y", source=proposal, marker="star", size=26, fill_color=NEXT, line_color="white"
+    )
+    chart.text(
+        [x],
+        [y],
+        text=["next end"],
+        x_offset=16,
+        y_offset=-10,
+        text_color=NEXT,
+        text_font_size="14px",
+        text_font_style="bold",
+        background_fill_color="white",
+        background_fill_alpha=0.85,
+        padding=3,
+    )
+    chart.add_tools(
+        _hover(("end of", "@pose"), ("at", "(@x{0.000}, @y{0.000}) m"), renderers=[held]),
+        _hover(("next end", "(@x{0.000}, @y{0.000}) m"), renderers=[star]),
+    )
+    return chart
+
+
+def pull_chart(outcome: Outcome) -> Model:
+    """Where the cable is pulled, and how, in each fit pose."""
+    load = outcome.unexplained
+    assert load is not None
+    names = load.get("poses") or [
+        pose.name for pose in outcome.poses if pose.role == "fit" and len(pose.points)
+    ]
+    forces = np.array(load["force_per_pose"], dtype=float).reshape(-1, 2)
+    largest = max(float(np.hypot(*forces.T).max(initial=0.0)), 1e-12)
+    reach = 0.25 * outcome.config.cable.length / largest
+    chart = _board(outcome)
+    rows: list[dict[str, Any]] = []
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
+    for name, force in zip(names, forces, strict=False):
+        line = measured_line(outcome, name)
+        if line is None:
+            continue
+        places, points = line
+        pulled = np.linspace(load["interval_95"][0], load["interval_95"][1], 9)
+        parts.append(
+            (np.interp(pulled, places, points[:, 0]), np.interp(pulled, places, points[:, 1]))
+        )
+        root = np.array([np.interp(load["position"], places, points[:, i]) for i in (0, 1)])
+        tip = root + reach * force
+        size = float(np.hypot(*force))
+        rows.append(
+            {
+                "pose": name,
+                "x0": root[0],
+                "y0": root[1],
+                "x1": tip[0],
+                "y1": tip[1],
+                "fx": force[0],
+                "fy": force[1],
+                "size": size,
+                "angle": float(np.arctan2(force[1], force[0])) - np.pi / 2,
+            }
+        )
+    chart.multi_line(
+        [x for x, _ in parts],
+        [y for _, y in parts],
+        line_color=AFTER,
+        line_width=6,
+        line_cap="butt",
+    )
+    source = ColumnDataSource({key: [row[key] for row in rows] for key in rows[0]} if rows else {})
+    if rows:
+        shafts = chart.segment("x0", "y0", "x1", "y1", source=source, line_color=NEXT, line_width=2)
+        heads = chart.scatter(
+            "x1", "y1", source=source, marker="triangle", size=11, angle="angle", color=NEXT
+        )
+        chart.add_tools(
+            _hover(
+                ("pose", "@pose"),
+                ("force", "(@fx{0.000}, @fy{0.000}) N, @size{0.000} N"),
+                renderers=[shafts, heads],
+            )
+        )
+    return chart

@@ -1,0 +1,211 @@
+"""What the page says in words and tables: pure functions of an outcome."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from dlo_casadi.config import Config
+from dlo_casadi.effects import EFFECTS
+from dlo_casadi.report.canvas import before_after, label_of, millimetres
+from dlo_casadi.report.json_report import all_warnings
+from dlo_casadi.report.terminal import (
+    cross_validated,
+    describe,
+    fixed_rows,
+    footnotes,
+    nuisance_rows,
+    rest_rows,
+    timing_rows,
+    verdict_lines,
+)
+from dlo_casadi.session.outcome import Outcome, ParameterEstimate
+
+# Half the width of a 95 % interval in standard deviations.
+_TWO_SIDED = 1.96
+# Where a number does not exist.
+NOTHING = "–"
+VERDICT_WORDS = {
+    "complete": "Complete",
+    "effect_found": "Effect found",
+    "unexplained": "Unexplained",
+}
+
+
+def page_data(outcome: Outcome) -> dict[str, Any]:
+    """Everything that the template writes, but for pictures and charts."""
+    said = [line.strip() for line in verdict_lines(outcome)]
+    before, after = before_after(outcome)
+    m = outcome.measurement
+    return {
+        "title": outcome.config.cable.name,
+        "config_name": outcome.config.name,
+        "verdict": outcome.verdict if outcome.config.diagnosis.enabled else "off",
+        "verdict_word": verdict_word(outcome),
+        "sentence": sentence(said[0]),
+        "details": said[1:],
+        "tiles": tiles(outcome),
+        "warnings": all_warnings(outcome),
+        "before": None if before is None else label_of(before, outcome),
+        "after": None if after is None else label_of(after, outcome),
+        "rest_before": before is not None and before.name == "batch",
+        "stages": stage_rows(outcome),
+        "noise": millimetres(m.std),
+        "noise_source": m.std_source,
+        "correlation": millimetres(m.correlation_length) if m.correlation_length > 0 else None,
+        "held_out": m.poses_held_out,
+        "candidates": candidate_rows(outcome),
+        "parameters": parameter_rows(outcome),
+        "nuisances": nuisance_rows(outcome),
+        "fixed": fixed_rows(outcome),
+        "footnotes": footnotes(outcome),
+        "photographed": m.kind == "images",
+        "next_pose": outcome.next_pose,
+        "unexplained": outcome.unexplained,
+        "timing": timing_rows(outcome),
+        "mesh": f"{outcome.discretization.n} {outcome.discretization.element}s, "
+        f"mesh error {millimetres(outcome.discretization.error)}",
+        "versions": outcome.versions,
+        "configuration": configuration_text(outcome.config),
+    }
+
+
+def sentence(line: str) -> str:
+    """A line of the terminal as a sentence of its own."""
+    text = line.removeprefix("Verdict: ")
+    return text[:1].upper() + text[1:]
+
+
+def verdict_word(outcome: Outcome) -> str:
+    """The verdict in one or two words."""
+    if not outcome.config.diagnosis.enabled:
+        return "Not diagnosed"
+    return VERDICT_WORDS[outcome.verdict]
+
+
+def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
+    """The numbers that most readers come for: name, value, remark."""
+    before, after = before_after(outcome)
+    m = outcome.measurement
+    rows = []
+    if after is not None:
+        stiffness = after.parameters.get("bending_stiffness")
+        if stiffness is not None:
+            value, interval, remark = describe(stiffness)
+            known = f"95 %: {interval}" if interval else remark
+            rows.append(("bending stiffness", value, known))
+        role = "held-out poses" if after.rmse_held_out is not None else "fit poses"
+        now = after.rmse_held_out if after.rmse_held_out is not None else after.rmse_fit
+        was = None
+        if before is not None:
+            was = before.rmse_held_out if after.rmse_held_out is not None else before.rmse_fit
+        said = "" if was is None or before is None else f"{label_of(before, outcome)}: "
+        rows.append((f"error, {role}", _mm(now), f"{said}{_mm(was)}" if said else ""))
+    rows.append(("noise floor", millimetres(m.std), f"of the centre-lines, {m.std_source}"))
+    rows.append(("poses", f"{m.poses_fit} + {m.poses_held_out}", "to fit + held out to check"))
+    return rows
+
+
+def stage_rows(outcome: Outcome) -> list[dict[str, Any]]:
+    """Errors of the stages: fit, cross-validated, held out, chi-square."""
+    validated = cross_validated(outcome)
+    before, after = before_after(outcome)
+    return [
+        {
+            "label": label_of(stage, outcome),
+            "mark": "before" if stage is before else "after" if stage is after else "",
+            "fit": _mm(stage.rmse_fit),
+            "validated": _mm(validated.get(stage.name)),
+            "held_out": _mm(stage.rmse_held_out),
+            "chi2": NOTHING if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
+            "note": stage.note,
+        }
+        for stage in outcome.stages
+    ]
+
+
+def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
+    """Candidates for a missing effect, as ranked, with what could not be told apart."""
+    added = {effect["name"] for effect in outcome.effects}
+    tied = {
+        rival: effect["name"]
+        for effect in outcome.effects
+        for rival in effect["indistinguishable_from"]
+    }
+    largest = max([row["score"] or 0.0 for row in outcome.candidates], default=0.0)
+    rows = []
+    for row in outcome.candidates:
+        name, score, p = row["name"], row["score"], row["p_value"]
+        status = ("added", "added to the model") if name in added else ("", "not needed")
+        if name in tied:
+            status = ("tied", f"cannot be told apart from {tied[name]}")
+        elif name not in added and outcome.verdict == "unexplained":
+            status = ("", "does not explain it")
+        rows.append(
+            {
+                "name": name,
+                "meaning": meaning(name),
+                "score": NOTHING
+                if score is None
+                else f"{score:,.0f}"
+                if score >= 100
+                else f"{score:.2g}",
+                "share": 0.0 if not score or largest <= 0 else max(score, 0.0) / largest,
+                "p_value": NOTHING if p is None else f"{p:.2g}",
+                "validated": _mm(row["rmse_cross_validated"]),
+                "status": status[0],
+                "said": status[1],
+            }
+        )
+    return rows
+
+
+def meaning(name: str) -> str:
+    """What an effect is, in a line."""
+    known = EFFECTS.get(name)
+    text = inspect.getdoc(known) or "" if known is not None else ""
+    return text.partition("\n")[0].replace("`", "")
+
+
+def parameter_rows(outcome: Outcome) -> list[dict[str, Any]]:
+    """Fitted parameters of the last stage with 95 % intervals, and what the data cannot tell."""
+    rows = []
+    for name, estimate in outcome.stages[-1].parameters.items():
+        value, interval, remark = describe(estimate)
+        doubt = (
+            "unknown" if estimate.identifiable is False else "bound" if estimate.at_bound else ""
+        )
+        rows.append(
+            {
+                "name": name,
+                "value": value,
+                "interval": interval or symmetric_interval(estimate),
+                "remark": remark,
+                "doubt": doubt,
+            }
+        )
+    for name, value, _, remark in rest_rows(outcome):
+        rows.append({"name": name, "value": value, "interval": "", "remark": remark, "doubt": ""})
+    return rows
+
+
+def symmetric_interval(estimate: ParameterEstimate) -> str:
+    """A 95 % interval from the standard deviation, where no profile was computed."""
+    if estimate.identifiable is False or not estimate.std > 0:
+        return ""
+    unit = f" {estimate.unit}" if estimate.unit else ""
+    low = estimate.value - _TWO_SIDED * estimate.std
+    high = estimate.value + _TWO_SIDED * estimate.std
+    return f"{low:.4g} to {high:.4g}{unit}"
+
+
+def configuration_text(config: Config) -> str:
+    """The configuration as it stands in its file."""
+    try:
+        return config.path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        return f"# {config.path.name} cannot be read any more: {error.strerror}"
+
+
+def _mm(value: float | None) -> str:
+    return NOTHING if value is None else millimetres(value)

@@ -1,0 +1,158 @@
+"""What was read, held against what is declared of it, before anything is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.config import Config
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model import CableModel
+from dlo_casadi.session.declared import declared_model, straight
+from dlo_casadi.session.measure import conditions, line_without_end
+from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.plausibility import (
+    CONTRADICTS,
+    MUCH_BETTER,
+    OUT_OF_STEP,
+    Lines,
+    Suspicion,
+    repeated,
+    suspicions,
+)
+
+FloatArray = NDArray[np.floating]
+
+NEVERTHELESS = (
+    "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless."
+)
+
+# Elements, poses and stiffnesses (over the declared one) that show which way a cable hangs.
+_MESH, _POSES = 12, 6
+_STIFFNESSES = sorted(10.0 ** np.arange(-2.0, 2.1, 0.5), key=lambda factor: abs(np.log(factor)))
+
+
+def raise_if_implausible(config: Config, inputs: Sequence[PoseInput]) -> list[str]:
+    """Return what looks odd, as warnings.
+
+    Raises
+    ------
+    MeasurementError
+        If the measured lines contradict the configuration beyond doubt, unless the option
+        `estimation.plausibility` is off.
+    """
+    found = find_suspicions(config, inputs)
+    certain = [item.message for item in found if item.certain]
+    if certain and config.estimation.plausibility:
+        raise MeasurementError("\n".join([*certain, NEVERTHELESS]))
+    return [item.message for item in found]
+
+
+def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Everything in a session that looks like a mistake, by `plausibility`."""
+    read = [item for item in inputs if len(item.points)]
+    found = suspicions(lines_of(config, inputs)) + repeated(
+        [item.name for item in read], [item.points for item in read]
+    )
+    if not any(item.certain for item in found):
+        found += hangs_elsewhere(config, read)
+    return found
+
+
+def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
+    """Measured lines beside their declared ends.
+
+    A photograph is searched for a line between the declared ends, so that wrong ends may hide the
+    line. Where several do not fit, the lines are searched for once more without their ends.
+    """
+    poses = config.experiment.poses
+    points = {item.name: item.points for item in inputs if len(item.points)}
+    lines = _lines(config, points)
+    if config.experiment.measurement.kind == "images" and config.experiment.boundary.end != "free":
+        fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
+        sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
+        doubtful = [pose for pose in poses if pose.name not in sound and pose.file.is_file()]
+        if len(doubtful) > 1:
+            again = {pose.name: line_without_end(config, pose) for pose in doubtful}
+            points |= {name: line for name, line in again.items() if line is not None}
+            lines = _lines(config, points)
+    return lines
+
+
+def _lines(config: Config, points: dict[str, FloatArray]) -> Lines:
+    poses = [pose for pose in config.experiment.poses if pose.name in points]
+    unknown = (np.nan, np.nan)
+    return Lines(
+        tuple(pose.name for pose in poses),
+        np.array([(pose.start, pose.end or unknown) for pose in poses]).reshape(-1, 2, 2),
+        np.array([points[pose.name][[0, -1]] for pose in poses]).reshape(-1, 2, 2),
+        np.array(
+            [np.linalg.norm(np.diff(points[p.name], axis=0), axis=1).sum() for p in poses]
+        ).reshape(-1),
+        config.cable.length,
+    )
+
+
+def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Whether the shapes fit only with gravity turned, or the points mirrored.
+
+    Shapes of a straight cable of the declared stiffness, and of others up to a hundred times as
+    soft or stiff, are predicted with gravity as declared and turned by quarters, and laid beside
+    the points; and beside the points mirrored at the height of the start.
+    """
+    declared = {pose.name: pose for pose in config.experiment.poses}
+    shown = read[:: max(1, -(-len(read) // _POSES))]
+    if not shown:
+        return ()
+    measured = [MeasuredPose(conditions(declared[item.name]), item.points) for item in shown]
+    model = straight(declared_model(config).model).with_mesh(_MESH)
+    length = config.cable.length
+    own = _distance(model, measured, CONTRADICTS * length)
+    if own < CONTRADICTS * length:
+        return ()
+    mirrored = [
+        replace(item, points=item.points * [1.0, -1.0] + [0.0, 2 * item.pose.start[1]])
+        for item in measured
+    ]
+    x, y = model.gravity
+    found = {"y pointing up in the points, which now points down": _distance(model, mirrored)}
+    for turned in ((-x, -y), (y, -x), (-y, x)):
+        said = f"gravity ({turned[0] + 0.0:g}, {turned[1] + 0.0:g}) m/s^2"
+        found[said] = _distance(replace(model, gravity=turned), measured)
+    what, rms = min(found.items(), key=lambda item: item[1])
+    if rms > MUCH_BETTER * own:
+        return ()
+    return (
+        Suspicion(
+            f"the cable does not hang along gravity ({x:g}, {y:g}) m/s^2: its shapes are "
+            f"{own:.3g} m RMS from those of any stiffness, but {rms:.3g} m with {what}. Try: "
+            "points, start, end and gravity in one frame, x to the right and y up, gravity: "
+            "[0.0, -9.81].",
+            True,
+        ),
+    )
+
+
+def _distance(model: CableModel, measured: Sequence[MeasuredPose], enough: float = 0.0) -> float:
+    """RMS distance [m] of the points from shapes of the best stiffness, or the first `enough`."""
+    best = np.inf
+    rest = np.zeros(model.chain.n_cells)
+    for factor in _STIFFNESSES:
+        p = model.nominal.copy()
+        p[0] *= factor
+        predictions = predict_poses(model, p, rest, [item.pose for item in measured])
+        gaps = [
+            prediction.curve.distances(item.points)
+            for prediction, item in zip(predictions, measured, strict=True)
+            if prediction is not None
+        ]
+        if gaps:
+            best = min(best, float(np.sqrt(np.mean(np.concatenate(gaps) ** 2))))
+        if best < enough:
+            break
+    return best

@@ -1,0 +1,270 @@
+"""Mistakes that the measured lines themselves give away: units, frames, files out of step.
+
+Pure functions on arrays. The lines of a session are compared with what is declared of them: their
+lengths with the cable's, the places where they end with the fixtures. A wrong unit shows as a
+factor of a thousand, an axis that points the other way as ends that fit once they are mirrored,
+a list out of step as ends that fit another pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+FloatArray = NDArray[np.floating]
+
+# Shares of the cable's length. Lines end up to 0.08 from their fixtures where a holder or a gap
+# hides the cable; ends that fit are well below, ends that do not are well above.
+FITS, CONTRADICTS = 0.04, 0.1
+# Ends that fit another pose need not be as far from their own.
+OUT_OF_STEP = 0.05
+# An explanation leaves at most this share of the misfit.
+MUCH_BETTER = 0.35
+# How far a factor may be from that of a unit.
+_NEAR = 1.25
+
+UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
+
+# What can have happened to the axes: measured -> declared, likeliest first.
+FRAMES: dict[str, FloatArray] = {
+    "y pointing down instead of up": np.array([[1.0, 0.0], [0.0, -1.0]]),
+    "x pointing left instead of right": np.array([[-1.0, 0.0], [0.0, 1.0]]),
+    "x and y exchanged": np.array([[0.0, 1.0], [1.0, 0.0]]),
+    "the picture turned by 180 degrees": np.array([[-1.0, 0.0], [0.0, -1.0]]),
+    "the picture turned by 90 degrees counter-clockwise": np.array([[0.0, 1.0], [-1.0, 0.0]]),
+    "the picture turned by 90 degrees clockwise": np.array([[0.0, -1.0], [1.0, 0.0]]),
+}
+
+
+class Suspicion(NamedTuple):
+    """What looks like a mistake, what to do about it, and whether nothing else explains it."""
+
+    message: str
+    certain: bool
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Measured lines beside what is declared of them.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Of the m poses.
+    declared : (m, 2, 2) [m]
+        Start and end fixture of each pose; NaN for a free end.
+    measured : (m, 2, 2) [m]
+        The two ends of each measured line, in any order.
+    lengths : (m,) [m]
+        Along each measured line.
+    length : float [m]
+        Of the cable.
+    """
+
+    names: tuple[str, ...]
+    declared: FloatArray
+    measured: FloatArray
+    lengths: FloatArray
+    length: float
+
+    def misfit(self, measured: FloatArray, declared: FloatArray) -> FloatArray:
+        """Distance of ends from fixtures over the length: the better order, RMS over both.
+
+        Shapes (..., 2, 2) and (..., 2, 2) -> (...).
+        """
+        ways = [
+            np.sqrt(np.nanmean(((ends - declared) ** 2).sum(axis=-1), axis=-1))
+            for ends in (measured, measured[..., ::-1, :])
+        ]
+        return np.minimum(*ways) / self.length
+
+
+def suspicions(lines: Lines) -> tuple[Suspicion, ...]:
+    """All that looks like a mistake; the first kind that explains the ends is the only one.
+
+    Parameters
+    ----------
+    lines : Lines
+        Poses that could be read; at least one.
+    """
+    if not len(lines.names):
+        return ()
+    for look in (wrong_units, wrong_frame, out_of_step):
+        found = look(lines)
+        if found is not None:
+            return (found,)
+    return (*exchanged(lines), *far_ends(lines))
+
+
+def wrong_units(lines: Lines) -> Suspicion | None:
+    """Lengths, or distances of the ends, that are off by the factor of a unit."""
+    ratio = lines.lengths / lines.length
+    typical = float(np.median(lines.lengths))
+    for unit, size in UNITS.items():
+        if _all_near(ratio, 1.0 / size):
+            return Suspicion(
+                f"the measured lines are {typical:.4g} m long (median), the cable "
+                f"{lines.length:.4g} m: the points look like {unit}. Try: write them in metres, "
+                "as the header x_m,y_m says.",
+                True,
+            )
+        if _all_near(ratio, size):
+            return Suspicion(
+                f"the measured lines are {typical:.4g} m long (median), cable.length is "
+                f"{lines.length:.4g} m: it looks like {unit}. Try: cable.length: "
+                f"{lines.length * size:.6g}, and all lengths in metres.",
+                True,
+            )
+    declared = np.linalg.norm(np.diff(lines.declared, axis=1)[:, 0], axis=1)
+    measured = np.linalg.norm(np.diff(lines.measured, axis=1)[:, 0], axis=1)
+    apart = np.isfinite(declared) & (np.maximum(declared, measured) > CONTRADICTS * lines.length)
+    if apart.sum() < 2:
+        return None
+    spans = declared[apart] / np.maximum(measured[apart], 1e-12)
+    for unit, size in UNITS.items():
+        if _all_near(spans, size) or _all_near(spans, 1.0 / size):
+            return Suspicion(
+                f"the ends of the lines are {np.median(measured[apart]):.4g} m apart (median), "
+                f"start and end of their poses {np.median(declared[apart]):.4g} m: the factor of "
+                f"{unit}. Try: start and end of all poses in metres.",
+                True,
+            )
+    return None
+
+
+def wrong_frame(lines: Lines) -> Suspicion | None:
+    """Ends that fit all fixtures once the axes are turned or mirrored, or the origin is moved."""
+    own = _overall(lines.misfit(lines.measured, lines.declared))
+    if own < CONTRADICTS:
+        return None
+    shifted, shift = _moved(lines, lines.measured)
+    if shifted < min(FITS, MUCH_BETTER * own):
+        return Suspicion(
+            f"all lines lie ({shift[0]:.4g}, {shift[1]:.4g}) m away from their start and end. Try: "
+            "measure fixtures and lines from the same origin; subtract this from the points, or "
+            "add it to start and end.",
+            True,
+        )
+    for what, axes in FRAMES.items():
+        turned = lines.measured @ axes.T
+        in_place = _overall(lines.misfit(turned, lines.declared))
+        moved, shift = _moved(lines, turned)
+        if len(lines.names) < 3:  # of so few ends, some turn and some origin fit any
+            moved = np.inf
+        if min(in_place, moved) > min(FITS, MUCH_BETTER * own):
+            continue
+        away = "" if in_place < FITS else f" and moved by ({shift[0]:.4g}, {shift[1]:.4g}) m"
+        return Suspicion(
+            f"the lines do not end at start and end of their poses ({own * lines.length:.4g} m "
+            f"RMS), but do ({min(in_place, moved) * lines.length:.4g} m) with {what}{away}. "
+            "Try: points, start and end in one frame, x to the right and y up; in pictures rows "
+            "count downwards.",
+            True,
+        )
+    return None
+
+
+def out_of_step(lines: Lines) -> Suspicion | None:
+    """Ends that fit the fixtures of other poses: files and end positions in different orders."""
+    misfit = lines.misfit(lines.measured[:, None], lines.declared[None, :])
+    own = np.diag(misfit)
+    _, best = linear_sum_assignment(misfit**2)
+    other = misfit[np.arange(len(own)), best]
+    wrong = (own > OUT_OF_STEP) & (other < np.minimum(FITS, MUCH_BETTER * own))
+    if wrong.sum() < 2:
+        return None
+    pairs = [
+        f"{lines.names[i]} shows the ends of {lines.names[best[i]]}" for i in np.flatnonzero(wrong)
+    ]
+    more = f", and {len(pairs) - 4} more" if len(pairs) > 4 else ""
+    step = set((best - np.arange(len(own)))[wrong].tolist())
+    shift = f" (all of them {abs(step.pop())} further in the list)" if len(step) == 1 else ""
+    return Suspicion(
+        f"{len(pairs)} of {len(own)} files belong to other entries of the list of poses{shift}: "
+        f"{'; '.join(pairs[:4])}{more}. Try: put file names and end positions in step.",
+        True,
+    )
+
+
+def exchanged(lines: Lines) -> tuple[Suspicion, ...]:
+    """Poses whose end is where all others have their start, as if both were exchanged."""
+    starts, ends = lines.declared[:, 0], lines.declared[:, 1]
+    if len(starts) < 4:
+        return ()
+    common = np.median(starts, axis=0)
+    near = FITS * lines.length
+    regular = np.linalg.norm(starts - common, axis=1) < near
+    turned = ~regular & (np.linalg.norm(ends - common, axis=1) < near)
+    if regular.sum() < 3 * turned.sum():
+        return ()
+    return tuple(
+        Suspicion(
+            f"{lines.names[i]}: its end ({ends[i][0]:g}, {ends[i][1]:g}) m is where the other "
+            "poses have their start. Try: are start and end exchanged?",
+            False,
+        )
+        for i in np.flatnonzero(turned)
+    )
+
+
+def far_ends(lines: Lines) -> tuple[Suspicion, ...]:
+    """Single poses whose line ends far from the fixtures."""
+    own = lines.misfit(lines.measured, lines.declared)
+    return tuple(
+        Suspicion(
+            f"{lines.names[i]}: its line runs from {_at(lines.measured[i, 0])} to "
+            f"{_at(lines.measured[i, 1])} m, {own[i] * lines.length:.3g} m RMS away from the "
+            "declared ends. Try: start and end of this pose, and whether it is the right file.",
+            False,
+        )
+        for i in np.flatnonzero(own > CONTRADICTS)
+    )
+
+
+def repeated(names: Sequence[str], points: Sequence[FloatArray]) -> tuple[Suspicion, ...]:
+    """Poses with exactly the same points (K, 2): one file under two names."""
+    seen: dict[bytes, str] = {}
+    found = []
+    for name, array in zip(names, points, strict=True):
+        key = np.ascontiguousarray(array, dtype=float).tobytes()
+        if key in seen:
+            found.append(
+                Suspicion(
+                    f"{name} holds exactly the points of {seen[key]}, and no two measurements "
+                    "agree to the last digit. Try: is one file there twice, under two names?",
+                    False,
+                )
+            )
+        seen.setdefault(key, name)
+    return tuple(found)
+
+
+def _all_near(ratio: FloatArray, factor: float) -> bool:
+    """Whether nearly all ratios are the factor, up to a quarter."""
+    near = (ratio > factor / _NEAR) & (ratio < factor * _NEAR)
+    return bool(near.mean() >= 0.8)
+
+
+def _overall(misfit: FloatArray) -> float:
+    """Root mean square over the poses, the worst fifth left out: a pose or two may be wrong."""
+    kept = np.sort(misfit)[: max(1, int(np.ceil(0.8 * len(misfit))))]
+    return float(np.sqrt(np.mean(kept**2)))
+
+
+def _moved(lines: Lines, measured: FloatArray) -> tuple[float, FloatArray]:
+    """Misfit after the one translation (2,) [m] that fits best, in the middle of both ends.
+
+    With a free end: at the start, which the line's first point is then taken for.
+    """
+    away = measured.mean(axis=1) - lines.declared.mean(axis=1)
+    shift = np.median(np.where(np.isfinite(away), away, (measured - lines.declared)[:, 0]), axis=0)
+    return _overall(lines.misfit(measured - shift, lines.declared)), shift
+
+
+def _at(point: FloatArray) -> str:
+    return f"({point[0]:.3f}, {point[1]:.3f})"

@@ -1,0 +1,27 @@
+"""A fleet of tiny sessions and its table, computed in this process."""
+
+import pytest
+
+pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-casadi[table]'")
+
+import pyarrow.parquet as pq
+from tiny_sessions import QUICK, without_times, write_fleet
+
+from dlo_casadi.executors import InProcess
+from dlo_casadi.fleet import find_sessions, fit_fleet
+
+
+@pytest.fixture(scope="session")
+def fleet(tmp_path_factory):
+    """Folder of the sessions."""
+    folder = tmp_path_factory.mktemp("cables")
+    write_fleet(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def expected(fleet, tmp_path_factory):
+    """Rows of the table without interruption, one session after the other."""
+    output = tmp_path_factory.mktemp("in_process")
+    fit_fleet(find_sessions(fleet)[1], output, InProcess(), QUICK)
+    return without_times(pq.read_table(output / "table.parquet"))

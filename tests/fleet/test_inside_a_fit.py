@@ -1,0 +1,64 @@
+"""Starts, folds and candidates of one fit give the same digits in other processes."""
+
+import numpy as np
+import pytest
+from tiny_sessions import write_session
+
+from dlo_casadi.config import load_config
+from dlo_casadi.diagnosis.confirm import confirm
+from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.diagnose import screen
+from dlo_casadi.effects import RestCurvatureDrift
+from dlo_casadi.estimation.fit import fit_model, starting_points
+from dlo_casadi.parallel import map_in_order, open_executor
+from dlo_casadi.session import run_session
+
+
+@pytest.fixture(scope="module")
+def fit(tmp_path_factory):
+    config = load_config(write_session(tmp_path_factory.mktemp("one") / "cable"))
+    return run_session(config).fit
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with open_executor(jobs=2) as executor:
+        yield executor
+
+
+class _Confirm:
+    """`confirm` of one fit, without what cannot be compared."""
+
+    def __init__(self, fit):
+        self.fit = fit
+
+    def __call__(self, screened):
+        found = confirm(self.fit, screened)
+        return None if found is None else (found.fit.p, found.validation.squares, found.bic)
+
+
+def test_starts(fit, pool):
+    theta = fit.problem.unknowns.prior_mean()
+    here = starting_points(fit.problem, theta, (-1, 0, 1))
+    there = starting_points(fit.problem, theta, (-1, 0, 1), pool)
+    assert len(here) > 0
+    assert [point.objective for point in here] == [point.objective for point in there]
+
+
+def test_folds_where_a_state_is_carried(fit, pool):
+    model = fit.model.with_effect(RestCurvatureDrift())
+    drifting = fit_model(model, fit.problem.history, fit.problem.tolerances, start=fit)
+    here, there = cross_validate(drifting), cross_validate(drifting, pool)
+    assert here.complete
+    assert np.array_equal(here.squares, there.squares)
+
+
+def test_refits_of_candidates(fit, pool):
+    best = screen(fit, None, ())[:2]
+    work = _Confirm(fit)
+    here, there = [work(item) for item in best], map_in_order(pool, work, best)
+    assert any(item is not None for item in here)
+    for one, other in zip(here, there, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None:
+            assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))

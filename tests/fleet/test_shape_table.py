@@ -1,0 +1,194 @@
+"""A table of shapes holds what single predictions give, in order, whatever interrupts it."""
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from tiny_sessions import write_session
+
+from dlo_casadi.cli import main
+from dlo_casadi.config import load_config
+from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium import Pose, solve_equilibrium
+from dlo_casadi.errors import DloError
+from dlo_casadi.executors import InProcess
+from dlo_casadi.model import CableModel
+from dlo_casadi.parallel import open_executor
+from dlo_casadi.prediction import predict
+from dlo_casadi.report.parameters_file import parameters_text
+from dlo_casadi.session import run_session
+from dlo_casadi.shape_table import Grid, Plan, PoseList, shape_table, solve
+
+CABLE = Cable(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
+REST = np.zeros(10)
+GRID = Grid((-0.4, 0.4, 9), (-0.3, 0.3, 7))
+
+
+def plan_of(tmp_path, **options):
+    model = CableModel(CABLE, n=10, n_rest=4, **options)
+    return Plan(model, model.nominal, model.rest_basis @ np.ones(4), None, tmp_path / "parts")
+
+
+@pytest.fixture(scope="module")
+def parameters(tmp_path_factory):
+    """parameters.yaml of a fitted cable, with all nuisances."""
+    folder = tmp_path_factory.mktemp("fitted")
+    outcome = run_session(load_config(write_session(folder / "cable")))
+    (folder / "parameters.yaml").write_text(parameters_text(outcome))
+    return folder / "parameters.yaml"
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    """Some ten poses a chunk."""
+    monkeypatch.setattr(solve, "CHUNK_BYTES", 4000)
+
+
+def test_rows_are_predictions_in_the_order_of_the_grid(parameters, tmp_path, capsys):
+    output = tmp_path / "shapes.parquet"
+    grid = ["--grid", "-0.5", "0.5", "5", "-4e-1", "0.4", "3"]
+    command = ["shape-table", str(parameters), *grid, "--output", str(output), "--quiet", "--json"]
+    assert main(command) == 0
+    told = json.loads(capsys.readouterr().out)
+    table = pq.read_table(output)
+    rows = table.to_pylist()
+    ends = [(row["end_x"], row["end_y"]) for row in rows]
+    places = [(x, y) for y in (-0.4, 0.0, 0.4) for x in np.linspace(-0.5, 0.5, 5)]
+    assert np.array(ends) == pytest.approx(np.array(places), abs=1e-15)
+    assert [row["status"] for row in rows].count("ok") == told["poses"]["ok"]
+    assert table.schema.field("points").metadata[b"unit"] == b"m"
+    assert table.schema.field("force_on_end_x").metadata[b"unit"] == b"N"
+    assert json.loads(table.schema.metadata[b"identity"])["model_hash"] == told["model_hash"]
+    for row, end in zip(rows, ends, strict=True):
+        if np.hypot(*end) > 0.56:  # the cable is 0.55 m long
+            assert row["status"] == "unreachable"
+            assert row["points"] is row["energy"] is None
+            continue
+        shape = predict(parameters, end)
+        nodes = np.reshape(row["points"], (-1, 2))
+        # Points are in single precision: 6e-8 of half a metre.
+        assert nodes == pytest.approx(shape.curve.nodes, abs=1e-7)
+        assert row["energy"] == pytest.approx(shape.equilibrium.energy, rel=1e-8)
+        force = [row["force_on_end_x"], row["force_on_end_y"]]
+        assert force == pytest.approx(shape.equilibrium.lam, rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_list_of_poses_of_a_clamped_cable(kind, tmp_path):
+    columns = {
+        "end_x_m": [0.3, 0.35, 9.0],
+        "end_y_m": [0.1, -0.1, 0.0],
+        "end_heading_rad": [0.4, -0.2, 0.0],
+    }
+    path = tmp_path / f"poses.{kind}"
+    if kind == "csv":
+        lines = [",".join(map(str, row)) for row in zip(*columns.values(), strict=True)]
+        path.write_text("\n".join([",".join(columns), *lines]) + "\n")
+    else:
+        pq.write_table(pa.table(columns), path)
+    plan = plan_of(tmp_path, start="clamped", end="clamped")
+    poses = PoseList(path, ("end_x_m", "end_y_m", "end_heading_rad"), {"start_heading": 0.2})
+    output = tmp_path / "shapes.parquet"
+    assert shape_table(plan, poses, output, InProcess()) == {"ok": 2, "unreachable": 1}
+    rows = pq.read_table(output).to_pylist()
+    for k, row in enumerate(rows[:2]):
+        end = (columns["end_x_m"][k], columns["end_y_m"][k])
+        pose = Pose((0.0, 0.0), end, start_heading=0.2, end_heading=columns["end_heading_rad"][k])
+        found = solve_equilibrium(plan.model, plan.p, plan.rest, pose)
+        assert row["energy"] == pytest.approx(found.energy, rel=1e-8)
+        assert row["end_heading"] == columns["end_heading_rad"][k]
+        moments = [row["moment_on_start"], row["moment_on_end"]]
+        assert moments == pytest.approx(found.moments, rel=1e-5, abs=1e-8)
+    assert rows[2]["status"] == "unreachable"
+
+
+def test_interrupted_and_resumed_or_in_a_pool_the_bytes_are_the_same(tmp_path, small_chunks):
+    whole = tmp_path / "whole.parquet"
+    plan = plan_of(tmp_path)
+    counts = shape_table(plan, GRID, whole, InProcess())
+    assert sum(counts.values()) == GRID.count
+    assert not plan.parts.exists()
+
+    def interrupt(tally):
+        if tally.done == 3:
+            raise KeyboardInterrupt
+
+    again = tmp_path / "again.parquet"
+    with pytest.raises(KeyboardInterrupt):
+        shape_table(plan, GRID, again, InProcess(), progress=interrupt)
+    assert not again.exists()
+    before = len(list(plan.parts.glob("*.npy")))
+    assert before == 3
+    tallies = []
+    assert shape_table(plan, GRID, again, InProcess(), progress=tallies.append) == counts
+    assert len(tallies) == -(-GRID.count // plan.chunk) - before > 2
+    assert again.read_bytes() == whole.read_bytes()
+
+    pooled = tmp_path / "pooled.parquet"
+    with open_executor(jobs=2) as executor:
+        shape_table(plan, GRID, pooled, executor)
+    assert pq.read_table(pooled).equals(pq.read_table(whole))
+
+    assert shape_table(plan, GRID, whole, InProcess()) == {}, "complete already"
+
+
+def test_what_belongs_to_something_else_is_refused(tmp_path, small_chunks):
+    plan, output = plan_of(tmp_path), tmp_path / "shapes.parquet"
+
+    def interrupt(tally):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        shape_table(plan, GRID, output, InProcess(), progress=interrupt)
+    other = Grid((-0.4, 0.4, 9), (-0.3, 0.2, 3))
+    with pytest.raises(DloError, match="holds parts of another table"):
+        shape_table(plan, other, output, InProcess())
+    shape_table(plan, other, output, InProcess(), restart=True)
+    with pytest.raises(DloError, match="holds something else"):
+        shape_table(plan, GRID, output, InProcess())
+    output.write_text("my notes")
+    with pytest.raises(DloError, match="holds something else"):
+        shape_table(plan, other, output, InProcess())
+    assert output.read_text() == "my notes"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("end_x_m\n0.1\n", "end_y_m missing"),
+        ("end_x_m,end_y_m,speed\n0.1,0.2,3\n", "speed unknown"),
+        ("end_x_m,end_y_m\n0.1,far\n", "far"),
+    ],
+)
+def test_bad_lists(text, message, tmp_path):
+    path = tmp_path / "ends.csv"
+    path.write_text(text)
+    with pytest.raises(DloError, match=message):
+        list(PoseList(path).chunks(10))
+
+
+def test_a_model_is_pickled_without_its_expressions():
+    model = CableModel(CABLE, n=10)
+    before = solve_equilibrium(model, model.nominal, REST, Pose((0.0, 0.0), (0.3, 0.0)))
+    copy = pickle.loads(pickle.dumps(model))
+    assert copy == model
+    after = solve_equilibrium(copy, copy.nominal, REST, Pose((0.0, 0.0), (0.3, 0.0)))
+    assert np.array_equal(before.phi, after.phi)
+
+
+def test_lists_and_grids_are_cut_without_a_gap(tmp_path):
+    path = Path(tmp_path / "ends.csv")
+    values = np.arange(50.0).reshape(25, 2)
+    path.write_text("end_x_m,end_y_m\n" + "\n".join(f"{x},{y}" for x, y in values) + "\n\n")
+    poses = PoseList(path, fixed={"start_x": 7.0})
+    cut = list(poses.chunks(10))
+    assert [len(chunk) for chunk in cut] == [10, 10, 5]
+    assert poses.count == 25
+    joined = np.concatenate(cut)
+    assert np.array_equal(joined[:, 2:4], values)
+    assert np.all(joined[:, 0] == 7.0)
+    assert np.array_equal(np.concatenate(list(GRID.chunks(10))), next(GRID.chunks(10**6)))

@@ -1,0 +1,181 @@
+"""Tasks end once each, wherever they run and whatever happens to their workers."""
+
+import os
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.executors import InProcess
+from dlo_casadi.parallel import (
+    LostTaskError,
+    Tally,
+    generator_of,
+    map_as_completed,
+    map_in_order,
+    open_executor,
+)
+
+
+def square(x):
+    return x * x
+
+
+def root(x):
+    if x < 0:
+        raise EquilibriumError(f"{x} has no root", pose="p", p_des=(x, 0.0))
+    return x**0.5
+
+
+def threads(_):
+    return [row["num_threads"] for row in threadpool_info()], cv2.getNumThreads(), os.getpid()
+
+
+def kill_once(mark, x):
+    """Square of x; the worker that meets item 3 first is killed."""
+    if x == 3 and not Path(mark).exists():
+        Path(mark).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x * x
+
+
+def kill_always(x):
+    if x == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x * x
+
+
+def draw(index):
+    return generator_of(7, index).standard_normal(3).tolist()
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with open_executor(jobs=2) as executor:
+        yield executor
+
+
+def test_in_process_results_come_one_by_one_and_in_order():
+    run = []
+    with open_executor() as executor:
+        for done in map_as_completed(executor, lambda x: run.append(x) or x, [5, 6, 7]):
+            assert run[-1] == done.item, "a task was run before the one before it was handed out"
+    assert run == [5, 6, 7]
+
+
+def test_pool_and_process_give_the_same(pool):
+    assert map_in_order(pool, square, range(20)) == [x * x for x in range(20)]
+    assert map_in_order(pool, draw, range(6)) == map_in_order(InProcess(), draw, range(6))
+
+
+def test_any_executor_of_the_standard_library_serves():
+    with ThreadPoolExecutor(2) as executor:
+        assert map_in_order(executor, square, range(5)) == [0, 1, 4, 9, 16]
+
+
+def test_an_error_ends_its_own_task_alone_and_keeps_what_it_knows(pool):
+    ended = {done.item: done for done in map_as_completed(pool, root, [4.0, -1.0, 9.0])}
+    assert ended[4.0].value == 2.0
+    assert ended[9.0].value == 3.0
+    with pytest.raises(EquilibriumError, match=r"p: -1\.0 has no root") as caught:
+        _ = ended[-1.0].value
+    assert caught.value.p_des == (-1.0, 0.0)
+
+
+@pytest.mark.parametrize("where", ["here", "pool"])
+def test_one_thread_in_each_process(where, pool):
+    found = map_in_order(InProcess() if where == "here" else pool, threads, range(3))
+    for blas, opencv, pid in found:
+        assert blas, "threadpoolctl sees no BLAS"
+        assert set(blas) == {1}
+        assert opencv == 1
+        assert (pid == os.getpid()) == (where == "here")
+
+
+def test_items_are_taken_only_when_there_is_room():
+    taken = []
+
+    def items():
+        for x in range(50):
+            taken.append(x)
+            yield x
+
+    with ThreadPoolExecutor(1) as executor:
+        results = map_as_completed(executor, square, items(), in_flight=3)
+        for k, _ in enumerate(results):
+            assert len(taken) <= k + 4
+
+
+def test_a_killed_worker_loses_nothing(tmp_path):
+    with open_executor(jobs=2, logs=tmp_path / "logs") as executor:
+        work = partial(kill_once, str(tmp_path / "mark"))
+        assert map_in_order(executor, work, range(8)) == [x * x for x in range(8)]
+    assert (tmp_path / "mark").exists(), "nothing was killed"
+    logs = list((tmp_path / "logs").glob("worker-*.log"))
+    text = "".join(path.read_text() for path in logs)
+    assert len(logs) >= 3, "each process keeps its own log: two, and at least one anew"
+    assert text.count("task 3 begins") == 2
+    assert text.count("task 3 done") == 1
+
+
+def test_a_task_that_kills_its_worker_is_given_up_and_no_other():
+    with open_executor(jobs=2) as executor:
+        ended = list(map_as_completed(executor, kill_always, range(6)))
+    assert sorted(done.item for done in ended) == list(range(6))
+    for done in ended:
+        if done.item == 3:
+            with pytest.raises(LostTaskError, match="lost 3 times, at last alone"):
+                _ = done.value
+        else:
+            assert done.value == done.item**2
+
+
+def test_an_interrupt_ends_the_running_tasks():
+    begin = time.perf_counter()
+
+    def interrupted():
+        with open_executor(jobs=2) as executor:
+            for _ in map_as_completed(executor, time.sleep, [0.0, 600.0, 600.0, 600.0]):
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.perf_counter() - begin < 60
+
+
+def test_remaining_time_is_an_interval_that_holds_the_truth():
+    durations = np.random.default_rng(0).uniform(0.002, 0.006, 60)
+    tallies: list[Tally] = []
+    list(map_as_completed(InProcess(), time.sleep, durations, progress=tallies.append))
+    assert [tally.done for tally in tallies] == list(range(1, 61))
+    assert tallies[0].remaining is None
+    assert tallies[-1].remaining == (0.0, 0.0)
+    low, high = tallies[19].remaining
+    truth = durations[20:].sum()
+    # Sleeping takes some 0.1 ms longer than asked for, more on a busy machine.
+    assert low <= 1.5 * truth
+    assert high >= truth
+
+
+def test_environment_is_as_before(monkeypatch):
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    with open_executor(jobs=2):
+        assert os.environ["MKL_NUM_THREADS"] == os.environ["OMP_NUM_THREADS"] == "1"
+    assert "MKL_NUM_THREADS" not in os.environ
+    assert os.environ["OMP_NUM_THREADS"] == "3"
+
+
+def test_bad_numbers_of_processes():
+    with pytest.raises(DloError, match="--jobs 0"), open_executor(jobs=0):
+        pass
+    both = open_executor(jobs=2, scheduler="tcp://127.0.0.1:1")
+    with pytest.raises(DloError, match="its own number of workers"), both:
+        pass
