@@ -135,6 +135,10 @@ def is_stable(matrix: FloatArray, n_conditions: int) -> bool:
     return int((eigenvalues < floor).sum()) == n_conditions
 
 
+# Minima of the potential and of the Lagrangian that lie within this are the same one [rad].
+NEARBY = 0.05
+
+
 @lru_cache(maxsize=32)
 def _solver(key: int, holder: _Held) -> ca.Function:
     model = holder.model
@@ -305,6 +309,9 @@ def _from_start(
     phi = np.array(out["x"]).ravel()[: chain.n_headings]
     multipliers = np.array(out["lam_g"]).ravel()
     lam, bound_lam = multipliers[: model.n_conditions], multipliers[model.n_conditions :]
+    inside = np.abs(np.diff(phi)).max() < JOINT_BOUND - 1e-6
+    if model.bowed and inside and stats["success"]:
+        phi, lam = _balanced(model, phi, lam, (p, rest, ends, deviation))
     gap = np.abs(np.array(out["g"]).ravel()[: model.n_conditions])
     residual = float(gap.max()) if gap.size else 0.0
     arguments = (phi, lam, p, rest, ends, deviation)
@@ -337,6 +344,21 @@ def _from_start(
         status=status,
         iterations=int(stats["iter_count"]),
     )
+
+
+def _balanced(
+    model: CableModel, phi: FloatArray, lam: FloatArray, given: tuple[FloatArray, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Newton's method from the potential's minimum, whose bows are stiff under compression too."""
+    for _ in range(5):
+        force, matrix = (np.array(block) for block in model.kkt(phi, lam, *given))
+        step = np.linalg.lstsq(matrix, -force.ravel(), rcond=1e-14)[0]
+        if not np.abs(step[: len(phi)]).max() < NEARBY:
+            break
+        phi, lam = phi + step[: len(phi)], lam + step[len(phi) :]
+        if np.abs(step[: len(phi)]).max() < 1e-12:
+            break
+    return phi, lam
 
 
 def split_multipliers(model: CableModel, lam: FloatArray) -> tuple[FloatArray, FloatArray]:

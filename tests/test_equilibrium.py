@@ -18,7 +18,7 @@ from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model import CableModel
 
 DATA = Path(__file__).parent / "data"
-BOTH = pytest.mark.parametrize("element", ["arc", "link"])
+ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WEIGHTLESS = (0.0, 0.0)  # m/s^2
 MESHES = (10, 20, 40)
 
@@ -60,7 +60,7 @@ def test_energies_of_table_4():
 # ---- closed forms, and the order of both elements ----------------------------------------------
 
 
-@BOTH
+@ALL
 def test_limp_cable_converges_to_the_catenary(element):
     """L = 2a sinh(s/2a), sag = a (cosh(s/2a) - 1), H = w a  [Irvine, Cable Structures, 1981]."""
     span, length, weight = 0.6, 1.0, 0.5  # m, m, N/m
@@ -68,8 +68,8 @@ def test_limp_cable_converges_to_the_catenary(element):
     a = brentq(lambda a: 2 * a * np.sinh(span / (2 * a)) - length, 0.05, 10.0)
     exact = np.array([a * (np.cosh(span / (2 * a)) - 1), weight * a])  # sag [m], H [N]
     errors = []
-    # Arcs are of fourth order here and would reach the effect of EI at n = 64.
-    for n in (16, 32, 64) if element == "link" else (8, 16, 32):
+    # Arcs are of fourth order here and would reach the effect of EI at n = 64, or before.
+    for n in {"link": (16, 32, 64), "arc": (8, 16, 32), "quadratic": (8, 16)}[element]:
         model = CableModel(Cable(length, weight * length / 9.81, 0.005, stiffness), n, element)
         hung = solve(model, stiffness, Pose((0.0, 0.0), (span, 0.0), branch="ccw"))
         assert hung.stable
@@ -100,7 +100,7 @@ def cantilever(stiffness: float, weight: float, length: float, heading: float):
     return found.sol
 
 
-@BOTH
+@ALL
 def test_heavy_cantilever_against_an_integrator(element):
     """Shape at the middle and at the end, bending moment at the clamp; w L^3 / EI = 20."""
     stiffness, weight, length, heading = 0.05, 2.0, 0.8, 0.3  # N m^2, N/m, m, rad
@@ -113,7 +113,7 @@ def test_heavy_cantilever_against_an_integrator(element):
         assert bent.stable
         np.testing.assert_allclose(bent.lam, 0.0)
         gaps = [np.hypot(*(bent.points[k] - exact(k * length / n)[2:])) for k in (n // 2, n)]
-        if element == "arc":  # the clamp's moment: force times lever of the weight
+        if element != "link":  # the clamp's moment: force times lever of the weight
             lever = weight * np.trapezoid(exact(np.linspace(0, length, 4001))[2], dx=length / 4000)
             gaps.append(abs(abs(bent.moments[0]) - lever))
         errors.append(gaps)
@@ -131,7 +131,7 @@ def elastica(slope: float, length: float, stiffness: float) -> tuple[float, floa
     return length * (2 * e / k - 1), length * np.sqrt(m) / k, thrust
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize("slope", [0.3, 1.0, 2.0])  # rad; at 2.0 the pins are close together
 def test_pinned_elastica(element, slope):
     length, stiffness = 1.0, 0.3
@@ -202,27 +202,29 @@ def bench(name: str, n: int, element: str) -> list[np.ndarray]:
 
 
 def node_error(name: str, n: int, element: str) -> float:
-    """Largest error of a node [m] over all poses, against 320 arcs at the same arc lengths."""
-    fine = bench(name, 320, "arc")
+    """Largest error of a node [m] over all poses, against 320 elements at the same arc lengths."""
+    fine = bench(name, 320, "quadratic")
     pairs = zip(bench(name, n, element), fine, strict=True)
     return max(np.hypot(*(coarse - exact[:: 320 // n]).T).max() for coarse, exact in pairs)
 
 
-def test_ten_arcs_are_five_times_closer_than_ten_links():
-    """On the eighteen poses of the bench cable, as its session without effects has them."""
-    arc, link = node_error("clean", 10, "arc"), node_error("clean", 10, "link")
-    assert arc < link / 5, f"arc {arc * 1e3:.3f} mm, link {link * 1e3:.3f} mm"
-    assert arc < 3e-4  # a third of the links' best
+@pytest.mark.parametrize("name", ["clean", "taper", "thin", "drift", "long", "clamped"])
+def test_ten_elements_are_five_times_closer_than_ten_links(name):
+    """Also where the rest curvature has features as short as an element."""
+    bowed, link = node_error(name, 10, "quadratic"), node_error(name, 10, "link")
+    assert bowed < link / 5, f"quadratic {bowed * 1e3:.3f} mm, link {link * 1e3:.3f} mm"
 
 
 @pytest.mark.parametrize("name", ["taper", "orange"])
-def test_both_elements_converge_on_bench_poses(name):
-    """Rest curvature with features as short as an element: second order, arcs twice as close."""
-    errors = {e: [node_error(name, n, e) for n in (10, 20, 40)] for e in ("arc", "link")}
+def test_elements_converge_on_bench_poses(name):
+    """Second order of arcs and links, arcs closer; about fourth of quadratic elements."""
+    meshes = {"quadratic": (10, 20, 40), "arc": (10, 20, 40), "link": (10, 20, 40)}
+    errors = {e: [node_error(name, n, e) for n in ns] for e, ns in meshes.items()}
     assert errors["arc"][0] < errors["link"][0] / 1.8
     for element, gaps in errors.items():
         measured = np.log2(gaps[0] / gaps[-1]) / 2
-        assert measured > 1.9, f"{element}: mean order {measured:.2f}, errors {gaps}"
+        least = 3.0 if element == "quadratic" else 1.9
+        assert measured > least, f"{element}: mean order {measured:.2f}, errors {gaps}"
 
 
 def test_stiff_cable_on_a_fine_mesh():
@@ -246,7 +248,7 @@ def hold(element: str, start=(0.0, 0.0), end=(0.5, 0.1)) -> Equilibrium:
     return solve_equilibrium(model, p, rest, Pose(start, end, branch="ccw"))
 
 
-@BOTH
+@ALL
 def test_reactions_are_slopes_of_the_energy(element):
     """-lam = dV/d(end), -lam_start = dV/d(start), by central differences of solved energies."""
     held, d = hold(element), 1e-4
@@ -261,7 +263,7 @@ def test_reactions_are_slopes_of_the_energy(element):
         assert -(starts[0] - starts[1]) / (2 * d) == pytest.approx(held.lam_start[axis], abs=2e-6)
 
 
-@BOTH
+@ALL
 def test_weight_and_reactions_sum_to_zero(element):
     """The holders carry what hangs on the cable: its weight, the lump's, the point force."""
     held = hold(element)
@@ -269,7 +271,7 @@ def test_weight_and_reactions_sum_to_zero(element):
     np.testing.assert_allclose(held.lam + held.lam_start, loads, atol=1e-10)
 
 
-@BOTH
+@ALL
 def test_moments_about_the_start_sum_to_zero(element):
     """Pins hold no moment: that of the weight is that of the end's reaction."""
     model = CableModel(HEAVY, 16, element)
@@ -377,7 +379,7 @@ def test_clamped_loop_of_a_real_wire():
     np.testing.assert_allclose(other.points, loop.points, atol=1e-6)
 
 
-@BOTH
+@ALL
 def test_both_ends_at_one_place(element):
     """A loop that hangs from one nail, symmetric about the vertical through it."""
     model = CableModel(Cable(0.8, 0.2, 0.01, 0.01), 20, element)
@@ -390,7 +392,7 @@ def test_both_ends_at_one_place(element):
     assert loop.points[:, 1].min() < 0.1 - 0.25
 
 
-@BOTH
+@ALL
 def test_free_cable_hangs_straight_down(element):
     model = CableModel(HEAVY, 8, element, end="free")
     hung = solve(model, 0.1, Pose((0.3, 0.5)))

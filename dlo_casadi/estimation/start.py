@@ -38,7 +38,11 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     chain = model.chain
     m = len(problem.measured)
     # Without forces an element does not know its bow.
-    sweep = problem.sweep if chain.element != "quadratic" else Sweep(model.with_mesh(chain.n, "arc"), problem.sweep.poses)
+    sweep = (
+        problem.sweep
+        if chain.element != "quadratic"
+        else Sweep(model.with_mesh(chain.n, "arc"), problem.sweep.poses)
+    )
     flat = np.zeros(chain.n_cells)
     phi = np.array([guesses(model, item.pose, flat)[0] for item in problem.measured])
     feet: list[FloatArray] = []

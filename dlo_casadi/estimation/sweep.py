@@ -72,9 +72,7 @@ class Observations:
 
     def by_theta(self, j: int, sens: Sensitivities, slopes: FloatArray) -> FloatArray:
         """Derivative (nz, size) of pose j by the unknowns, through its equilibrium."""
-        return (
-            self.by_x[j] @ sens.theta[j] + self.by_p[j] @ slopes + self.by_rest[j] @ sens.rest[j]
-        )
+        return self.by_x[j] @ sens.theta[j] + self.by_p[j] @ slopes + self.by_rest[j] @ sens.rest[j]
 
     def by_own(self, j: int, sens: Sensitivities) -> FloatArray:
         """Derivative (nz, len(DEVIATIONS)) of pose j by its deviation."""
@@ -293,9 +291,7 @@ class Sweep:
             change = by_phi @ total[: self.n_phi] + by_before @ change + by_own @ slopes
         return Sensitivities(np.array(rows), solved[:, :, size + n_cells :], np.array(found))
 
-    def observe(
-        self, shapes: Shapes, p: FloatArray, rest: FloatArray
-    ) -> Observations:
+    def observe(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Observations:
         """Measured curves and their derivatives."""
         rests = self.rests(shapes, p, rest)
         z, *slopes = self._call("observation", shapes, p, rests)

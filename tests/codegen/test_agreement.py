@@ -77,13 +77,13 @@ def test_every_effect_of_the_cable_has_values():
 
 
 @pytest.mark.parametrize("name", [name for name in VALUES if name != "clamp_angle"])
-@pytest.mark.parametrize("element", ["link", "arc"])
+@pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_effect(name, element):
     assert difference([name], element, "pinned", "pinned") < 1e-8
 
 
 @pytest.mark.parametrize(("start", "end"), BOUNDARIES)
-@pytest.mark.parametrize("element", ["link", "arc"])
+@pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_all_effects_together(element, start, end):
     names = [n for n in VALUES if n != "clamp_angle" or (start, end) == ("clamped", "clamped")]
     assert difference(names, element, start, end) < 1e-8

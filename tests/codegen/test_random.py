@@ -14,7 +14,7 @@ from benchmarks.random_cables import AnyCable, check, compare_with_ipopt, random
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
 
-@pytest.mark.parametrize("element", ["link", "arc"])
+@pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_random_cables_have_stable_equilibria(element):
     rng = np.random.default_rng(2)
     solver = AnyCable(random_problem(rng, 1, element=element))

@@ -42,7 +42,7 @@ ENDS = [
     (0.35, 0.0),
     (0.7, 0.1),
 ]
-BOTH = pytest.mark.parametrize("element", ["arc", "link"])
+ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 
 
 def poses_at(count: int) -> list[Pose]:
@@ -86,7 +86,7 @@ def solved(problem: BatchProblem, theta: np.ndarray, deviation: np.ndarray | Non
 # ---- equilibria of many poses ------------------------------------------------------------------
 
 
-@BOTH
+@ALL
 def test_poses_solved_together_are_those_solved_alone(element):
     """Two routes: Newton's method over the stacked poses; IPOPT for each of them."""
     model = CableModel(CABLE, 8, element, effects=(LumpedMass(), AxialStretch()))
@@ -180,7 +180,7 @@ def residuals(problem: BatchProblem, point: Point, theta, deviation=None) -> lis
     ]
 
 
-@BOTH
+@ALL
 def test_jacobian_by_the_unknowns_against_central_differences(element):
     """Feet move, equilibria are solved again, the drift of earlier poses is carried along."""
     problem, point = rich(element)
@@ -259,7 +259,7 @@ def round_trip(element: str):
     return fit, p, coefficients
 
 
-@BOTH
+@ALL
 def test_round_trip_with_noise_within_three_sigma(element):
     """Parameters -> poses -> noise -> the same parameters; the prior of EI is off by 1.8."""
     fit, p, coefficients = round_trip(element)

@@ -175,7 +175,10 @@ def damaged(file, tmp_path, change):
         (lambda d: d.pop("cable"), "cable is missing"),
         (lambda d: d["cable"].update(length=-1.0), "cable.length must be a positive number"),
         (lambda d: d["cable"].update(length="long"), "cable.length must be a positive number"),
-        (lambda d: d.update(element="beam"), "element must be arc or link, found 'beam'"),
+        (
+            lambda d: d.update(element="beam"),
+            "element must be quadratic or arc or link, found 'beam'",
+        ),
         (lambda d: d["boundary"].update(end="glued"), "boundary.end must be pinned or clamped"),
         (lambda d: d["effects"].append({"name": "magic", "label": "x"}), "called 'magic'"),
         (lambda d: d["effects"].pop(), "do not belong together: end_offset.dx, end_offset.dy"),
