@@ -32,6 +32,7 @@ MAY_IMPORT["report"] = set(MAY_IMPORT)
 MAY_IMPORT["shape_table"] = MECHANICS | {"codegen", "durable", "parallel"}
 MAY_IMPORT["fleet"] = set(MAY_IMPORT)
 MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}
+MAY_IMPORT["api"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 
