@@ -23,8 +23,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "diagnosis": MECHANICS | {"config", "measurements", "estimation"} | PARALLEL,
     "codegen": MECHANICS | {"config"},
     "durable": {"errors"},
-    "executors": {"errors"},
-    "parallel": {"errors", "executors", "vision"},
+    "workers": {"vision"},
+    "executors": {"errors", "workers"},
+    "parallel": {"errors", "executors", "workers"},
 }
 # A session: what is declared and measured -> stages and findings -> one outcome.
 MAY_IMPORT["session"] = set(MAY_IMPORT)
