@@ -10,8 +10,11 @@ import sys
 import time
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
+
+pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-casadi[table]'")
+
+import pyarrow.parquet as pq
 from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import main
