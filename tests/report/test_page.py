@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bokeh.models import HoverTool
 from PIL import Image
 from test_figures import CANDIDATES, EFFECT, LOAD
 
-from dlo_casadi.report import page_charts
+from dlo_casadi.report import page_boards, page_canvas, page_charts
 from dlo_casadi.report.geometry import beside
 from dlo_casadi.report.page import as_data, breakable, page_script, report_page, units
 from dlo_casadi.report.page_charts import charts
@@ -141,6 +142,7 @@ def test_a_configuration_that_has_gone_is_said_to_be(outcome, tmp_path):
 
 def test_units_and_names_are_set_for_reading():
     assert units("0.3 N m^2 and 9.81 m/s^2") == "0.3\u00a0N\u00a0m² and 9.81 m/s²"
+    assert units(">= 2 N") == "≥ 2 N"
     assert breakable("a_<b>.c") == "a_<wbr>&lt;b&gt;.<wbr>c"
 
 
@@ -274,6 +276,27 @@ def test_charts_are_there_for_what_the_outcome_holds(outcome):
     assert all("NaN" not in text for text in drawn.values())
 
 
+def test_what_is_told_at_the_pointer_is_known(outcome):
+    """Every field of a tooltip is a column of all that it is told of, or the browser's own."""
+    full = diagnosed(outcome, unexplained=LOAD, verdict="unexplained")
+    drawn = [
+        page_charts.errors_chart(full),
+        page_charts.poses_chart(full),
+        page_charts.residuals_chart(full),
+        page_charts.rest_chart(full),
+        page_boards.next_pose_chart(full),
+        page_boards.pull_chart(full),
+    ]
+    tools = [tool for chart in drawn for tool in chart.select({"type": HoverTool})]
+    assert len(tools) >= 10
+    for tool in tools:
+        said = " ".join(f"{text}" for _, text in tool.tooltips)
+        assert not any("@" in name for name, _ in tool.tooltips)
+        assert set(re.findall(r"\$(\w+)", said)) <= {"snap_x", "snap_y"}
+        for drawing in tool.renderers:
+            assert set(re.findall(r"@(\w+)", said)) <= set(drawing.data_source.data), said
+
+
 def luminance(color):
     """Relative luminance of #rrggbb (WCAG 2)."""
     parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
@@ -283,10 +306,10 @@ def luminance(color):
 
 def test_colours_have_a_contrast_of_four_and_a_half():
     """WCAG 2: (L1 + 0.05) / (L2 + 0.05) of the relative luminances."""
-    style = (Path(page_charts.__file__).parent / "templates" / "page.css").read_text()
+    style = (Path(page_canvas.__file__).parent / "templates" / "page.css").read_text()
     of_style = dict(re.findall(r"--([a-z]+): (#[0-9a-f]{6})", style))
     of_charts = [
-        getattr(page_charts, name)
+        getattr(page_canvas, name)
         for name in ("BEFORE", "AFTER", "HELD_OUT", "NEXT", "INK", "FAINT")
     ]
     on_paper = [of_style[k] for k in ("ink", "soft", "before", "after", "held", "next", "good")]
