@@ -11,7 +11,7 @@ result.predict(end=(0.3, -0.1)).points()
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -25,7 +25,6 @@ from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
 
 
-@dataclass(frozen=True, repr=False)
 class Result(Outcome):
     """An `Outcome` that can show itself, write itself, and predict.
 
