@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from dlo_casadi.api import Result as Result
+    from dlo_casadi.api import fit as fit
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Config as Config
     from dlo_casadi.config import load_config as load_config
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 # Module -> its public names. They are imported when they are first asked for, so that the command
 # answers at once and an interrupt finds it ready.
 _PUBLIC = {
+    "api": ("Result", "fit"),
     "codegen": ("CompiledSolver",),
     "config": ("Config", "load_config"),
     "effects": ("EFFECTS", "Cable"),

@@ -6,48 +6,18 @@ Each is a `concurrent.futures.Executor`; `parallel.py` uses no more than that an
 
 from __future__ import annotations
 
-import faulthandler
-import logging
 import multiprocessing
-import multiprocessing.connection
-import os
-import platform
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from dlo_casadi.errors import DloError
+from dlo_casadi.workers import THREADS, begin_worker, environment, software
 
-# Read by BLAS, OpenMP and OpenCV when they are loaded.
-THREADS = dict.fromkeys(
-    (
-        *("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
-        *("VECLIB_MAXIMUM_THREADS", "OPENCV_FOR_THREADS_NUM"),
-    ),
-    "1",
-)
 # How long a scheduler may take to answer, and to have a worker [s].
 PATIENCE = 30.0
-
-
-@contextmanager
-def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set variables of the environment; what was set before is put back."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 class InProcess(Executor):
@@ -95,7 +65,7 @@ class Pool(Executor):
             self.workers,
             # A forked copy of a process with threads and solvers in it may hang.
             mp_context=multiprocessing.get_context("spawn"),
-            initializer=_begin_worker,
+            initializer=begin_worker,
             initargs=(None if self.logs is None else str(self.logs),),
         )
 
@@ -257,64 +227,3 @@ def open_executor(
         executor.shutdown(wait=False, cancel_futures=True)
         raise
     executor.shutdown()
-
-
-# ---- in a worker -------------------------------------------------------------------------------
-
-
-def _begin_worker(logs: str | None) -> None:
-    """Leave interrupts to the parent, end with it, and keep the stack of a crash."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-    if logs is not None:
-        stream = open(log_file(Path(logs)), "a")  # noqa: SIM115 (as long as the process)
-        faulthandler.enable(stream)
-        # What libraries print would tear the progress of the parent.
-        for number in (1, 2):
-            os.dup2(stream.fileno(), number)
-
-
-def _end_with(sentinel: int) -> None:
-    """A worker whose parent was killed would wait for work for ever."""
-    multiprocessing.connection.wait([sentinel])
-    os._exit(1)
-
-
-def software() -> dict[str, str]:
-    """Versions on which the digits of results depend."""
-    packages = ("dlo-casadi", "casadi", "numpy", "scipy", "opencv-contrib-python-headless")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
-
-
-def worker_name() -> str:
-    """Machine and process."""
-    return f"{platform.node()}-{os.getpid()}"
-
-
-def log_file(folder: Path) -> Path:
-    """Where this process keeps its log."""
-    return folder / f"worker-{worker_name()}.log"
-
-
-def worker_log(folder: str | None) -> logging.Logger:
-    """Logger of this process, to its own file in that folder if there is one."""
-    logger = logging.getLogger("dlo_casadi.worker")
-    if folder is None:
-        return logger
-    path = str(log_file(Path(folder)))
-    if any(getattr(old, "baseFilename", None) == path for old in logger.handlers):
-        return logger
-    for old in list(logger.handlers):
-        logger.removeHandler(old)
-        old.close()
-    try:
-        handler: logging.Handler = logging.FileHandler(path, encoding="utf-8")
-    except OSError:
-        # A machine of the cluster that does not see the folder: Dask keeps its own log there.
-        return logger
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    return logger

@@ -63,7 +63,8 @@ def read_centerline(
         )
     if step.sum() > _LONGEST:
         raise MeasurementError(
-            f"the centre-line is {step.sum():.4g} m long: are the points in metres?",
+            f"the centre-line is {step.sum():.4g} m long: are the points in metres? If "
+            "they are in millimetres, divide them by 1000",
             pose=source.name,
         )
     return points[::-1].copy() if _runs_backwards(points, start, end) else points

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import logging
-import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Generator, Iterable, Sequence, Sized
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.executors import THREADS, environment, open_executor, worker_log, worker_name
+from dlo_casadi.executors import open_executor
+from dlo_casadi.workers import one_thread, worker_log, worker_name
 
 __all__ = [
     "Finished",
@@ -216,22 +214,6 @@ def generator_of(seed: int, index: int) -> np.random.Generator:
 
 # CasADi's expressions are not made for threads: a worker does one task at a time.
 _one_at_a_time = threading.RLock()
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Hold BLAS, OpenMP and OpenCV to one thread each: the matrices are small.
-
-    Libraries that are loaded already are told so, others find it in the environment.
-    """
-    with ExitStack() as stack:
-        stack.enter_context(environment(THREADS))
-        stack.enter_context(threadpool_limits(limits=1))
-        if "cv2" in sys.modules:
-            from dlo_casadi.vision.threads import opencv_threads
-
-            stack.enter_context(opencv_threads(1))
-        yield
 
 
 def _run(

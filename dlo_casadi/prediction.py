@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dlo_casadi.effects import MeasurementEffect
@@ -15,14 +16,16 @@ from dlo_casadi.equilibrium import Branch, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.report.drawing import prediction_figure
+from dlo_casadi.report.notebook import shape_html, shape_text
 from dlo_casadi.report.parameters_file import Parameters, load_parameters
 
 FloatArray = NDArray[np.floating]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PredictedShape:
-    """A fitted cable in one pose.
+    """A fitted cable in one pose. In a notebook it is a short table; `print` gives text.
 
     Parameters
     ----------
@@ -47,6 +50,18 @@ class PredictedShape:
     def points(self, count: int = 101) -> FloatArray:
         """Points (count, 2) [m] evenly spaced along the cable, from start to end."""
         return self.curve.at(np.linspace(0.0, self.curve.length, count))
+
+    def plot(self) -> Figure:
+        """The shape with the forces of the cable on its fixtures."""
+        return prediction_figure(self.as_dict())
+
+    def __str__(self) -> str:
+        return shape_text(self.as_dict())
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return shape_html(self.as_dict())
 
     def as_dict(self, count: int = 101) -> dict[str, Any]:
         """Everything a program may want to know, as plain data in SI units."""

@@ -1,6 +1,6 @@
 """Run whole sessions whose truth is known and set the results beside it.
 
-    python scripts/check_bench.py [NAME ...] [--without-true-effect] [--output FILE]
+    python scripts/check_bench.py [NAME ...] [--without-true-effect] [--output FILE] [--jobs N]
 
 Only this script and the tests read the truth; the toolkit never does. The bench sessions are
 rendered: an independent rod simulator and a camera renderer made them.
@@ -11,8 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -21,6 +21,7 @@ import numpy as np
 import yaml
 
 from dlo_casadi.config import load_config
+from dlo_casadi.parallel import map_as_completed, open_executor
 from dlo_casadi.session import run_session
 from dlo_casadi.session.outcome import Outcome
 
@@ -145,22 +146,28 @@ def main() -> None:
         help="take the true effects out of the library: what is named then?",
     )
     parser.add_argument("--output", type=Path, help="JSON file for the table")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
+    parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
     names = args.names or sorted(path.name for path in TRUTH.iterdir() if path.is_dir())
-    rows = []
-    for name in names:
-        config = load_config(config_of(name))
-        if args.without_true_effect:
-            hidden = tuple(n for n in true_effects(name) if n != "tether")
-            config = replace(
-                config, diagnosis=config.diagnosis.model_copy(update={"exclude": hidden})
-            )
-        begin = time.perf_counter()
-        row = compare(name, run_session(config))
-        rows.append(row)
-        show(row, time.perf_counter() - begin)
-        if args.output:
-            args.output.write_text(json.dumps(rows, indent=1, default=str))
+    rows: dict[int, dict] = {}
+    work = partial(run_one, without_true_effect=args.without_true_effect)
+    with open_executor(args.jobs, args.scheduler) as executor:
+        for done in map_as_completed(executor, work, names):
+            rows[done.index] = done.value
+            show(done.value, done.seconds)
+            if args.output:
+                ordered = [rows[k] for k in sorted(rows)]
+                args.output.write_text(json.dumps(ordered, indent=1, default=str))
+
+
+def run_one(name: str, without_true_effect: bool) -> dict:
+    """Run one session and compare."""
+    config = load_config(config_of(name))
+    if without_true_effect:
+        hidden = tuple(n for n in true_effects(name) if n != "tether")
+        config = replace(config, diagnosis=config.diagnosis.model_copy(update={"exclude": hidden}))
+    return compare(name, run_session(config))
 
 
 def show(row: dict, seconds: float) -> None:

@@ -1,6 +1,6 @@
 """False alarms of the diagnosis on simulated sessions with nothing hidden.
 
-    python scripts/check_false_alarms.py [--sets 300] [--seed 0] [--output FILE]
+    python scripts/check_false_alarms.py [--sets 300] [--seed 0] [--jobs N] [--output FILE]
 
 Each set takes the cable and the poses of a bench session, a new smooth rest curvature and
 stiffness, fixtures, length and scale drawn from their tolerances, and noise that is partly
@@ -13,8 +13,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,6 +27,7 @@ from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Shapes, Sweep
+from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import conditions
@@ -87,39 +88,45 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path)
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
+    parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
-    generator = np.random.default_rng(args.seed)
-    configs = []
-    for name in SESSIONS:
-        config = load_config(ROOT / "tests" / "data" / "bench" / name / "session.yaml")
-        plain = config.experiment.measurement.model_copy(update={"std": None})
-        experiment = config.experiment.model_copy(update={"measurement": plain})
-        configs.append(replace(config, experiment=experiment))
-    done, alarms, unexplained, seconds, rows = 0, 0, 0, [], []
-    while done < args.sets:
-        config = configs[done % len(configs)]
+    rows: dict[int, dict] = {}
+    seconds = []
+    with open_executor(args.jobs, args.scheduler) as executor:
+        work = partial(run_one, seed=args.seed)
+        for done in map_as_completed(executor, work, range(args.sets)):
+            row = rows[done.index] = done.value
+            seconds.append(done.seconds)
+            if row["added"] or row["verdict"] == "unexplained":
+                print(f"  set {done.index}: {row}", flush=True)
+            if len(rows) % 20 == 0 or len(rows) == args.sets:
+                alarms = sum(bool(row["added"]) for row in rows.values())
+                unexplained = sum(row["verdict"] == "unexplained" for row in rows.values())
+                print(
+                    f"{len(rows)} sets: {alarms} with a wrong effect, {unexplained} unexplained; "
+                    f"median {np.median(seconds):.1f} s a set",
+                    flush=True,
+                )
+                if args.output:
+                    args.output.write_text(json.dumps([rows[k] for k in sorted(rows)]))
+
+
+def run_one(index: int, seed: int) -> dict:
+    """Simulate one set, whose random numbers depend on seed and index alone, and diagnose it."""
+    name = SESSIONS[index % len(SESSIONS)]
+    config = load_config(ROOT / "tests" / "data" / "bench" / name / "session.yaml")
+    plain = config.experiment.measurement.model_copy(update={"std": None})
+    experiment = config.experiment.model_copy(update={"measurement": plain})
+    config = replace(config, experiment=experiment)
+    generator = generator_of(seed, index)
+    measured = None
+    while measured is None:
         measured = simulate(config, generator)
-        if measured is None:
-            continue
-        begin = time.perf_counter()
-        fit, _ = fit_declared(config, declared_model(config), measured)
-        diagnosis = diagnose(fit)
-        seconds.append(time.perf_counter() - begin)
-        done += 1
-        names = [item.candidate.name for item in diagnosis.added]
-        alarms += bool(names)
-        unexplained += diagnosis.verdict == "unexplained"
-        rows.append({"session": config.cable.name, "verdict": diagnosis.verdict, "added": names})
-        if names or diagnosis.verdict == "unexplained":
-            print(f"  set {done}: {config.cable.name} {diagnosis.verdict} {names}", flush=True)
-        if done % 20 == 0:
-            print(
-                f"{done} sets: {alarms} with a wrong effect, {unexplained} unexplained; median "
-                f"{np.median(seconds):.1f} s a set",
-                flush=True,
-            )
-            if args.output:
-                args.output.write_text(json.dumps(rows))
+    fit, _ = fit_declared(config, declared_model(config), measured)
+    diagnosis = diagnose(fit)
+    names = [item.candidate.name for item in diagnosis.added]
+    return {"session": config.cable.name, "verdict": diagnosis.verdict, "added": names}
 
 
 if __name__ == "__main__":

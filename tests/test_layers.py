@@ -23,8 +23,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "diagnosis": MECHANICS | {"config", "measurements", "estimation"} | PARALLEL,
     "codegen": MECHANICS | {"config"},
     "durable": {"errors"},
-    "executors": {"errors"},
-    "parallel": {"errors", "executors", "vision"},
+    "workers": {"vision"},
+    "executors": {"errors", "workers"},
+    "parallel": {"errors", "executors", "workers"},
 }
 # A session: what is declared and measured -> stages and findings -> one outcome.
 MAY_IMPORT["session"] = set(MAY_IMPORT)
@@ -32,6 +33,7 @@ MAY_IMPORT["report"] = set(MAY_IMPORT)
 MAY_IMPORT["shape_table"] = MECHANICS | {"codegen", "durable", "parallel"}
 MAY_IMPORT["fleet"] = set(MAY_IMPORT)
 MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}
+MAY_IMPORT["api"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 

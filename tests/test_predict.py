@@ -135,17 +135,6 @@ def test_ends_that_do_not_suit_the_cable(request, file, ends, message):
         predict(request.getfixturevalue(file), **ends)
 
 
-def test_the_example_of_the_readme_runs(pinned, monkeypatch):
-    """Word for word, where results/cable/parameters.yaml is."""
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(blocks) == 1
-    monkeypatch.chdir(pinned.parents[2])
-    names = {}
-    exec(blocks[0], names)
-
-    assert names["shape"].points(101).shape == (101, 2)
-
-
 def test_the_configuration_of_the_readme_is_one(tmp_path):
     (block,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     (tmp_path / "config.yaml").write_text(block)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from types import ModuleType
 
@@ -68,8 +69,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"dlo {__version__}")
         return OK
-    said = f"no subcommand is called {arguments[0]!r}\n\n" if arguments else ""
-    print(said + _overview(), file=sys.stderr)
+    if arguments:
+        near = get_close_matches(arguments[0], COMMANDS, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        print(f"no subcommand is called {arguments[0]!r}{hint}\n", file=sys.stderr)
+    print(_overview(), file=sys.stderr)
     return BAD_INPUT
 
 

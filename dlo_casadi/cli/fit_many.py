@@ -54,24 +54,28 @@ def main(argv: Sequence[str]) -> int:
     base, sessions = find_sessions(chosen.where)
     output = chosen.output or Path("results") / f"fleet-{base.name}"
     options = Options(diagnosis=not chosen.no_diagnosis, reports=not chosen.no_reports)
-    with (
-        Counter(Console(stderr=True), "sessions", chosen.quiet) as counter,
-        open_executor(chosen.jobs, chosen.scheduler, output / "logs") as executor,
-    ):
+    try:
+        with (
+            Counter(Console(stderr=True), "sessions", chosen.quiet) as counter,
+            open_executor(chosen.jobs, chosen.scheduler, output / "logs") as executor,
+        ):
 
-        def begin(taken_over: int, left: int) -> None:
-            before = f", {taken_over} are finished" if taken_over else ""
-            counter.message(f"{len(sessions)} sessions{before}; results in {output}")
+            def begin(taken_over: int, left: int) -> None:
+                before = f", {taken_over} are finished" if taken_over else ""
+                counter.message(f"{len(sessions)} sessions{before}; results in {output}")
 
-        result = fit_fleet(
-            sessions,
-            output,
-            executor,
-            options,
-            retry_failed=chosen.retry_failed,
-            begin=begin,
-            progress=counter.show,
-        )
+            result = fit_fleet(
+                sessions,
+                output,
+                executor,
+                options,
+                retry_failed=chosen.retry_failed,
+                begin=begin,
+                progress=counter.show,
+            )
+    except KeyboardInterrupt:
+        console(chosen.quiet).print("What is finished is kept: the same command goes on.")
+        raise
     if chosen.json:
         print_json(list(result.rows))
     else:

@@ -16,7 +16,7 @@ def main(argv: Sequence[str]) -> int:
     """Run `dlo reproduce [-- OPTION ...]`."""
     parser = command(
         "reproduce",
-        "Compare with the paper of Quartaro et al.: runs scripts/reproduce_paper.py of the checkout.",
+        "Compare with the paper of Quartaro et al.; runs scripts/reproduce_paper.py of a checkout.",
         EXAMPLES,
         "others are the script's own",
     )

@@ -41,7 +41,7 @@ class Watch:
     _bars: Progress | None = None
     _tasks: dict[str, TaskID] = field(default_factory=dict)
     _begun: dict[str, float] = field(default_factory=dict)
-    _spoken: float = field(default_factory=time.perf_counter)
+    _spoken: float = 0.0
 
     def __enter__(self) -> Watch:
         if not self.quiet and self.console.is_terminal:
@@ -68,6 +68,7 @@ class Watch:
         name, detail = ("read the poses", name[5:]) if name.startswith("read ") else (name, "")
         first = name not in self._begun
         begun = self._begun.setdefault(name, time.perf_counter())
+        self._spoken = max(self._spoken, begun)
         if self.quiet:
             return
         if self._bars is not None:

@@ -135,9 +135,11 @@ def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) ->
             continue
         distance = math.dist(pose.start, pose.end)
         if distance > cable.length + slack:
+            meant = ", ".join(f"{x / 1e3:g}" for x in pose.end)
+            hint = f" Did you mean ({meant})?" if 10 * cable.length < distance else ""
             reasons[pose.name] = (
                 f"end ({pose.end[0]:g}, {pose.end[1]:g}) m is {distance:.4g} m from the start; "
-                f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?"
+                f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?{hint}"
             )
     return reasons
 

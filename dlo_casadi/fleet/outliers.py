@@ -83,10 +83,10 @@ def _reasons(row: Row, stiffness: float | None, error: float | None) -> tuple[st
     if row["verdict"] == "unexplained":
         reasons.append("unexplained")
     if stiffness is not None and abs(stiffness) > OUTLYING:
-        reasons.append("stiffer than the others" if stiffness > 0 else "softer than the others")
+        reasons.append("stiffer" if stiffness > 0 else "softer")
     # Of errors only large ones are odd.
     if error is not None and error > OUTLYING:
-        reasons.append("larger error than the others")
+        reasons.append("larger error")
     return tuple(reasons)
 
 

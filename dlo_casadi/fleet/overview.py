@@ -19,8 +19,9 @@ body { margin: 2rem auto; max-width: 80rem; padding: 0 1rem; }
 h1 { font-size: 1.4rem; margin: 0 0 .3rem; } p { margin: .3rem 0 1rem; max-width: 60rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid var(--line); }
-th { vertical-align: bottom; } .text { text-align: left; overflow-wrap: anywhere; }
+th, td { padding: .3rem .6rem; text-align: right; border-bottom: 1px solid var(--line); }
+td { white-space: nowrap; vertical-align: top; } th { vertical-align: bottom; }
+.text { text-align: left; } .long { white-space: normal; min-width: 11rem; }
 .odd { color: var(--odd); font-weight: 600; } .good { color: var(--good); }
 pre { white-space: pre-wrap; margin: 0; font: inherit; }
 """
@@ -84,22 +85,22 @@ def _line(item: Judged, output: Path) -> str:
     if row["status"] != "done":
         text = f'<pre class="odd">{escape(str(row["message"]))}</pre>'
         return (
-            f'<tr><td class="text">{name}</td><td class="text"></td><td class="text">{odd}</td>'
-            f'<td class="text" colspan="{len(HEAD) - 3}">{text}</td></tr>'
+            f'<tr><td class="text long">{name}</td><td></td><td class="text">{odd}</td>'
+            f'<td class="text long" colspan="{len(HEAD) - 3}">{text}</td></tr>'
         )
     verdict = str(row["verdict"])
     error = last_error(row)
     cells = (
-        ("text", name),
+        ("text long", name),
         ("text good" if verdict == "complete" else "text", escape(verdict.replace("_", " "))),
         ("text", odd),
         ("", _number(row["bending_stiffness"], "{:.4g}")),
         ("", _interval(row)),
-        (_score(item.stiffness_z), _number(item.stiffness_z, "{:+.1f}")),
+        (_score(item.stiffness_z), _number(item.stiffness_z, "{:+z.1f}")),
         ("", _number(error, "{:.2f}", 1e3)),
-        (_score(max(item.error_z or 0.0, 0.0)), _number(item.error_z, "{:+.1f}")),
+        (_score(max(item.error_z or 0.0, 0.0)), _number(item.error_z, "{:+z.1f}")),
         ("", _number(row["noise_std"], "{:.2f}", 1e3)),
-        ("text", escape(", ".join(_effect(effect) for effect in row["effects"]))),
+        ("text long", escape(", ".join(_effect(effect) for effect in row["effects"]))),
         ("", _number(row["time_session_s"], "{:.1f}")),
     )
     return "<tr>" + "".join(f'<td class="{kind}">{text}</td>' for kind, text in cells) + "</tr>"
@@ -108,10 +109,11 @@ def _line(item: Judged, output: Path) -> str:
 def _link(row: Row, output: Path) -> str:
     """The session's page: of its results, or of why there are none."""
     key = str(row["session"])
+    text = escape(key).replace("/", "/<wbr>")
     for name in ("report.html", "report.json") if row["status"] == "done" else ("failed.html",):
         if (output / "sessions" / key / name).is_file():
-            return f'<a href="{quote(f"sessions/{key}/{name}")}">{escape(key)}</a>'
-    return escape(key)
+            return f'<a href="{quote(f"sessions/{key}/{name}")}">{text}</a>'
+    return text
 
 
 def _number(value: float | None, form: str, factor: float = 1.0) -> str:

@@ -46,11 +46,18 @@ _DPI = 150
 @contextmanager
 def figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
     """Open a figure of a size [inch] and save it to a file when it is drawn."""
+    with styled(size) as drawing:
+        yield drawing
+        drawing.savefig(path, dpi=_DPI)
+
+
+@contextmanager
+def styled(size: tuple[float, float]) -> Iterator[Figure]:
+    """Open a figure of a size [inch], to be drawn in the style of all figures."""
     with mpl.rc_context(_STYLE):
         drawing = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(drawing)
         yield drawing
-        drawing.savefig(path, dpi=_DPI)
 
 
 def before_after(outcome: Outcome) -> tuple[Stage | None, Stage | None]:

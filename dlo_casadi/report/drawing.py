@@ -6,56 +6,70 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from dlo_casadi.report.canvas import BLACK, BLUE, GREY, VERMILLION, figure
+from dlo_casadi.report.canvas import BLACK, BLUE, GREY, VERMILLION, figure, styled
+
+_SIZE = (7.0, 6.0)
 
 
 def draw_prediction(path: Path, shape: dict[str, Any]) -> None:
-    """Draw a predicted shape with the forces on its fixtures.
+    """Draw a predicted shape with the forces on its fixtures into a file.
 
     Parameters
     ----------
     shape : dict
         As from `PredictedShape.as_dict`.
     """
+    with figure(path, _SIZE) as drawing:
+        _draw(drawing, shape)
+
+
+def prediction_figure(shape: dict[str, Any]) -> Figure:
+    """The same as a figure."""
+    with styled(_SIZE) as drawing:
+        _draw(drawing, shape)
+    return drawing
+
+
+def _draw(drawing: Figure, shape: dict[str, Any]) -> None:
     points = np.array(shape["points"])
     forces = {"start": np.array(shape["force_on_start"]), "end": np.array(shape["force_on_end"])}
     largest = max(float(np.hypot(*force)) for force in forces.values())
     span = float(np.ptp(points, axis=0).max())
     reach = 0.25 * span / max(largest, 1e-12)
-    with figure(path, (7.0, 6.0)) as drawing:
-        axes = drawing.subplots()
-        axes.plot(*points.T, color=BLUE, lw=2.5, label="cable")
-        for at, (side, force) in zip((points[0], points[-1]), forces.items(), strict=True):
-            held = side == "start" or shape["end"] is not None
-            if not held:
-                continue
-            axes.plot(*at, "s" if side == "start" else "o", color=BLACK, ms=7, label=side)
-            size = float(np.hypot(*force))
-            if size <= 1e-3 * largest or largest == 0:
-                continue
-            tip = at + reach * force
-            arrow = {"arrowstyle": "-|>", "color": VERMILLION, "lw": 1.8}
-            axes.annotate("", xy=(tip[0], tip[1]), xytext=(at[0], at[1]), arrowprops=arrow)
-            axes.annotate(
-                f"{size:.3g} N",
-                xy=(tip[0], tip[1]),
-                xytext=(8 * force[0] / size, 10 * force[1] / size),
-                textcoords="offset points",
-                color=VERMILLION,
-                ha="left" if force[0] > 0 else "right",
-                va="bottom" if force[1] > 0 else "top",
-            )
-            axes.plot(*tip, alpha=0)  # an annotation does not count for the axes' limits
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.12)
-        axes.set(xlabel="x [m]", ylabel="y [m]")
-        axes.plot([], [], color=VERMILLION, label="force of the cable on its fixtures")
-        drawing.legend(loc="outside lower center", ncols=4)
-        state = "stable" if shape["stable"] else "NOT stable"
-        axes.set_title(
-            f"energy {shape['energy']:.4g} J, smallest bend radius "
-            f"{1e3 * shape['min_bend_radius']:.3g} mm, {state}",
-            color=GREY if shape["stable"] else VERMILLION,
+    axes = drawing.subplots()
+    axes.plot(*points.T, color=BLUE, lw=2.5, label="cable")
+    for at, (side, force) in zip((points[0], points[-1]), forces.items(), strict=True):
+        held = side == "start" or shape["end"] is not None
+        if not held:
+            continue
+        axes.plot(*at, "s" if side == "start" else "o", color=BLACK, ms=7, label=side)
+        size = float(np.hypot(*force))
+        if size <= 1e-3 * largest or largest == 0:
+            continue
+        tip = at + reach * force
+        arrow = {"arrowstyle": "-|>", "color": VERMILLION, "lw": 1.8}
+        axes.annotate("", xy=(tip[0], tip[1]), xytext=(at[0], at[1]), arrowprops=arrow)
+        axes.annotate(
+            f"{size:.3g} N",
+            xy=(tip[0], tip[1]),
+            xytext=(8 * force[0] / size, 10 * force[1] / size),
+            textcoords="offset points",
+            color=VERMILLION,
+            ha="left" if force[0] > 0 else "right",
+            va="bottom" if force[1] > 0 else "top",
         )
-        drawing.suptitle(f"{shape['cable']}: predicted shape", fontsize=12)
+        axes.plot(*tip, alpha=0)  # an annotation does not count for the axes' limits
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.12)
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.plot([], [], color=VERMILLION, label="force of the cable on its fixtures")
+    drawing.legend(loc="outside lower center", ncols=4)
+    state = "stable" if shape["stable"] else "NOT stable"
+    axes.set_title(
+        f"energy {shape['energy']:.4g} J, smallest bend radius "
+        f"{1e3 * shape['min_bend_radius']:.3g} mm, {state}",
+        color=GREY if shape["stable"] else VERMILLION,
+    )
+    drawing.suptitle(f"{shape['cable']}: predicted shape", fontsize=12)

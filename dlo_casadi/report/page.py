@@ -59,6 +59,7 @@ def render(template: str, scripts: list[str], **data: Any) -> str:
 
 def units(text: str) -> str:
     """Units as they are printed: N m^2 becomes N m², and is not broken."""
+    text = text.replace(">=", "≥").replace("<=", "≤")
     return text.replace(" N m^2", "\u00a0N\u00a0m^2").replace("^2", "²").replace("^3", "³")
 
 

@@ -13,7 +13,6 @@ from bokeh.models import (
     ColumnDataSource,
     DataRange1d,
     FixedTicker,
-    HoverTool,
     Model,
     PrintfTickFormatter,
     Range1d,
@@ -23,13 +22,11 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from dlo_casadi.report.canvas import before_after, label_of
-from dlo_casadi.report.geometry import measured_line
+from dlo_casadi.report.page_boards import next_pose_chart, pull_chart
+from dlo_casadi.report.page_canvas import AFTER, BEFORE, FAINT, HELD_OUT, INK, empty_chart, hover
 from dlo_casadi.report.terminal import cross_validated
 from dlo_casadi.session.outcome import Outcome, Stage
 
-# Colours that the colour-blind can tell apart, each at least 4.5 to 1 against white.
-BEFORE, AFTER, HELD_OUT, NEXT = "#B35A00", "#0067A3", "#8C3B6C", "#9E2A00"
-INK, FAINT, GRID = "#1F2933", "#6B7280", "#E3E6EA"
 _BAND = "#E8EEF3"
 _SYMBOLS = {"fit": "circle", "cross-validated": "diamond", "held out": "square"}
 
@@ -49,28 +46,6 @@ def charts(outcome: Outcome) -> dict[str, str]:
     return {name: json.dumps(json_item(model)) for name, model in drawn.items()}
 
 
-def _figure(height: int, **options: Any) -> figure:
-    """An empty chart as wide as its place, which neither drags nor swallows the scrolling."""
-    chart = figure(
-        height=height, sizing_mode="stretch_width", toolbar_location=None, tools="", **options
-    )
-    chart.outline_line_color = None
-    chart.grid.grid_line_color = GRID
-    chart.axis.axis_label_text_font_style = "normal"
-    chart.axis.axis_label_text_font_size = "13px"
-    chart.axis.major_label_text_font_size = "12px"
-    for part in ("axis_label_text_color", "major_label_text_color"):
-        setattr(chart.axis, part, INK)
-    chart.axis.axis_line_color = FAINT
-    chart.axis.major_tick_line_color = FAINT
-    chart.axis.minor_tick_line_color = None
-    return chart
-
-
-def _hover(*rows: tuple[str, str], renderers: list[Any], **options: Any) -> HoverTool:
-    return HoverTool(tooltips=list(rows), renderers=renderers, **options)
-
-
 # ---- errors ------------------------------------------------------------------------------------
 
 
@@ -88,7 +63,7 @@ def errors_chart(outcome: Outcome) -> Model:
         rows += [(label, kind, 1e3 * value) for kind, value in values.items() if value]
     labels = [label_of(stage, outcome) for stage in outcome.stages]
     floor = 1e3 * outcome.measurement.std
-    chart = _figure(
+    chart = empty_chart(
         70 + 42 * len(labels),
         y_range=labels[::-1],
         x_axis_type="log",
@@ -111,7 +86,7 @@ def errors_chart(outcome: Outcome) -> Model:
         )
         drawn = chart.scatter("value", "y", source=source, marker=symbol, size=11, **_filled(kind))
         chart.add_tools(
-            _hover(("stage", "@stage"), ("@kind", "@value{0.0000} mm"), renderers=[drawn])
+            hover(("stage", "@stage"), ("error", "@value{0.0000} mm (@kind)"), renderers=[drawn])
         )
     return chart
 
@@ -150,7 +125,7 @@ def poses_chart(outcome: Outcome) -> Model:
             known = {name: shape.rmse for name, shape in stage.shapes.items() if shape.rmse}
             errors = [1e3 * known.get(name, np.nan) for name in names]
             found.append((stage, color, marker, errors))
-    chart = _figure(
+    chart = empty_chart(
         70 + 24 * max(3, len(names)),
         y_range=names[::-1],
         x_axis_type="log",
@@ -189,7 +164,7 @@ def poses_chart(outcome: Outcome) -> Model:
             )
         )
     chart.add_tools(
-        _hover(("pose", "@pose (@role)"), ("@stage", "@value{0.0000} mm"), renderers=drawn),
+        hover(("pose", "@pose (@role)"), ("error", "@value{0.0000} mm (@stage)"), renderers=drawn),
         TapTool(renderers=drawn),
     )
     return chart
@@ -206,11 +181,11 @@ def residuals_chart(outcome: Outcome) -> Model:
     for kind, stage, color in (("before", before, BEFORE), ("after", after, AFTER)):
         if stage is None:
             continue
-        chart = _figure(
+        chart = empty_chart(
             230 if kind == "before" else 260,
             x_range=across,
             y_range=DataRange1d(range_padding=0.08),
-            title=label_of(stage, outcome),
+            title=f"{kind}: {label_of(stage, outcome)}",
             y_axis_label="residual [noise std]",
         )
         chart.title.text_color = INK
@@ -255,14 +230,14 @@ def _residual_lines(chart: figure, kind: str, stage: Stage, outcome: Outcome, co
     chart.line("s", "r", source=chosen, line_color=color, line_width=2.5)
     points = chart.scatter("s", "r", source=chosen, size=4, fill_color=color, line_color=None)
     chart.add_tools(
-        _hover(
+        hover(
             ("pose", "@pose (@role)"),
-            ("s", "$data_x{0.000} m"),
-            ("residual", "$data_y{0.0} std"),
+            ("s", "$snap_x{0.000} m"),
+            ("residual", "$snap_y{0.0} std"),
             renderers=[thin],
             line_policy="nearest",
         ),
-        _hover(("s", "@s{0.000} m"), ("residual", "@r{0.00} std"), renderers=[points]),
+        hover(("s", "@s{0.000} m"), ("residual", "@r{0.00} std"), renderers=[points]),
     )
 
 
@@ -272,7 +247,7 @@ def _residual_lines(chart: figure, kind: str, stage: Stage, outcome: Outcome, co
 def rest_chart(outcome: Outcome) -> Model:
     """Rest curvature of the last stage with its band, and of the fit that it improves on."""
     before, after = before_after(outcome)
-    chart = _figure(
+    chart = empty_chart(
         280,
         x_range=Range1d(0.0, outcome.config.cable.length),
         x_axis_label="arc length from the start s [m]",
@@ -295,167 +270,12 @@ def rest_chart(outcome: Outcome) -> Model:
         chart.varea("s", "low", "high", source=source, fill_color=AFTER, fill_alpha=0.22)
         drawn = chart.line("s", "value", source=source, line_color=AFTER, line_width=2.5)
         chart.add_tools(
-            _hover(
+            hover(
                 ("s", "@s{0.000} m"),
                 ("rest curvature", "@value{0.000} 1/m"),
                 ("95 % band", "@low{0.000} to @high{0.000}"),
                 renderers=[drawn],
                 mode="vline",
-            )
-        )
-    return chart
-
-
-# ---- boards ------------------------------------------------------------------------------------
-
-
-def _board(outcome: Outcome) -> figure:
-    """The board with one scale on both axes, and the measured cables on it."""
-    ends = [
-        [point for point in (pose.start, pose.end) if point is not None]
-        for pose in outcome.config.experiment.poses
-    ]
-    drawn = np.concatenate([*ends, *(pose.points for pose in outcome.poses if len(pose.points))])
-    across, down = np.ptp(drawn, axis=0)
-    chart = _figure(
-        440,
-        match_aspect=True,
-        x_range=DataRange1d(range_padding=0.08),
-        y_range=DataRange1d(range_padding=0.08),
-        x_axis_label="x [m]",
-        y_axis_label="y [m]",
-    )
-    chart.sizing_mode = "scale_width"
-    chart.aspect_ratio = float(np.clip(across / max(down, 1e-9), 0.8, 1.8))
-    measured = [pose for pose in outcome.poses if len(pose.points)]
-    source = ColumnDataSource(
-        {
-            "x": [pose.points[:: max(1, len(pose.points) // 60), 0] for pose in measured],
-            "y": [pose.points[:: max(1, len(pose.points) // 60), 1] for pose in measured],
-            "pose": [pose.name for pose in measured],
-        }
-    )
-    lines = chart.multi_line("x", "y", source=source, line_color="#9AA5B1", line_width=1.2)
-    chart.add_tools(_hover(("measured", "@pose"), renderers=[lines]))
-    board = getattr(outcome.config.experiment.measurement, "board", None)
-    if board is not None:
-        centers = np.array(list(board.marker_centers.values()))
-        chart.rect(
-            centers[:, 0],
-            centers[:, 1],
-            board.marker_size,
-            board.marker_size,
-            fill_color="#C9D0D8",
-            line_color=FAINT,
-        )
-    return chart
-
-
-def next_pose_chart(outcome: Outcome) -> Model:
-    """Where to hold the end in the next photograph, among those that were taken."""
-    assert outcome.next_pose is not None
-    chart = _board(outcome)
-    poses = [pose for pose in outcome.config.experiment.poses if pose.end is not None]
-    starts = np.unique(np.array([pose.start for pose in poses]), axis=0)
-    ends = ColumnDataSource(
-        {
-            "x": [pose.end[0] for pose in poses if pose.end],
-            "y": [pose.end[1] for pose in poses if pose.end],
-            "pose": [pose.name for pose in poses],
-        }
-    )
-    held = chart.scatter(
-        "x",
-        "y",
-        source=ends,
-        marker="circle",
-        size=9,
-        fill_color="white",
-        line_color=INK,
-        line_width=1.5,
-    )
-    chart.scatter(starts[:, 0], starts[:, 1], marker="square", size=11, color=INK)
-    x, y = outcome.next_pose["end"]
-    proposal = ColumnDataSource({"x": [x], "y": [y]})
-    star = chart.scatter(
-        "x", "y", source=proposal, marker="star", size=26, fill_color=NEXT, line_color="white"
-    )
-    chart.text(
-        [x],
-        [y],
-        text=["next end"],
-        x_offset=16,
-        y_offset=-10,
-        text_color=NEXT,
-        text_font_size="14px",
-        text_font_style="bold",
-        background_fill_color="white",
-        background_fill_alpha=0.85,
-        padding=3,
-    )
-    chart.add_tools(
-        _hover(("end of", "@pose"), ("at", "(@x{0.000}, @y{0.000}) m"), renderers=[held]),
-        _hover(("next end", "(@x{0.000}, @y{0.000}) m"), renderers=[star]),
-    )
-    return chart
-
-
-def pull_chart(outcome: Outcome) -> Model:
-    """Where the cable is pulled, and how, in each fit pose."""
-    load = outcome.unexplained
-    assert load is not None
-    names = load.get("poses") or [
-        pose.name for pose in outcome.poses if pose.role == "fit" and len(pose.points)
-    ]
-    forces = np.array(load["force_per_pose"], dtype=float).reshape(-1, 2)
-    largest = max(float(np.hypot(*forces.T).max(initial=0.0)), 1e-12)
-    reach = 0.25 * outcome.config.cable.length / largest
-    chart = _board(outcome)
-    rows: list[dict[str, Any]] = []
-    parts: list[tuple[np.ndarray, np.ndarray]] = []
-    for name, force in zip(names, forces, strict=False):
-        line = measured_line(outcome, name)
-        if line is None:
-            continue
-        places, points = line
-        pulled = np.linspace(load["interval_95"][0], load["interval_95"][1], 9)
-        parts.append(
-            (np.interp(pulled, places, points[:, 0]), np.interp(pulled, places, points[:, 1]))
-        )
-        root = np.array([np.interp(load["position"], places, points[:, i]) for i in (0, 1)])
-        tip = root + reach * force
-        size = float(np.hypot(*force))
-        rows.append(
-            {
-                "pose": name,
-                "x0": root[0],
-                "y0": root[1],
-                "x1": tip[0],
-                "y1": tip[1],
-                "fx": force[0],
-                "fy": force[1],
-                "size": size,
-                "angle": float(np.arctan2(force[1], force[0])) - np.pi / 2,
-            }
-        )
-    chart.multi_line(
-        [x for x, _ in parts],
-        [y for _, y in parts],
-        line_color=AFTER,
-        line_width=6,
-        line_cap="butt",
-    )
-    source = ColumnDataSource({key: [row[key] for row in rows] for key in rows[0]} if rows else {})
-    if rows:
-        shafts = chart.segment("x0", "y0", "x1", "y1", source=source, line_color=NEXT, line_width=2)
-        heads = chart.scatter(
-            "x1", "y1", source=source, marker="triangle", size=11, angle="angle", color=NEXT
-        )
-        chart.add_tools(
-            _hover(
-                ("pose", "@pose"),
-                ("force", "(@fx{0.000}, @fy{0.000}) N, @size{0.000} N"),
-                renderers=[shafts, heads],
             )
         )
     return chart

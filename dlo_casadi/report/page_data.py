@@ -72,7 +72,7 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
 
 def sentence(line: str) -> str:
     """A line of the terminal as a sentence of its own."""
-    text = line.removeprefix("Verdict: ")
+    text = line.removeprefix("Verdict: ").removeprefix("unexplained. ").removeprefix("complete. ")
     return text[:1].upper() + text[1:]
 
 

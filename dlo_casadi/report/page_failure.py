@@ -12,7 +12,7 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError
 from dlo_casadi.report.page import page_script, render
-from dlo_casadi.report.page_data import configuration_text
+from dlo_casadi.report.page_data import configuration_text, sentence
 from dlo_casadi.report.page_pictures import pictures_of_failure
 from dlo_casadi.session.outcome import PoseInput
 
@@ -62,7 +62,7 @@ def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = (
         title=config.cable.name,
         config_name=config.name,
         kind=type(error).__name__,
-        heading=heading,
+        heading=sentence(heading),
         rest=rest,
         hints=hints([error.message, *(pose.problem for pose in shown)]),
         read=sum(len(pose.points) > 0 for pose in shown),

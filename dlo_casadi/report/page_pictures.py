@@ -71,7 +71,7 @@ class Picture:
     grid : tuple of (x1, y1, x2, y2)
         Lines of the board, every 100 mm.
     start, end : (u, v) or None
-        Where the predicted cable begins and ends.
+        Where the cable begins and ends: predicted, or declared where nothing was.
     facts : tuple of (kind, name, text)
         The kind is that of the line that a fact is about.
     notes : tuple of str
@@ -110,21 +110,32 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Picture]:
     """A picture of every pose of a run that has failed, with what was measured until then."""
+    declared = {pose.name: pose for pose in config.experiment.poses}
+    backgrounds = _backgrounds(config, poses, [])
     drawn = []
-    for pose, (box, place, photograph) in zip(poses, _backgrounds(config, poses, []), strict=True):
+    for pose, (box, place, photograph) in zip(poses, backgrounds, strict=True):
         measured = _placed(pose, place)
+        found = len(measured) > 0
+        held = [declared[pose.name].start, declared[pose.name].end]
+        ends = [
+            None if at is None or place is None else _point(np.asarray(place(np.array([at])))[0])
+            for at in held
+        ]
+        seen = [measured, np.array([at for at in ends if at is not None]).reshape(-1, 2)]
         drawn.append(
             Picture(
                 name=pose.name,
                 role=pose.role,
                 alt=f"{_what(photograph)}, pose {pose.name}"
-                + (", with the measured line." if len(measured) else ": no cable was measured."),
-                box=_about(box, [measured]) if photograph else box,
+                + (", with the measured line." if found else ": no cable was measured."),
+                box=_about(box, seen) if photograph else box,
                 whole=box,
                 photograph=photograph,
                 grid=() if photograph else _grid(box),
-                lines=(Line("measured", _svg(measured, 2)),) if len(measured) else (),
-                facts=(("measured", "measured", _seen(pose)),) if len(measured) else (),
+                lines=(Line("measured", _svg(measured, 2)),) if found else (),
+                start=ends[0],
+                end=ends[1],
+                facts=(("measured", "measured", _seen(pose)),) if found else (),
                 problem=pose.problem,
                 notes=pose.messages,
             )

@@ -297,6 +297,11 @@ def load_parameters(path: str | Path) -> Parameters:
         raise ConfigError(f"damaged parameters: {error}", source) from None
 
 
+def parameters_of(outcome: Outcome) -> Parameters:
+    """The fitted cable of a run, as `load_parameters` would read it from the run's file."""
+    return _rebuild(parameters_dict(outcome), outcome.config.path)
+
+
 def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     declared, rows = document["cable"], document["parameters"]
     cable = Cable(

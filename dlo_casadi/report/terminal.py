@@ -342,20 +342,8 @@ def prediction_table(shape: dict[str, Any], notes: Iterable[str] = ()) -> Render
     table = _table(f"{shape['cable']}: predicted shape")
     table.add_column("quantity")
     table.add_column("value")
-    for side in ("start", "end"):
-        at = shape[side]
-        if at is None:
-            table.add_row(side, "free")
-            continue
-        x, y = shape[f"force_on_{side}"]
-        table.add_row(side, f"({at[0]:g}, {at[1]:g}) m")
-        table.add_row(f"force of the cable on its {side}", f"({x:.4g}, {y:.4g}) N")
-        if shape[f"{side}_heading"] is not None:
-            moment = shape[f"moment_on_{side}"]
-            table.add_row(f"moment of the cable on its {side}", f"{moment:.4g} N m")
-    table.add_row("energy", f"{shape['energy']:.6g} J")
-    table.add_row("smallest bend radius", _mm(shape["min_bend_radius"]))
-    table.add_row("stable", "yes" if shape["stable"] else "NO: the cable would not stay there")
+    for row in prediction_rows(shape):
+        table.add_row(*row)
     points = _table("Points from start to end")
     for column in ("s [m]", "x [m]", "y [m]"):
         points.add_column(column, justify="right")
@@ -364,6 +352,26 @@ def prediction_table(shape: dict[str, Any], notes: Iterable[str] = ()) -> Render
         if k % max(1, (count - 1) // 10) == 0:
             points.add_row(f"{shape['length'] * k / (count - 1):.4f}", f"{x:.5f}", f"{y:.5f}")
     return Group(table, points, *(Text(note) for note in notes))
+
+
+def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
+    """Quantities of a predicted pose, as from `PredictedShape.as_dict`, and their values."""
+    rows = []
+    for side in ("start", "end"):
+        at = shape[side]
+        if at is None:
+            rows.append((side, "free"))
+            continue
+        x, y = shape[f"force_on_{side}"]
+        rows.append((side, f"({at[0]:g}, {at[1]:g}) m"))
+        rows.append((f"force of the cable on its {side}", f"({x:.4g}, {y:.4g}) N"))
+        if shape[f"{side}_heading"] is not None:
+            moment = shape[f"moment_on_{side}"]
+            rows.append((f"moment of the cable on its {side}", f"{moment:.4g} N m"))
+    rows.append(("energy", f"{shape['energy']:.6g} J"))
+    rows.append(("smallest bend radius", _mm(shape["min_bend_radius"])))
+    stable = "yes" if shape["stable"] else "NO: the cable would not stay there"
+    return [*rows, ("stable", stable)]
 
 
 def plus_minus(value: float, std: float) -> str:

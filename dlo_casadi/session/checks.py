@@ -34,6 +34,8 @@ NEVERTHELESS = (
 
 # Elements, poses and stiffnesses (over the declared one) that show which way a cable hangs.
 _MESH, _POSES = 12, 6
+# Of the length: no other explanation is looked for once one comes so near.
+_CLEAR = 0.02
 _STIFFNESSES = sorted(10.0 ** np.arange(-2.0, 2.1, 0.5), key=lambda factor: abs(np.log(factor)))
 
 
@@ -120,11 +122,18 @@ def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicio
         for item in measured
     ]
     x, y = model.gravity
-    found = {"y pointing up in the points, which now points down": _distance(model, mirrored)}
+    others: dict[str, tuple[CableModel, list[MeasuredPose]]] = {}
     for turned in ((-x, -y), (y, -x), (-y, x)):
         said = f"gravity ({turned[0] + 0.0:g}, {turned[1] + 0.0:g}) m/s^2"
-        found[said] = _distance(replace(model, gravity=turned), measured)
-    what, rms = min(found.items(), key=lambda item: item[1])
+        others[said] = (replace(model, gravity=turned), measured)
+    others["y pointing up in the points, which now points down"] = (model, mirrored)
+    what, rms = "", np.inf
+    for said, (other, points) in others.items():
+        distance = _distance(other, points, _CLEAR * length)
+        if distance < rms:
+            what, rms = said, distance
+        if rms < _CLEAR * length:
+            break
     if rms > MUCH_BETTER * own:
         return ()
     return (

@@ -199,15 +199,16 @@ def _turned(config: Config, pose: DeclaredPose, image: np.ndarray) -> str:
     measurement = config.experiment.measurement
     if measurement.kind != "images" or measurement.reference is None:
         return ""
-    for quarters in (2, 1, 3):
+    turns = {2: "180 degrees", 1: "90 degrees counter-clockwise", 3: "90 degrees clockwise"}
+    for quarters, how in turns.items():
         turned = np.ascontiguousarray(np.rot90(image, quarters))
         try:
             _extract(config, pose, turned, view_of(config, turned))
         except MeasurementError:
             continue
         return (
-            f" The cable is found once the photograph is turned by {90 * quarters} degrees "
-            "counter-clockwise: turn it, or read the reference's pixels again."
+            f" The cable is found once the photograph is turned by {how}: turn it, or read the "
+            "reference's pixels again."
         )
     return ""
 

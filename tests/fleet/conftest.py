@@ -1,10 +1,6 @@
 """A fleet of tiny sessions and its table, computed in this process."""
 
 import pytest
-
-pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-casadi[table]'")
-
-import pyarrow.parquet as pq
 from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.executors import InProcess
@@ -22,6 +18,8 @@ def fleet(tmp_path_factory):
 @pytest.fixture(scope="session")
 def expected(fleet, tmp_path_factory):
     """Rows of the table without interruption, one session after the other."""
+    import pyarrow.parquet as pq
+
     output = tmp_path_factory.mktemp("in_process")
     fit_fleet(find_sessions(fleet)[1], output, InProcess(), QUICK)
     return without_times(pq.read_table(output / "table.parquet"))

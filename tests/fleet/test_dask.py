@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-casadi[table]'")
 pytest.importorskip("distributed", reason="needs Dask: pip install 'dlo-casadi[dask]'")
 
 import pyarrow.parquet as pq

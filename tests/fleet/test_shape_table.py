@@ -5,9 +5,12 @@ import pickle
 from pathlib import Path
 
 import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-casadi[table]'")
+
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
 from tiny_sessions import write_session
 
 from dlo_casadi.cli import main

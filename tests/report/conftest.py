@@ -1,4 +1,4 @@
-"""One small session, run once, that all tests of the report look at."""
+"""Small sessions, each run once, that all tests of the report look at."""
 
 import os
 
@@ -6,7 +6,7 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(variable, "1")  # before numpy: the matrices are small
 
 import pytest  # noqa: E402
-from small_sessions import small  # noqa: E402
+from small_sessions import photographs, small  # noqa: E402
 
 from dlo_casadi.session import run_session  # noqa: E402
 
@@ -14,3 +14,8 @@ from dlo_casadi.session import run_session  # noqa: E402
 @pytest.fixture(scope="session")
 def outcome():
     return run_session(small("short_clean"))
+
+
+@pytest.fixture(scope="session")
+def photographed():
+    return run_session(photographs(("pose_01", "pose_03", "pose_04", "pose_05", "pose_09")))

@@ -6,11 +6,24 @@ from pathlib import Path
 from dlo_casadi.config import load_config
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
+CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def small(name):
     """Configuration of a quick run of a bench session."""
-    config = load_config(BENCH / name / "session.yaml")
+    return quick(load_config(BENCH / name / "session.yaml"))
+
+
+def photographs(names):
+    """Configuration of a quick run of a few photographs of configs/cable.yaml."""
+    config = load_config(CONFIGS / "cable.yaml")
+    poses = tuple(pose for pose in config.experiment.poses if pose.name in names)
+    experiment = config.experiment.model_copy(update={"poses": poses})
+    return quick(replace(config, experiment=experiment))
+
+
+def quick(config):
+    """The same session on a coarse mesh, without the parts that take time."""
     return replace(
         config,
         model=config.model.model_copy(update={"n": 20}),

@@ -20,10 +20,11 @@ function model(name) {
 }
 
 // A printer's page is narrower than the screen: shrink the charts while it prints.
-const PAPER = 680; // px, A4 within its margins
+const PAPER = { wide: 680, square: 480 }; // px, A4 within its margins
 addEventListener("beforeprint", () => {
   for (const chart of document.querySelectorAll(".chart")) {
-    chart.style.zoom = Math.min(1, PAPER / chart.offsetWidth);
+    const room = chart.classList.contains("square") ? PAPER.square : PAPER.wide;
+    chart.style.zoom = Math.min(1, room / chart.offsetWidth);
   }
 });
 addEventListener("afterprint", () => {

@@ -1,0 +1,117 @@
+"""What a notebook or a program calls: fit a session, and look at what came out.
+
+import dlo_casadi as dlo
+
+result = dlo.fit("configs/cable.yaml")
+print(result)
+result.plot().savefig("poses.png")
+result.predict(end=(0.3, -0.1)).points()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from dlo_casadi.config import Config, load_config
+from dlo_casadi.equilibrium import Branch
+from dlo_casadi.prediction import PredictedShape, predict
+from dlo_casadi.report.notebook import outcome_figure, outcome_html, outcome_text
+from dlo_casadi.report.parameters_file import parameters_of
+from dlo_casadi.report.writer import ResultsFolder
+from dlo_casadi.session import Outcome, Progress, run_session
+
+
+class Result(Outcome):
+    """An `Outcome` that can show itself, write itself, and predict.
+
+    In a notebook it is a short table; `print` gives the same as text.
+    """
+
+    def __str__(self) -> str:
+        return outcome_text(self)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return outcome_html(self)
+
+    def plot(self) -> Figure:
+        """All poses in one frame: measured points, and shapes predicted from their ends alone."""
+        return outcome_figure(self)
+
+    def write(self, folder: str | Path) -> Path:
+        """Write report, parameters, centre-lines and figures, as `dlo fit` does.
+
+        Earlier results in the folder are replaced by the complete new ones.
+
+        Raises
+        ------
+        DloError
+            If the folder cannot be written, or holds files of these names from elsewhere.
+        """
+        with ResultsFolder(folder, self.config) as results:
+            return results.write(self)
+
+    def predict(
+        self,
+        end: Sequence[float] | None = None,
+        *,
+        start: Sequence[float] | None = None,
+        start_heading: float | None = None,
+        end_heading: float | None = None,
+        branch: Branch | None = None,
+    ) -> PredictedShape:
+        """Predict the fitted cable's shape in a new pose: `dlo_casadi.predict` without a file."""
+        return predict(
+            parameters_of(self),
+            end,
+            start=start,
+            start_heading=start_heading,
+            end_heading=end_heading,
+            branch=branch,
+        )
+
+
+def fit(
+    config: str | Path | Config,
+    *,
+    diagnosis: bool | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Fit a cable to its photographs or centre-lines.
+
+    Parameters
+    ----------
+    config : str, Path or Config
+        A configuration file, or what `load_config` has made of one.
+    diagnosis : bool, optional
+        Whether to search for missing effects; as the configuration says by default.
+    progress : Progress, optional
+        Told how far the run has come: an object with `step(name, done, total)` and
+        `message(text)`.
+
+    Returns
+    -------
+    Result
+        Nothing is written; see `Result.write`.
+
+    Raises
+    ------
+    ConfigError
+        If the configuration cannot be used.
+    MeasurementError
+        If no pose can be read, or if the lines contradict the configuration beyond doubt.
+    EstimationError
+        If no model of the declared cable comes near the measured shapes.
+    """
+    if not isinstance(config, Config):
+        config = load_config(config)
+    if diagnosis is not None:
+        options = config.diagnosis.model_copy(update={"enabled": diagnosis})
+        config = replace(config, diagnosis=options)
+    outcome = run_session(config, progress)
+    return Result(**{field.name: getattr(outcome, field.name) for field in fields(outcome)})

@@ -1,0 +1,23 @@
+"""Write the pages of the Python API: python scripts/build_api_pages.py (docs/api/index.html)."""
+
+from pathlib import Path
+
+import pdoc
+
+import dlo_casadi
+
+MODULES = ("dlo_casadi", "dlo_casadi.effects", "dlo_casadi.vision", "dlo_casadi.parallel")
+FOLDER = Path(__file__).parents[1] / "docs/api"
+
+
+def main() -> None:
+    """Write one page for each module."""
+    for name in dlo_casadi.__all__:  # they are imported on demand, and pdoc does not ask
+        setattr(dlo_casadi, name, getattr(dlo_casadi, name))
+    pdoc.render.configure(docformat="numpy", footer_text=f"dlo_casadi {dlo_casadi.__version__}")
+    pdoc.pdoc(*MODULES, output_directory=FOLDER)
+    print(FOLDER / "index.html")
+
+
+if __name__ == "__main__":
+    main()

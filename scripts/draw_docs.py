@@ -1,0 +1,43 @@
+"""Draw the pictures of the README: python scripts/draw_docs.py (two minutes)."""
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+import dlo_casadi as dlo
+from dlo_casadi.session.measure import draw_steps
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+TITLES = {
+    "1_workplane": "1 the board's plane, within reach of the cable",
+    "2_contrast": "2 what stands out in the colour of the cable",
+    "3_strands": "3 strands, chained from start to end",
+    "4_centerline": "4 the line: blue measured, red hidden",
+}
+
+
+def draw_camera_steps() -> None:
+    """The four pictures of `dlo check --show` for a photograph with a card before the cable."""
+    config = dlo.load_config(ROOT / "tests/data/bench/orange/session.yaml")
+    pictures = draw_steps(config, config.experiment.poses[1])
+    drawing = Figure(figsize=(9, 6.4), layout="constrained")
+    for axes, (name, title) in zip(drawing.subplots(2, 2).ravel(), TITLES.items(), strict=True):
+        axes.imshow(pictures[name][..., ::-1])
+        axes.set_title(title, fontsize=10)
+        axes.set_axis_off()
+    drawing.savefig(DOCS / "camera_steps.jpg", dpi=110, pil_kwargs={"quality": 82})
+
+
+def main() -> None:
+    """Draw all of them."""
+    DOCS.mkdir(exist_ok=True)
+    draw_camera_steps()
+    result = dlo.fit(ROOT / "configs/cable.yaml")
+    result.plot().savefig(DOCS / "poses.png", dpi=100)
+    result.predict(end=(0.3, -0.1)).plot().savefig(DOCS / "shape.png", dpi=80)
+    print(result)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""The Python API: results that show themselves, predict and write themselves."""
+
+import dataclasses
+import re
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from small_sessions import small
+
+import dlo_casadi as dlo
+
+
+@pytest.fixture(scope="module")
+def result(outcome):
+    """The small session's outcome as `fit` returns it."""
+    values = {field.name: getattr(outcome, field.name) for field in dataclasses.fields(outcome)}
+    return dlo.Result(**values)
+
+
+def test_a_fit_is_that_of_the_session(outcome):
+    told = []
+
+    class Listener:
+        def step(self, name, done, total):
+            told.append(name)
+
+        def message(self, text):
+            told.append(text)
+
+    result = dlo.fit(small("short_clean"), diagnosis=False, progress=Listener())
+    assert isinstance(result, dlo.Outcome)
+    assert result.fit.p == pytest.approx(outcome.fit.p, rel=1e-9)
+    assert "fit the declared model" in told
+    assert result.candidates == ()
+
+
+def test_a_path_is_a_configuration(tmp_path):
+    with pytest.raises(dlo.ConfigError, match="no such file"):
+        dlo.fit(str(tmp_path / "rope.yaml"))
+
+
+def test_text_says_what_was_found(result):
+    text = str(result)
+    assert text.startswith("short_clean: ")
+    assert re.search(r"bending_stiffness  0\.\d+ ± 0\.\d+ N m\^2", text)
+    assert "held out  0." in text
+    assert re.search(r"noise \(estimated\)  0\.\d+ mm", text)
+    assert repr(result) == text
+    assert len(text.splitlines()) < 12
+
+
+def test_a_notebook_gets_a_table_with_everything_escaped(result):
+    cable = result.config.cable.model_copy(update={"name": "<script>&"})
+    shown = dataclasses.replace(result, config=dataclasses.replace(result.config, cable=cable))
+    html = shown._repr_html_()
+    assert "<table><tr><td>bending_stiffness</td>" in html
+    assert "&lt;script&gt;&amp;" in html
+    assert "<script>" not in html
+
+
+def test_plots_are_figures_that_leave_pyplot_alone(result):
+    before = dict(mpl.rcParams)
+    figure = result.plot()
+    assert isinstance(figure, Figure)
+    lines = figure.axes[0].get_lines()
+    drawn = [line for line in lines if len(line.get_xdata()) > 100]
+    assert len(drawn) == len(result.poses)
+    assert "held out of the fit" in {line.get_label() for line in lines}
+    assert isinstance(result.predict((0.3, -0.1)).plot(), Figure)
+    assert dict(mpl.rcParams) == before
+
+
+def test_a_result_predicts_as_its_file_does(result, tmp_path):
+    folder = result.write(tmp_path / "rope")
+    assert (folder / "report.json").exists()
+    direct, from_file = result.predict((0.3, -0.1)), dlo.predict(folder, (0.3, -0.1))
+    assert np.array_equal(direct.points(), from_file.points())
+    assert str(direct) == str(from_file)
+    text = str(direct)
+    assert "end: (0.3, -0.1) m" in text
+    assert "stable: yes" in text
+    assert "<tr><td>end</td><td>(0.3, -0.1) m</td></tr>" in direct._repr_html_()
+
+
+def test_every_public_name_is_there():
+    for name in dlo.__all__:
+        assert getattr(dlo, name).__doc__ or name == "EFFECTS", name
+    assert set(dlo.__all__) < set(dir(dlo))
+    with pytest.raises(AttributeError, match="no attribute 'fitt'"):
+        dlo.fitt  # noqa: B018

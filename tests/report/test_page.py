@@ -1,0 +1,320 @@
+"""report.html says what the outcome holds, escaped, in one file of a bounded size."""
+
+import base64
+import hashlib
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bokeh.models import HoverTool
+from PIL import Image
+from test_figures import CANDIDATES, EFFECT, LOAD
+
+from dlo_casadi.report import page_boards, page_canvas, page_charts
+from dlo_casadi.report.geometry import beside
+from dlo_casadi.report.page import as_data, breakable, page_script, report_page, units
+from dlo_casadi.report.page_charts import charts
+from dlo_casadi.report.page_data import (
+    candidate_rows,
+    configuration_text,
+    meaning,
+    page_data,
+    parameter_rows,
+    stage_rows,
+    symmetric_interval,
+)
+from dlo_casadi.report.page_pictures import PHOTOGRAPHS, photograph_of, pictures
+from dlo_casadi.session.outcome import ParameterEstimate
+
+HOSTILE = "<img src=x onerror=alert(1)></script>"
+PROPOSAL = {
+    "end": [0.1, -0.2],
+    "separates": ["lumped_mass", "point_force"],
+    "expected_difference_m": 2.5e-3,
+}
+
+
+def diagnosed(outcome, **changes):
+    """The outcome as if its diagnosis had added an effect: the last stage once more."""
+    diagnosis = outcome.config.diagnosis.model_copy(update={"enabled": True})
+    closed = replace(outcome.stage("batch"), name="closed")
+    found = {
+        "config": replace(outcome.config, diagnosis=diagnosis),
+        "stages": (*outcome.stages, closed),
+        "effects": (EFFECT,),
+        "candidates": CANDIDATES,
+        "verdict": "effect_found",
+        "next_pose": PROPOSAL,
+    }
+    return replace(outcome, **(found | changes))
+
+
+# ---- what it says ------------------------------------------------------------------------------
+
+
+def test_the_verdict_is_a_sentence(outcome):
+    data = page_data(diagnosed(outcome))
+    assert data["verdict_word"] == "Effect found"
+    assert data["sentence"] == (
+        "The declared model lacked lumped_mass; with it the residual is noise."
+    )
+    assert "These data cannot tell it from point_force." in data["details"]
+
+
+def test_a_diagnosis_that_is_switched_off_is_no_verdict(outcome):
+    data = page_data(outcome)
+    assert data["verdict_word"] == "Not diagnosed"
+    assert data["sentence"].startswith("Diagnosis: switched off")
+    assert "What the declared model may lack" not in report_page(outcome)
+
+
+def test_the_stages_have_their_errors_and_the_two_that_are_compared_their_marks(outcome):
+    rows = stage_rows(diagnosed(outcome))
+    assert [row["mark"] for row in rows] == ["", "", "", "before", "after"]
+    assert [row["validated"] for row in rows[-2:]] == ["0.5 mm", "0.1 mm"]
+    batch = outcome.stage("batch")
+    assert rows[-1]["fit"] == f"{1e3 * batch.rmse_fit:.3g} mm"
+    assert rows[-1]["held_out"] == f"{1e3 * batch.rmse_held_out:.3g} mm"
+    assert rows[-1]["chi2"] == f"{batch.chi2_per_dof:.3g}"
+    assert rows[2] | {"note": ""} == {  # Algorithm 1 did not run
+        "label": "Algorithm 1",
+        "mark": "",
+        "fit": "–",
+        "validated": "–",
+        "held_out": "–",
+        "chi2": "–",
+        "note": "",
+    }
+
+
+def test_candidates_keep_their_rank_and_rivals_are_named(outcome):
+    rows = candidate_rows(diagnosed(outcome))
+    assert [row["name"] for row in rows] == [row["name"] for row in CANDIDATES]
+    assert [row["said"] for row in rows] == [
+        "added to the model",
+        "cannot be told apart from lumped_mass",
+        "not needed",
+    ]
+    assert rows[0]["share"] == 1.0
+    assert rows[1]["share"] == pytest.approx(690 / 700)
+
+
+def test_no_candidate_explains_what_is_unexplained(outcome):
+    rows = candidate_rows(diagnosed(outcome, effects=(), verdict="unexplained"))
+    assert {row["said"] for row in rows} == {"does not explain it"}
+
+
+def test_an_effect_has_a_meaning_and_an_unknown_one_none():
+    assert meaning("lumped_mass").startswith("A compact mass on the cable")
+    assert "`" not in meaning("gravity_tilt")
+    assert meaning("no such effect") == ""
+
+
+def test_what_the_data_cannot_tell_has_no_value(outcome):
+    unknown = ParameterEstimate(1.0, 9.0, "N m^2", (0.1, None), identifiable=False)
+    bound = ParameterEstimate(0.0, 0.1, "kg", at_bound=True)
+    known = ParameterEstimate(0.5, 0.01, "m")
+    parameters = {"bending_stiffness": unknown, "lumped_mass.mass": bound, "x.position": known}
+    last = replace(outcome.stage("batch"), parameters=parameters)
+    rows = parameter_rows(replace(outcome, stages=(*outcome.stages[:-1], last)))
+
+    assert [row["doubt"] for row in rows[:3]] == ["unknown", "bound", ""]
+    assert (rows[0]["value"], rows[0]["interval"]) == (">= 0.1 N m^2", "")
+    assert rows[2]["interval"] == "0.4804 to 0.5196 m"
+    page = report_page(replace(outcome, stages=(*outcome.stages[:-1], last)))
+    assert "the data cannot tell</span>" in page
+    assert "at a bound</span>" in page
+
+
+def test_a_fixed_parameter_has_no_interval():
+    assert symmetric_interval(ParameterEstimate(0.5, 0.0, "m")) == ""
+
+
+def test_a_configuration_that_has_gone_is_said_to_be(outcome, tmp_path):
+    assert configuration_text(outcome.config) == outcome.config.path.read_text()
+    text = configuration_text(replace(outcome.config, path=tmp_path / "gone.yaml"))
+    assert text == "# gone.yaml cannot be read any more: No such file or directory"
+
+
+def test_units_and_names_are_set_for_reading():
+    assert units("0.3 N m^2 and 9.81 m/s^2") == "0.3\u00a0N\u00a0m² and 9.81 m/s²"
+    assert units(">= 2 N") == "≥ 2 N"
+    assert breakable("a_<b>.c") == "a_<wbr>&lt;b&gt;.<wbr>c"
+
+
+# ---- one file ----------------------------------------------------------------------------------
+
+
+def hostile(outcome):
+    """The outcome as if cable, file and messages had been named to do harm."""
+    name = HOSTILE.replace("/", "")
+    cable = outcome.config.cable.model_copy(update={"name": HOSTILE})
+    first, *others = outcome.config.experiment.poses
+    first = first.model_copy(update={"file": first.file.with_name(f"{name}.csv")})
+    experiment = outcome.config.experiment.model_copy(update={"poses": (first, *others)})
+    stages = tuple(
+        replace(stage, shapes={name: stage.shapes.get("pose_01"), **stage.shapes})
+        for stage in outcome.stages
+        if stage.shapes
+    )
+    poses = (replace(outcome.poses[0], name=name, messages=(HOSTILE,)), *outcome.poses[1:])
+    config = replace(outcome.config, cable=cable, experiment=experiment)
+    return replace(outcome, config=config, poses=poses, stages=stages, warnings=(HOSTILE,))
+
+
+def test_names_and_messages_are_escaped(outcome):
+    page = report_page(hostile(outcome))
+
+    assert "<img" not in page
+    assert page.count("</script>") == page.count("<script")
+    assert page.count("&lt;img src=x onerror=alert(1)&gt;") >= 5
+
+
+def test_data_cannot_end_their_script():
+    text = as_data(json.dumps({"</script>": "<!-- & -->"}))
+    assert not set("<>&") & set(text)
+    assert json.loads(text) == {"</script>": "<!-- & -->"}
+
+
+def test_the_page_may_load_nothing_and_run_its_own_scripts_alone(outcome):
+    page = report_page(outcome)
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1]
+    policy = policy.replace("&#39;", "'")
+    assert policy.startswith("default-src 'none'; img-src data:;")
+    scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
+    assert len(scripts) == 2
+    for script in scripts:
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+
+
+def test_eighteen_photographs_of_the_noisiest_kind_stay_within_six_megabytes(tmp_path):
+    """A photograph that does not compress: white noise, 1920 px wide."""
+    noise = np.random.default_rng(0).integers(0, 256, (1080, 1920, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "noise.jpg", quality=90)
+    uri, width, height = photograph_of(tmp_path / "noise.jpg", PHOTOGRAPHS // 18)
+
+    assert (width, height) == (1920, 1080)
+    library = len(page_script()) + 1.3e6
+    lines = 18 * 20e3
+    assert 18 * len(uri) + library + lines < 6e6
+    shown = Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
+    assert shown.width >= 320
+    assert shown.width / shown.height == pytest.approx(16 / 9, rel=0.01)
+
+
+def test_a_photograph_that_is_small_enough_keeps_its_size(photographed):
+    uri, width, _ = photograph_of(photographed.poses[0].image, 300_000)
+    shown = Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
+    assert shown.width == width == 1280
+
+
+def test_a_photograph_that_has_gone_is_replaced_by_the_board(photographed, tmp_path):
+    declared = photographed.config.experiment.poses
+    poses = (declared[0].model_copy(update={"file": tmp_path / "pose_01.jpg"}), *declared[1:])
+    experiment = photographed.config.experiment.model_copy(update={"poses": poses})
+    gone = replace(photographed, config=replace(photographed.config, experiment=experiment))
+    first, second = pictures(gone)[:2]
+
+    assert (first.photograph, bool(first.grid), len(first.lines)) == ("", True, 3)
+    assert second.photograph.startswith("data:image/jpeg;base64,")
+
+
+# ---- pictures and charts -----------------------------------------------------------------------
+
+
+def coordinates(text):
+    return np.array([pair.split(",") for pair in text.split()], dtype=float)
+
+
+def test_lines_lie_where_the_camera_sees_them(photographed):
+    for picture, pose in zip(pictures(photographed), photographed.poses, strict=True):
+        lines = {line.kind: line for line in picture.lines}
+        assert set(lines) == {"measured", "before", "after"}
+        # Written with two decimals; the camera step measured them at these pixels.
+        assert coordinates(lines["measured"].points) == pytest.approx(pose.pixels, abs=0.02)
+        stage = photographed.stage("batch")
+        near = beside(pose, stage.shapes[pose.name], photographed.measurement.std)
+        assert coordinates(lines["after"].near) == pytest.approx(pose.to_pixels(near), abs=0.006)
+
+
+def test_the_part_that_is_shown_holds_the_cable_and_keeps_the_ratio(photographed):
+    for picture, pose in zip(pictures(photographed), photographed.poses, strict=True):
+        left, top, width, height = picture.box
+        assert width / height == pytest.approx(1280 / 720, rel=1e-3)
+        assert width <= picture.whole[2]
+        assert np.all(pose.pixels >= [left, top])
+        assert np.all(pose.pixels <= [left + width, top + height])
+
+
+def test_centre_lines_are_drawn_on_a_board_of_one_scale(outcome):
+    drawn = pictures(outcome)
+    assert {picture.photograph for picture in drawn} == {""}
+    assert len({picture.box for picture in drawn}) == 1
+    measured = next(line for line in drawn[0].lines if line.kind == "measured")
+    expected = 1e3 * outcome.poses[0].points * [1, -1]
+    assert coordinates(measured.points) == pytest.approx(expected, abs=0.006)
+
+
+def test_a_pose_that_could_not_be_read_says_why(outcome):
+    lost = replace(outcome.poses[0], points=np.zeros((0, 2)), problem="no cable found")
+    page = report_page(replace(outcome, poses=(lost, *outcome.poses[1:])))
+    assert "<strong>Not read.</strong> no cable found" in page
+    assert "pose_01 (not read)" in page
+
+
+def test_charts_are_there_for_what_the_outcome_holds(outcome):
+    always = {"chart-errors", "chart-poses", "chart-residuals", "chart-rest"}
+    assert set(charts(outcome)) == always
+    full = diagnosed(outcome, unexplained=LOAD, verdict="unexplained")
+    drawn = charts(full)
+    assert set(drawn) == always | {"chart-next", "chart-pull"}
+    assert all("NaN" not in text for text in drawn.values())
+
+
+def test_what_is_told_at_the_pointer_is_known(outcome):
+    """Every field of a tooltip is a column of all that it is told of, or the browser's own."""
+    full = diagnosed(outcome, unexplained=LOAD, verdict="unexplained")
+    drawn = [
+        page_charts.errors_chart(full),
+        page_charts.poses_chart(full),
+        page_charts.residuals_chart(full),
+        page_charts.rest_chart(full),
+        page_boards.next_pose_chart(full),
+        page_boards.pull_chart(full),
+    ]
+    tools = [tool for chart in drawn for tool in chart.select({"type": HoverTool})]
+    assert len(tools) >= 10
+    for tool in tools:
+        said = " ".join(f"{text}" for _, text in tool.tooltips)
+        assert not any("@" in name for name, _ in tool.tooltips)
+        assert set(re.findall(r"\$(\w+)", said)) <= {"snap_x", "snap_y"}
+        for drawing in tool.renderers:
+            assert set(re.findall(r"@(\w+)", said)) <= set(drawing.data_source.data), said
+
+
+def luminance(color):
+    """Relative luminance of #rrggbb (WCAG 2)."""
+    parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_colours_have_a_contrast_of_four_and_a_half():
+    """WCAG 2: (L1 + 0.05) / (L2 + 0.05) of the relative luminances."""
+    style = (Path(page_canvas.__file__).parent / "templates" / "page.css").read_text()
+    of_style = dict(re.findall(r"--([a-z]+): (#[0-9a-f]{6})", style))
+    of_charts = [
+        getattr(page_canvas, name)
+        for name in ("BEFORE", "AFTER", "HELD_OUT", "NEXT", "INK", "FAINT")
+    ]
+    on_paper = [of_style[k] for k in ("ink", "soft", "before", "after", "held", "next", "good")]
+    pairs = [(color, of_style["paper"]) for color in of_charts + on_paper]
+    pairs += [(of_style[name], of_style["ground"]) for name in ("ink", "soft", "after")]
+    for color, ground in pairs:
+        contrast = (luminance(ground) + 0.05) / (luminance(color) + 0.05)
+        assert contrast >= 4.5, (color, ground, contrast)

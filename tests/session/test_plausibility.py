@@ -1,0 +1,144 @@
+"""Suspicions on synthetic ends, and none on any session of the repository."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dlo_casadi.config import load_config
+from dlo_casadi.session.checks import find_suspicions
+from dlo_casadi.session.measure import read_inputs
+from dlo_casadi.session.plausibility import (
+    FRAMES,
+    Lines,
+    exchanged,
+    far_ends,
+    out_of_step,
+    repeated,
+    suspicions,
+    wrong_frame,
+    wrong_units,
+)
+
+ROOT = Path(__file__).parents[2]
+SESSIONS = [*ROOT.glob("tests/data/bench/*/session.yaml"), *ROOT.glob("configs/*.yaml")]
+LENGTH = 0.8  # m
+
+
+def session(count=9, seed=0):
+    """Lines that end 5 mm RMS from their fixtures, in either order."""
+    rng = np.random.default_rng(seed)
+    angle, reach = rng.uniform(-2.5, 0.5, count), rng.uniform(0.3, 0.7, count)
+    ends = np.column_stack([reach * np.cos(angle), reach * np.sin(angle)])
+    declared = np.stack([np.zeros((count, 2)), ends], axis=1)
+    measured = declared + 5e-3 * rng.standard_normal((count, 2, 2)) / np.sqrt(2)
+    measured[::2] = measured[::2, ::-1]
+    lengths = LENGTH * (1 + 0.01 * rng.standard_normal(count))
+    return Lines(tuple(f"pose_{k}" for k in range(count)), declared, measured, lengths, LENGTH)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_sound_session_raises_no_suspicion(seed):
+    assert suspicions(session(seed=seed)) == ()
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1e3, "millimetres"), (1e2, "centimetres"), (1 / 0.0254, "inches")]
+)
+def test_units_are_told_from_the_ratio_of_lengths(factor, unit):
+    lines = session()
+    points = replace(lines, measured=factor * lines.measured, lengths=factor * lines.lengths)
+    assert f"the points look like {unit}" in wrong_units(points).message
+    declared = replace(lines, length=factor * LENGTH)
+    assert f"it looks like {unit}. Try: cable.length: 0.8," in wrong_units(declared).message
+    ends = replace(lines, declared=lines.declared / factor)
+    assert f"the factor of {unit}" in wrong_units(ends).message
+
+
+def test_a_length_that_is_a_little_off_is_no_unit():
+    lines = session()
+    for factor in (0.5, 0.9, 1.1, 2.0, 10.0):
+        assert wrong_units(replace(lines, lengths=factor * lines.lengths)) is None
+
+
+@pytest.mark.parametrize("what", FRAMES)
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (1.3, 0.7)])
+def test_every_frame_is_recognised(what, shift):
+    lines = session()
+    turned = replace(lines, measured=lines.measured @ FRAMES[what] + shift)
+    (found,) = suspicions(turned)
+    assert found.certain
+    assert f"with {what}" in found.message
+    assert ("moved by (" in found.message) == any(shift)
+
+
+def test_another_origin_is_recognised():
+    lines = session()
+    (found,) = suspicions(replace(lines, measured=lines.measured + np.array([0.3, -0.2])))
+    assert found.certain
+    assert found.message.startswith("all lines lie (0.3")
+
+
+def test_two_wrong_poses_do_not_hide_a_wrong_frame():
+    lines = session(12)
+    measured = lines.measured * [1, -1]
+    measured[:2] += 0.4
+    assert "y pointing down" in wrong_frame(replace(lines, measured=measured)).message
+
+
+@pytest.mark.parametrize("order", [np.roll(np.arange(9), -1), [1, 0, *range(2, 9)]])
+def test_files_of_other_poses_are_named(order):
+    lines = session()
+    found = out_of_step(replace(lines, measured=lines.measured[order]))
+    assert found.certain
+    assert "pose_0 shows the ends of pose_1" in found.message
+
+
+def test_one_wrong_end_is_odd_but_not_certain():
+    lines = session()
+    declared = lines.declared.copy()
+    declared[3, 1] += 0.2
+    (found,) = suspicions(replace(lines, declared=declared))
+    assert not found.certain
+    assert found.message.startswith("pose_3: its line runs from")
+    assert found in far_ends(replace(lines, declared=declared))
+
+
+def test_start_and_end_exchanged_in_one_pose():
+    lines = session()
+    declared = lines.declared.copy()
+    declared[5] = declared[5, ::-1]
+    (found,) = exchanged(replace(lines, declared=declared))
+    assert found.message.startswith("pose_5: its end (0, 0) m is where the other poses")
+
+
+def test_free_ends_are_judged_by_their_start():
+    lines = session()
+    declared = lines.declared.copy()
+    declared[:, 1] = np.nan
+    free = replace(lines, declared=declared, measured=lines.declared)
+    assert suspicions(free) == ()
+    (found,) = suspicions(replace(free, measured=lines.declared + np.array([0.0, 0.3])))
+    assert "all lines lie (0, 0.3)" in found.message
+
+
+def test_the_same_points_twice():
+    points = np.random.default_rng(0).standard_normal((3, 5, 2))
+    assert repeated("abc", points) == ()
+    (found,) = repeated("abc", [points[0], points[1], points[0]])
+    assert found.message.startswith("c holds exactly the points of a")
+
+
+def label(path):
+    return path.parent.name if path.stem == "session" else path.stem
+
+
+@pytest.mark.parametrize("path", SESSIONS, ids=label)
+def test_no_session_of_the_repository_looks_like_a_mistake(path):
+    """Photographs: a few poses of each session, since reading takes time."""
+    config = load_config(path)
+    if config.experiment.measurement.kind == "images":
+        poses = config.experiment.poses[::5]
+        config = replace(config, experiment=config.experiment.model_copy(update={"poses": poses}))
+    assert find_suspicions(config, read_inputs(config, lambda *_: None)) == ()
