@@ -19,6 +19,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from benchmarks import fleet, memory, random_cables, speed
 
+from dlo_casadi.chain import ELEMENTS
+
 PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory", "fleet")
 
 
@@ -43,7 +45,7 @@ def run_growth() -> dict[str, Any]:
     """Time against n of all methods that stand it."""
     sizes = (10, 20, 50, 100, 200, 500, 1000)
     out: dict[str, Any] = {"n": sizes}
-    for element in ("link", "arc"):
+    for element in ELEMENTS:
         out[element] = [speed.generated(n, element, max(50, 2000 // n)) for n in sizes]
         per_element = np.array([row["best"] for row in out[element]]) / np.array(sizes)
         out[f"{element}_spread"] = float(per_element.max() / per_element.min())
@@ -56,7 +58,7 @@ def run_growth() -> dict[str, Any]:
 def run_random(cables: int, poses: int) -> dict[str, Any]:
     """Random cables and poses: statuses, end errors, stability by the Python model."""
     out: dict[str, Any] = {}
-    for element in ("link", "arc"):
+    for element in ELEMENTS:
         rng = np.random.default_rng(0)
         solver = random_cables.AnyCable(random_cables.random_problem(rng, 1, element=element))
         ok, wrong, worst, total, slowest = 0, 0, 0.0, 0.0, 0.0
@@ -107,6 +109,7 @@ def draw(growth: dict[str, Any], path: Path) -> None:
         ("ipopt", "IPOPT"),
         ("sqp", "sqpmethod + qrqp, generated C"),
         ("arc", "generated solver, arcs"),
+        ("quadratic", "generated solver, quadratic"),
         ("link", "generated solver, links"),
         ("bare_newton", "bare Newton, links"),
     ):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from dlo_casadi.chain import ELEMENTS
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, print_json
 from dlo_casadi.codegen import generate
@@ -28,7 +29,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--output", type=Path, required=True, help="folder for the C files")
     parser.add_argument("--prefix", default="dlo", help="begins all public names (dlo)")
     parser.add_argument("--elements", type=int, help="number of elements, instead of the fit's")
-    parser.add_argument("--element", choices=("arc", "link"), help="instead of the fit's")
+    parser.add_argument("--element", choices=ELEMENTS, help="instead of the fit's")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print files and hash as JSON")
     chosen = parser.parse_args(argv)

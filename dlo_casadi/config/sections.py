@@ -338,7 +338,8 @@ class ModelOptions(Section):
     n: Annotated[int, Field(strict=True, ge=2, le=2000)] | None = None
     """Number of elements; chosen from the data when absent."""
     element: Literal["quadratic", "arc", "link"] = "quadratic"
-    """arc (heading varies linearly in an element) or link (straight, as in the paper)."""
+    """quadratic (the heading bows in an element: fourth order), arc (it varies linearly: second
+    order, five times cheaper) or link (straight, as in the paper)."""
     effects: tuple[
         Annotated[
             DeclaredEffect,

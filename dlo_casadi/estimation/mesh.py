@@ -32,8 +32,8 @@ def on_mesh(fit: Fit, n: int) -> tuple[Sweep, Shapes, FloatArray, bool]:
 def discretization_error(fit: Fit) -> float:
     """Largest RMS distance [m] between a pose on this mesh and on an infinitely fine one.
 
-    The difference to the mesh of half the element size, times 4/3: the error of both elements
-    falls with the square of the element size (Richardson).
+    The difference to the mesh of half the element size, times 4/3: the error falls at least with
+    the square of the element size (Richardson).
 
     Raises
     ------

@@ -43,7 +43,7 @@ def fit_declared(
     if finest:
         fit = refine_mesh(fit, finest)
         return fit, discretization_error(fit)
-    return fine_enough(fit, 2 * FIRST_MESH)
+    return fine_enough(fit, FIRST_MESH)
 
 
 def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float]:
