@@ -74,7 +74,8 @@ def main(argv: Sequence[str]) -> int:
                 progress=counter.show,
             )
     except KeyboardInterrupt:
-        console(chosen.quiet).print("What is finished is kept: the same command goes on.")
+        said = Console(stderr=True, quiet=chosen.quiet)
+        said.print("What is finished is kept: the same command goes on.")
         raise
     if chosen.json:
         print_json(list(result.rows))
