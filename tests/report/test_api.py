@@ -2,14 +2,17 @@
 
 import dataclasses
 import re
+from io import StringIO
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from rich.console import Console
 from small_sessions import small
 
 import dlo_casadi as dlo
+from dlo_casadi.report.terminal import candidate_table
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +85,29 @@ def test_a_result_predicts_as_its_file_does(result, tmp_path):
     assert "end: (0.3, -0.1) m" in text
     assert "stable: yes" in text
     assert "<tr><td>end</td><td>(0.3, -0.1) m</td></tr>" in direct._repr_html_()
+
+
+def test_the_candidates_are_printed_in_their_order(outcome):
+    row = {"score": 12.34, "p_value": 1e-9, "rmse_cross_validated": 2e-4}
+    weak = {"score": 0.5, "p_value": None, "rmse_cross_validated": None}
+    effect = {"name": "lumped_mass", "indistinguishable_from": ["point_force"]}
+    diagnosed = dataclasses.replace(
+        outcome,
+        effects=(effect,),
+        candidates=(
+            {"name": "lumped_mass", **row},
+            {"name": "point_force", **row},
+            {"name": "side_load", **weak},
+        ),
+    )
+    printed = StringIO()
+    Console(file=printed, width=120).print(candidate_table(diagnosed))
+    rows = [" ".join(line.split()) for line in printed.getvalue().splitlines()]
+    assert "lumped_mass 12.3 1e-09 0.2 mm added" in rows
+    assert "point_force 12.3 1e-09 0.2 mm cannot be told apart from it" in rows
+    assert "side_load 0.5 - -" in rows
+    order = [row.split()[0] for row in rows if "_" in row]
+    assert order == ["lumped_mass", "point_force", "side_load"]
 
 
 def test_every_public_name_is_there():
