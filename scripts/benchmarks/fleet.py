@@ -43,7 +43,7 @@ def run() -> dict[str, Any]:
 
 def two_against_one(folder: Path, count: int = 24) -> dict[str, Any]:
     """The same sessions by one process, by two, and by two Dask workers on this machine."""
-    write_sessions(folder / "cables", count, poses=12, every=1)
+    write_sessions(folder / "cables", count, poses=6, every=4, n=12)
     tables = {}
     out: dict[str, Any] = {"sessions": count}
     for name, options in (("one", ["--jobs", "1"]), ("two", ["--jobs", "2"])):
@@ -77,7 +77,7 @@ def growth(folder: Path, counts: Sequence[int] = (10, 30, 100, 300)) -> dict[str
 def million(folder: Path, side: int = 1000) -> dict[str, Any]:
     """A million shapes of 20 elements by two processes, with the memory of all of them."""
     folder.mkdir()
-    config = load_config(write_sessions(folder / "cables", 1, poses=3, every=6)[0])
+    config = load_config(write_sessions(folder / "cables", 1, poses=3, every=6, n=20)[0])
     (folder / "parameters.yaml").write_text(parameters_text(run_session(config)))
     reach = 0.98 * config.cable.length / np.sqrt(2)
     grid = [-reach, reach, side, -reach, reach, side]
@@ -94,8 +94,8 @@ def million(folder: Path, side: int = 1000) -> dict[str, Any]:
     }
 
 
-def write_sessions(folder: Path, count: int, poses: int, every: int, n: int = 20) -> list[Path]:
-    """Write centre-line sessions of a few poses; every so many points are kept."""
+def write_sessions(folder: Path, count: int, poses: int, every: int, n: int) -> list[Path]:
+    """Write centre-line sessions of a few poses; one of so many points is kept."""
     files = []
     for k in range(count):
         name = NAMES[k % len(NAMES)]
@@ -103,6 +103,7 @@ def write_sessions(folder: Path, count: int, poses: int, every: int, n: int = 20
         kept = document["experiment"]["poses"][:poses]
         document["experiment"]["poses"] = kept
         document["model"] = {"n": n}
+        document["experiment"]["measurement"]["std"] = 3e-4
         document["estimation"] = {"algorithm1": False}
         document["diagnosis"] = {"enabled": False}
         own = folder / f"{k:04d}"
