@@ -33,12 +33,11 @@ _SYMBOLS = {"fit": "circle", "cross-validated": "diamond", "held out": "square"}
 
 def charts(outcome: Outcome) -> dict[str, str]:
     """Charts for which there is something to draw, as JSON by the name of their place."""
-    drawn: dict[str, Model] = {
-        "chart-errors": errors_chart(outcome),
-        "chart-poses": poses_chart(outcome),
-        "chart-residuals": residuals_chart(outcome),
-        "chart-rest": rest_chart(outcome),
-    }
+    drawn: dict[str, Model] = {"chart-errors": errors_chart(outcome)}
+    if any(stage.shapes for stage in outcome.stages):
+        drawn["chart-poses"] = poses_chart(outcome)
+        drawn["chart-residuals"] = residuals_chart(outcome)
+        drawn["chart-rest"] = rest_chart(outcome)
     if outcome.next_pose is not None:
         drawn["chart-next"] = next_pose_chart(outcome)
     if outcome.unexplained is not None:

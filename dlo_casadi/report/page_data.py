@@ -48,6 +48,7 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "warnings": all_warnings(outcome),
         "before": None if before is None else label_of(before, outcome),
         "after": None if after is None else label_of(after, outcome),
+        "last": label_of(outcome.stages[-1], outcome),
         "rest_before": before is not None and before.name == "batch",
         "stages": stage_rows(outcome),
         "noise": millimetres(m.std),

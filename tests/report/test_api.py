@@ -12,7 +12,9 @@ from rich.console import Console
 from small_sessions import small
 
 import dlo_casadi as dlo
+from dlo_casadi import api
 from dlo_casadi.report.terminal import candidate_table
+from dlo_casadi.session import Silent
 
 
 @pytest.fixture(scope="module")
@@ -22,21 +24,23 @@ def result(outcome):
     return dlo.Result(**values)
 
 
-def test_a_fit_is_that_of_the_session(outcome):
-    told = []
+@pytest.mark.parametrize("searched", [None, True, False])
+def test_a_fit_is_that_of_the_session(searched, outcome, monkeypatch):
+    """Its outcome, whole; the diagnosis as asked for, else as configured."""
+    listener, called = Silent(), []
 
-    class Listener:
-        def step(self, name, done, total):
-            told.append(name)
+    def run(config, progress):
+        called.append((config.diagnosis.enabled, progress))
+        return outcome
 
-        def message(self, text):
-            told.append(text)
-
-    result = dlo.fit(small("short_clean"), diagnosis=False, progress=Listener())
+    monkeypatch.setattr(api, "run_session", run)
+    config = small("short_clean")
+    result = dlo.fit(config, diagnosis=searched, progress=listener)
+    enabled = config.diagnosis.enabled if searched is None else searched
+    assert called == [(enabled, listener)]
     assert isinstance(result, dlo.Outcome)
-    assert result.fit.p == pytest.approx(outcome.fit.p, rel=1e-9)
-    assert "fit the declared model" in told
-    assert result.candidates == ()
+    for field in dataclasses.fields(outcome):
+        assert getattr(result, field.name) is getattr(outcome, field.name)
 
 
 def test_a_path_is_a_configuration(tmp_path):

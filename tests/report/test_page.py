@@ -17,6 +17,7 @@ from test_figures import CANDIDATES, EFFECT, LOAD
 from dlo_casadi.report import page_boards, page_canvas, page_charts
 from dlo_casadi.report.geometry import beside
 from dlo_casadi.report.page import as_data, breakable, page_script, report_page, units
+from dlo_casadi.report.page_backgrounds import PHOTOGRAPHS, photograph_of
 from dlo_casadi.report.page_charts import charts
 from dlo_casadi.report.page_data import (
     candidate_rows,
@@ -27,7 +28,7 @@ from dlo_casadi.report.page_data import (
     stage_rows,
     symmetric_interval,
 )
-from dlo_casadi.report.page_pictures import PHOTOGRAPHS, photograph_of, pictures
+from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.session.outcome import ParameterEstimate
 
 HOSTILE = "<img src=x onerror=alert(1)></script>"
@@ -274,6 +275,16 @@ def test_charts_are_there_for_what_the_outcome_holds(outcome):
     drawn = charts(full)
     assert set(drawn) == always | {"chart-next", "chart-pull"}
     assert all("NaN" not in text for text in drawn.values())
+
+
+def test_a_run_without_a_prediction_shows_what_was_measured(outcome):
+    bare = replace(outcome, stages=tuple(replace(stage, shapes={}) for stage in outcome.stages))
+    page = report_page(bare)
+
+    assert set(charts(bare)) == {"chart-errors"}
+    assert page.count('<polyline id="measured-') == 12
+    assert 'id="residuals"' not in page
+    assert "None" not in page.partition("<main")[2].partition("<script")[0]
 
 
 def test_what_is_told_at_the_pointer_is_known(outcome):
