@@ -207,7 +207,7 @@ def _predicted(
     unknowns, sweep = problem.unknowns, problem.sweep
     p, rest = unknowns.p(point.theta), unknowns.rest(point.theta)
     seen = sweep.observe(point.shapes, p, rest)
-    out = []
+    out: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     for j, s in zip(problem.used, point.feet, strict=True):
         curve = NodeCurve.of(unknowns.model.chain, seen.z[j])
         normals = curve.normals(s)

@@ -276,13 +276,14 @@ class Sweep:
         if not self.model.has_state:
             right = np.concatenate([direct + by_rest @ rest_slopes, by_deviation], axis=2)
             solved = -np.linalg.solve(matrix, right)
-            found = np.broadcast_to(rest_slopes, (self.m, *rest_slopes.shape))
-            return Sensitivities(solved[:, :, :size], solved[:, :, size:], found)
+            same = np.broadcast_to(rest_slopes, (self.m, *rest_slopes.shape))
+            return Sensitivities(solved[:, :, :size], solved[:, :, size:], same)
         solved = -np.linalg.solve(matrix, np.concatenate([direct, by_rest, by_deviation], axis=2))
         n_cells = rest_slopes.shape[0]
         carry = self._carry(shapes, p, rests)
         change = rest_slopes
-        rows, found = [], []
+        rows: list[FloatArray] = []
+        found: list[FloatArray] = []
         for j in range(self.m):
             found.append(change)
             total = solved[j, :, :size] + solved[j, :, size : size + n_cells] @ change
