@@ -18,6 +18,7 @@ from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model import CableModel
 
 DATA = Path(__file__).parent / "data"
+SCRIPTS = Path(__file__).parents[1] / "scripts"
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WEIGHTLESS = (0.0, 0.0)  # m/s^2
 MESHES = (10, 20, 40)
@@ -46,7 +47,7 @@ def test_energies_of_table_4():
     length, n, k_theta = 0.8125, 10, 949.56
     stiffness = k_theta * length / n
     model = CableModel(Cable(length, 0.23, 0.0128, stiffness), n=n, element="link")
-    with (DATA / "paper" / "table4.csv").open() as file:
+    with (SCRIPTS / "paper" / "data" / "table4.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 12
     for row in rows:
