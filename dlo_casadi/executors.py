@@ -160,7 +160,7 @@ class Cluster(Executor):
     @property
     def workers(self) -> int:
         """Processes that take tasks now; they may come and go."""
-        return max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+        return max(1, len(self._client.nthreads()))
 
     @property
     def capacity(self) -> int:
