@@ -52,6 +52,7 @@ def two_against_one(folder: Path, count: int = 24) -> dict[str, Any]:
         out["dask"], tables["dask"] = fit_many(folder, "dask", ["--scheduler", scheduler])
     out["same_tables"] = tables["one"] == tables["two"] == tables["dask"]
     out["speedup"] = out["one"]["seconds"] / out["two"]["seconds"]
+    out["speedup_of_the_chain"] = out["one"]["chain_seconds"] / out["two"]["chain_seconds"]
     out["dask_overhead"] = out["dask"]["seconds"] / out["two"]["seconds"] - 1
     return out
 
@@ -127,34 +128,51 @@ def fit_many(folder: Path, name: str, options: Sequence[str]) -> tuple[dict[str,
 
 
 def measured(command: Sequence[str]) -> dict[str, float]:
-    """Run a script; wall-clock and processor time [s], peak memory of all its processes [MB].
+    """Run a script; wall-clock and processor times [s], peak memory of all its processes [MB].
 
-    Memory is the proportional set size: pages that processes share are counted once.
+    Memory is the proportional set size: pages that processes share are counted once. The chain
+    is the processor time of the first process and of the busiest of its workers: with one core
+    for each, about what the command would take, whatever else the machine does now.
     """
     begin = time.perf_counter()
     script, *arguments = command
     process = subprocess.Popen(
         [sys.executable, str(ROOT / "scripts" / script), *arguments, "--quiet"]
     )
-    peak, over = [0.0], threading.Event()
+    peak, over, workers = [0.0], threading.Event(), dict[int, float]()
 
     def watch() -> None:
         while not over.wait(0.1):
-            peak[0] = max(peak[0], sum(map(memory_of, [process.pid, *children(process.pid)])))
+            below = children(process.pid)
+            peak[0] = max(peak[0], sum(map(memory_of, [process.pid, *below])))
+            workers.update({pid: max(processor_of(pid), workers.get(pid, 0.0)) for pid in below})
 
     thread = threading.Thread(target=watch)
     thread.start()
     _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - begin
     over.set()
     thread.join()
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise RuntimeError(f"{script} ended with {process.returncode}")
+    total = usage.ru_utime + usage.ru_stime
+    own = total - sum(workers.values())
     return {
-        "seconds": round(time.perf_counter() - begin, 2),
-        "cpu_seconds": round(usage.ru_utime + usage.ru_stime, 2),
+        "seconds": round(seconds, 2),
+        "cpu_seconds": round(total, 2),
+        "chain_seconds": round(own + max(workers.values(), default=0.0), 2),
         "peak_mb": round(peak[0], 1),
     }
+
+
+def processor_of(pid: int) -> float:
+    """Processor time of a process [s]."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def children(pid: int) -> list[int]:
