@@ -117,44 +117,6 @@ def test_check_shows_photographs_only(capsys, tmp_path):
     assert "this configuration has centre-lines" in capsys.readouterr().err
 
 
-# ---- results as JSON ---------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    """Configuration and results of a quick fit, and what it printed with --json."""
-    folder = tmp_path_factory.mktemp("quick")
-    data = read_yaml(BENCH / "short_clean/session.yaml")
-    data["experiment"]["poses"] = data["experiment"]["poses"][:4]
-    for pose in data["experiment"]["poses"]:
-        pose["file"] = str(BENCH / "short_clean" / pose["file"])
-    data |= {"model": {"n": 12}, "estimation": {"algorithm1": False}}
-    (folder / "rope.yaml").write_text(dump_yaml(data))
-    dlo = Path(sys.executable).with_name("dlo")
-    command = [dlo, "fit", "rope.yaml", "--no-diagnosis", "--json", "--quiet"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return folder, done
-
-
-def test_fit_prints_its_report_and_nothing_else(results):
-    folder, done = results
-    assert json.loads(done.stdout) == json.loads((folder / "results/rope/report.json").read_text())
-    assert done.stderr == ""
-
-
-def test_the_solver_of_a_folder_of_results(results, tmp_path, capsys):
-    folder, _ = results
-    command = ["generate-solver", str(folder / "results/rope"), "--output", str(tmp_path / "c")]
-    assert main([*command, "--json"]) == 0
-    written = json.loads(capsys.readouterr().out)
-    assert {Path(file).name for file in written["files"]} >= {"dlo_solver.c", "dlo_solver.h"}
-    assert len(written["model_hash"]) >= 16
-    (tmp_path / "file").touch()
-    assert main([*command[:3], str(tmp_path / "file")]) == 2
-    assert "cannot be written: File exists" in capsys.readouterr().err
-
-
 # ---- new and schema ----------------------------------------------------------------------------
 
 

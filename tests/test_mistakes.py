@@ -43,7 +43,7 @@ class Session:
         """Change all photographs."""
         for pose in self.poses:
             picture = cv2.imread(str(self.folder / pose["file"]))
-            pose["file"] = Path(pose["file"]).stem + ".png"
+            pose["file"] = Path(pose["file"]).stem + ".bmp"
             cv2.imwrite(str(self.folder / pose["file"]), change(picture))
 
     def files(self, order: Callable[[list[str]], list[str]]) -> None:
@@ -178,7 +178,7 @@ def points_with_rows_of_a_picture(folder: Path) -> Session:
 
 
 def points_with_y_down_between_ends_of_one_height(folder: Path) -> Session:
-    session = Session(folder, ROOT / "configs/white_wire.yaml", 2)
+    session = Session(folder, ROOT / "configs/white_wire.yaml", 1)
     session.points(lambda points: points * [1, -1])
     return session
 

@@ -23,7 +23,7 @@ def small_cable(tmp_path, monkeypatch):
     for pose in poses:
         pose["file"] = str(SESSION.parent / pose["file"])
     data["experiment"]["poses"] = poses
-    data |= {"model": {"n": 20}, "estimation": {"algorithm1": False}}
+    data |= {"model": {"n": 12}, "estimation": {"algorithm1": False}}
     data["diagnosis"] = {"enabled": False}
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs/cable.yaml").write_text(dump_yaml(data))

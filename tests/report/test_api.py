@@ -1,8 +1,11 @@
 """The Python API: results that show themselves, predict and write themselves."""
 
 import dataclasses
+import json
 import re
+from contextlib import redirect_stdout
 from io import StringIO
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +16,9 @@ from small_sessions import small
 
 import dlo_casadi as dlo
 from dlo_casadi import api
+from dlo_casadi.cli import fit as fit_command
+from dlo_casadi.cli import main
+from dlo_casadi.report import writer
 from dlo_casadi.report.terminal import candidate_table
 from dlo_casadi.session import Silent
 
@@ -79,9 +85,25 @@ def test_plots_are_figures_that_leave_pyplot_alone(result):
     assert dict(mpl.rcParams) == before
 
 
-def test_a_result_predicts_as_its_file_does(result, tmp_path):
-    folder = result.write(tmp_path / "rope")
-    assert (folder / "report.json").exists()
+@pytest.fixture(scope="module")
+def written(outcome, tmp_path_factory):
+    """Folder of the small session's results, and what `dlo fit --json` printed."""
+    folder = tmp_path_factory.mktemp("written") / "rope"
+    command = ["fit", str(outcome.config.path), "--json", "--quiet", "--output", str(folder)]
+    printed = StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
+        patch.setattr(fit_command, "run_session", lambda *_: outcome)
+        assert main(command) == 0
+    return folder, printed.getvalue()
+
+
+def test_fit_prints_its_report_and_nothing_else(written):
+    folder, printed = written
+    assert json.loads(printed) == json.loads((folder / "report.json").read_text())
+
+
+def test_a_result_predicts_as_its_file_does(result, written):
+    folder, _ = written
     direct, from_file = result.predict((0.3, -0.1)), dlo.predict(folder, (0.3, -0.1))
     assert np.array_equal(direct.points(), from_file.points())
     assert str(direct) == str(from_file)
@@ -89,6 +111,25 @@ def test_a_result_predicts_as_its_file_does(result, tmp_path):
     assert "end: (0.3, -0.1) m" in text
     assert "stable: yes" in text
     assert "<tr><td>end</td><td>(0.3, -0.1) m</td></tr>" in direct._repr_html_()
+
+
+def test_a_result_writes_what_the_command_writes(result, tmp_path, monkeypatch):
+    filled = []
+    monkeypatch.setattr(writer, "fill", lambda folder, outcome: filled.append(outcome))
+    assert result.write(tmp_path / "rope") == tmp_path / "rope"
+    assert filled == [result]
+
+
+def test_the_solver_of_a_folder_of_results(written, tmp_path, capsys):
+    folder, _ = written
+    command = ["generate-solver", str(folder), "--output"]
+    assert main([*command, str(tmp_path / "c"), "--json"]) == 0
+    files = json.loads(capsys.readouterr().out)
+    assert {Path(file).name for file in files["files"]} >= {"dlo_solver.c", "dlo_solver.h"}
+    assert len(files["model_hash"]) >= 16
+    (tmp_path / "file").touch()
+    assert main([*command, str(tmp_path / "file")]) == 2
+    assert "cannot be written: File exists" in capsys.readouterr().err
 
 
 def test_the_candidates_are_printed_in_their_order(outcome):
