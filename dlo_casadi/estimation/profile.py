@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.unknowns import Unknowns
+
+FloatArray = NDArray[np.floating]
 
 # 95 % of a standard normal lies within this many standard deviations.
 NORMAL_95 = 1.959964
@@ -55,40 +58,17 @@ def stiffness_interval(fit: Fit) -> Interval:
     The stiffness is held, everything else refitted; the prior of the stiffness itself does not
     count.
     """
-    model = fit.model
     log_ei = float(np.log(fit.p[0]))
     k = fit.problem.unknowns.names.index("bending_stiffness")
     log_std = float(np.sqrt(max(fit.covariance[k, k], 0.0))) * fit.inflation
     limit = threshold(fit)
-    others = np.array([name != "bending_stiffness" for name in model.names])
-    others &= fit.problem.unknowns.free
-    gap = fit.point.theta[k] - fit.problem.mean[k]
-    base = 2 * fit.point.objective - fit.problem.precision[k, k] * gap**2
-    keep = np.arange(fit.problem.unknowns.size) != k
 
     def held(log_value: float, near: Point) -> tuple[Point, float] | None:
-        p = fit.p.copy()
-        p[0] = np.exp(log_value)
-        unknowns = Unknowns(model, others, p, fit.problem.unknowns.rest_free)
-        problem = BatchProblem(
-            unknowns,
-            fit.problem.history,
-            fit.noise,
-            fit.problem.tolerances,
-            fit.problem.roughness_std,
-            fit.problem.scatter,
-            fit.problem.sweep,
-        )
-        problem.refresh(near.feet)
-        theta = near.theta
-        shapes, ok = problem.sweep.solve(near.shapes, unknowns.p(theta), unknowns.rest(theta))
-        if not ok:
-            return None
-        point, _ = problem.descend(problem.evaluate(theta, shapes, near.feet), tolerance=1e-2)
-        return point, 2 * point.objective - base - limit
+        tried = _held(fit, log_value, near)
+        return None if tried is None else (tried[0], tried[1] - limit)
 
     def end(direction: int) -> float | None:
-        near = replace(fit.point, theta=fit.point.theta[keep])
+        near = _others(fit)
         low, f_low = 0.0, -limit
         step = min(max(np.sqrt(limit) * log_std, 1e-4), 0.7)
         while low < LARGEST_LOG_STEP:
@@ -108,6 +88,67 @@ def stiffness_interval(fit: Fit) -> Interval:
     ends = [end(-1), end(1)]
     low, high = (None if e is None else float(np.exp(e)) for e in ends)
     return Interval(low, high)
+
+
+def stiffness_profile(fit: Fit, stiffness: FloatArray) -> FloatArray:
+    """Rise of twice the objective where the stiffness is held and everything else refitted.
+
+    Parameters
+    ----------
+    stiffness : (k,) [N m^2]
+        In any order.
+
+    Returns
+    -------
+    (k,)
+        To be compared with `threshold`; NaN where no equilibria were found.
+    """
+    wanted = np.log(stiffness)
+    here = float(np.log(fit.p[0]))
+    rises = np.full(len(wanted), np.nan)
+    order = np.argsort(wanted)
+    # Outwards from the estimate, each refit from its neighbour's.
+    for side in (order[wanted[order] >= here], order[wanted[order] < here][::-1]):
+        near = _others(fit)
+        for k in side:
+            tried = _held(fit, float(wanted[k]), near)
+            if tried is not None:
+                near, rises[k] = tried
+    return rises
+
+
+def _others(fit: Fit) -> Point:
+    """The fit's minimum without the stiffness among its unknowns."""
+    names = np.array(fit.problem.unknowns.names)
+    return replace(fit.point, theta=fit.point.theta[names != "bending_stiffness"])
+
+
+def _held(fit: Fit, log_value: float, near: Point) -> tuple[Point, float] | None:
+    """Refit with the stiffness held, from a neighbour; the rise of twice the objective."""
+    model, found = fit.model, fit.problem.unknowns
+    k = found.names.index("bending_stiffness")
+    gap = fit.point.theta[k] - fit.problem.mean[k]
+    base = 2 * fit.point.objective - fit.problem.precision[k, k] * gap**2
+    others = np.array([name != "bending_stiffness" for name in model.names]) & found.free
+    p = fit.p.copy()
+    p[0] = np.exp(log_value)
+    unknowns = Unknowns(model, others, p, found.rest_free)
+    problem = BatchProblem(
+        unknowns,
+        fit.problem.history,
+        fit.noise,
+        fit.problem.tolerances,
+        fit.problem.roughness_std,
+        fit.problem.scatter,
+        fit.problem.sweep,
+    )
+    problem.refresh(near.feet)
+    theta = near.theta
+    shapes, ok = problem.sweep.solve(near.shapes, unknowns.p(theta), unknowns.rest(theta))
+    if not ok:
+        return None
+    point, _ = problem.descend(problem.evaluate(theta, shapes, near.feet), tolerance=1e-2)
+    return point, 2 * point.objective - base
 
 
 def _crossing(held, log_ei, direction, below, above, near) -> float:  # type: ignore[no-untyped-def]
