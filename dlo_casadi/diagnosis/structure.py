@@ -36,6 +36,9 @@ class Structure:
     order_z, span_z : float
         Rank correlation of the poses' slow energy with their order and with their span, as a
         normal score.
+    position_z : float
+        Score test of a displacement that is a parabola in the measured place (a lens, a board out
+        of its plane, a scale), the same in all poses; as a normal score.
     per_pose : dict
         Slow energy per degree of freedom by pose name.
     """
@@ -47,6 +50,7 @@ class Structure:
     runs_z: float
     order_z: float
     span_z: float
+    position_z: float
     per_pose: dict[str, float]
 
 
@@ -112,8 +116,42 @@ def structure_of(fit: Fit) -> Structure:
         _runs(lin.residuals),
         _rank_score(energies, np.arange(len(energies), dtype=float)),
         _rank_score(energies, spans),
+        _position_score(fit),
         dict(zip(names, energies.tolist(), strict=True)),
     )
+
+
+def _position_score(fit: Fit) -> float:
+    """Score test of the ten terms of first and second degree of a displacement field (x, y)."""
+    problem, lin, inner = fit.problem, fit.linearization, fit.normal.inner
+    curves = problem.curves(fit.point.theta, fit.point.shapes)
+    information: FloatArray = np.zeros((10, 10))
+    cross: FloatArray = np.zeros((10, len(fit.point.theta)))
+    slope: FloatArray = np.zeros(10)
+    for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
+        x, y = problem.measured[j].points.T / fit.model.cable.length
+        terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
+        normals = curves[j].normals(s)
+        moves = np.concatenate([normals[:, :1] * terms, normals[:, 1:] * terms], axis=1)
+        seen = problem.whitening(j, s) @ moves
+        information += seen.T @ seen
+        cross += seen.T @ lin.by_theta[k]
+        slope += seen.T @ lin.residuals[k]
+        if inner:
+            block, by_theta, gradient = inner[k]
+            along = lin.by_deviation[k].T @ seen
+            taken = np.linalg.solve(block, along)
+            information -= along.T @ taken
+            cross -= taken.T @ by_theta
+            slope -= taken.T @ gradient
+    information -= cross @ fit.covariance @ cross.T
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    kept = values > 1e-6
+    along = vectors[:, kept].T @ (slope * scale)
+    score, dof, noise = float((along**2 / values[kept]).sum()), int(kept.sum()), noise_degrees(fit)
+    p_value = chi2.sf(score, dof) if np.isinf(noise) else f.sf(score / dof, dof, noise)
+    return float(norm.isf(np.clip(p_value, 1e-12, 1 - 1e-12)))
 
 
 def _span(fit: Fit, j: int) -> float:
@@ -135,7 +173,7 @@ def _runs(residuals: list[FloatArray]) -> float:
         mean = 1 + 2 * n1 * n2 / n
         excess += 1 + int((positive[1:] != positive[:-1]).sum()) - mean
         variance += (mean - 1) * (mean - 2) / (n - 1)
-    return excess / np.sqrt(variance) if variance > 0 else 0.0
+    return float(excess / np.sqrt(variance)) if variance > 0 else 0.0
 
 
 def _rank_score(a: FloatArray, b: FloatArray) -> float:

@@ -50,6 +50,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "verdict": outcome.verdict,
         "unexplained": outcome.unexplained,
         "next_pose": outcome.next_pose,
+        "structure": outcome.structure,
     }
     plain: dict[str, Any] = finite(document)
     return plain

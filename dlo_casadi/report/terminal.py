@@ -223,7 +223,7 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     """What the diagnosis has led to, in sentences."""
     if not outcome.config.diagnosis.enabled:
         return ["Diagnosis: switched off; nothing was looked for in the residual."]
-    lines = [_verdict(outcome)]
+    lines = [_verdict(outcome), *structure_lines(outcome)]
     for effect in outcome.effects:
         lines += _effect_lines(effect)
     load = outcome.unexplained
@@ -241,6 +241,32 @@ def verdict_lines(outcome: Outcome) -> list[str]:
             f" m; they differ there by {_mm(proposal['expected_difference_m'])}."
         )
     return lines
+
+
+# What the residual may depend on, by the key of its normal score.
+DEPENDENCES = {
+    "runs_z": "runs along the cable",
+    "order_z": "the order of the poses",
+    "span_z": "the distance of the ends",
+    "position_z": "the place in the picture",
+}
+# Normal scores beyond it are worth a word.
+NOTABLE = 3.0
+
+
+def structure_lines(outcome: Outcome) -> list[str]:
+    """What the declared model's residual depends on, where it is not noise."""
+    if outcome.structure is None or outcome.verdict == "complete":
+        return []
+    before = outcome.structure["before"]
+    found = [
+        f"{text} (z = {before[key]:+.1f})"
+        for key, text in DEPENDENCES.items()
+        if abs(before[key]) > NOTABLE
+    ]
+    if not found:
+        return []
+    return [f"  The declared model's residual depends on {', '.join(found)}."]
 
 
 def _verdict(outcome: Outcome) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -94,3 +95,9 @@ def next_pose_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
         "separates": list(diagnosis.proposal_for),
         "expected_difference_m": diagnosis.proposal.difference,
     }
+
+
+def structure_rows(diagnosis: Diagnosis) -> dict[str, dict[str, Any]]:
+    """Tests of the residual before and after effects were added; see `Structure`."""
+    pair = {"before": diagnosis.structure_before, "after": diagnosis.structure_after}
+    return {when: asdict(structure) for when, structure in pair.items()}

@@ -186,6 +186,8 @@ class Outcome:
     ----------
     effects, candidates, unexplained, next_pose
         As in report.json ("dlo-report/1"), ready to be written.
+    structure : dict or None
+        Tests of the residual "before" and "after", see `diagnosis.structure.Structure`.
     fit : Fit
         The last stage's fit, from which parameters.yaml is written.
     diagnosis : object or None
@@ -205,6 +207,7 @@ class Outcome:
     candidates: tuple[dict[str, Any], ...] = ()
     unexplained: dict[str, Any] | None = None
     next_pose: dict[str, Any] | None = None
+    structure: dict[str, dict[str, Any]] | None = None
     diagnosis: Any = None
     versions: dict[str, str] = field(default_factory=dict)
 

@@ -20,7 +20,13 @@ from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.checks import raise_if_implausible
 from dlo_casadi.session.declared import Declared, declared_model, straight
-from dlo_casadi.session.findings import candidate_rows, effect_rows, next_pose_row, unexplained_row
+from dlo_casadi.session.findings import (
+    candidate_rows,
+    effect_rows,
+    next_pose_row,
+    structure_rows,
+    unexplained_row,
+)
 from dlo_casadi.session.fitting import (
     SEARCH_MESH,
     fine_enough,
@@ -154,6 +160,7 @@ def close_the_loop(
         candidates=candidate_rows(diagnosis),
         unexplained=unexplained_row(diagnosis),
         next_pose=next_pose_row(diagnosis),
+        structure=structure_rows(diagnosis),
         diagnosis=diagnosis,
     )
 
