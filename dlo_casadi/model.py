@@ -11,6 +11,7 @@ loads. An equilibrium is a stationary point; the chain's coordinates stay the he
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -483,6 +484,12 @@ class CableModel:
             for symbol in (unknowns, self._p, self._rest, self._deviation)
         ]
         return ca.Function("observation", self._arguments, [z, *blocks])
+
+    def slopes_by(self, names: Sequence[str]) -> ca.Function:
+        """Same arguments -> derivatives of the stationarity and of z by the named parameters."""
+        chosen = ca.vertcat(*(self._p[self.names.index(name)] for name in names))
+        blocks = [ca.densify(ca.jacobian(e, chosen)) for e in (self._stationarity, self._observed)]
+        return ca.Function("slopes_by", self._arguments, blocks)
 
     @cached_property
     def shape(self) -> ca.Function:

@@ -18,7 +18,7 @@ function theorem, exact from CasADi.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,8 @@ from scipy.stats import chi2, f
 
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.fit import Fit, carried_shapes
-from dlo_casadi.estimation.gauss_newton import BatchProblem
+from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Point
+from dlo_casadi.estimation.observation import normal_rows
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
@@ -68,6 +69,39 @@ def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
     return model
 
 
+@dataclass
+class _Linearized:
+    """The extended model at the fit; moving its candidates along the cable is cheap.
+
+    A local effect that is not there yet changes no shape wherever it is moved: only the
+    derivatives by its own parameters have to be taken again.
+    """
+
+    problem: BatchProblem
+    point: Point
+    lin: Linearization
+    _reach: FloatArray | None = None
+    _rows: list[FloatArray] = field(default_factory=list)
+
+    def move(self, names: tuple[str, ...], p: FloatArray) -> None:
+        """Take the derivatives by the named parameters again, at p."""
+        problem, point = self.problem, self.point
+        rest, shapes = problem.unknowns.rest(point.theta), point.shapes
+        if self._reach is None:
+            self._reach = problem.sweep.reach(shapes, p, rest)
+            curves = problem.curves(point.theta, shapes)
+            for j, s in zip(problem.used, point.feet, strict=True):
+                rows = normal_rows(curves[j], s, curves[j].normals(s))
+                self._rows.append(problem.whitening(j, s) @ rows)
+        balance, z = problem.sweep.slopes_by(names, shapes, p, rest)
+        moved = self._reach @ balance + z
+        own = [problem.unknowns.model.names.index(name) for name in names]
+        columns = [problem.unknowns.names.index(name) for name in names]
+        scale = problem.unknowns.slopes(point.theta)[own, columns]
+        for k, (j, rows) in enumerate(zip(problem.used, self._rows, strict=True)):
+            self.lin.by_theta[k][:, columns] = -(rows @ moved[j]) * scale
+
+
 class Screen:
     """All candidates in one model, evaluated at a fit."""
 
@@ -87,14 +121,28 @@ class Screen:
         for name, value in zip(fit.model.names, fit.p, strict=True):
             p[self.model.names.index(name)] = value
         self.p = p
+        # What scans change the derivatives of.
+        self.moving = tuple(
+            name for c in self.listed if len(c.scans) > 1 for name in c.screened if not c.nuisance
+        )
         self.sweep: Sweep | None = None
         self.shapes: Shapes | None = None
+        self.still: _Linearized | None = None
 
     def normal(self, scan: dict[str, float]) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
         """Normal equations of the extended model with the scanned parameters set."""
         p = self.p.copy()
         for name, value in scan.items():
             p[self.model.names.index(name)] = value
+        if self.still is None or self.fit.model.has_state:
+            self.still = self._linearized(p)
+        else:
+            self.still.move(self.moving, p)
+        still = self.still
+        normal = still.problem.normal_equations(still.point, still.lin)
+        return normal.hessian, normal.gradient, still.problem.unknowns.names
+
+    def _linearized(self, p: FloatArray) -> _Linearized:
         problem = self.fit.problem
         unknowns = Unknowns(self.model, self.free, p, problem.unknowns.rest_free)
         larger = BatchProblem(
@@ -110,11 +158,9 @@ class Screen:
         larger.share_metric(problem)
         if self.shapes is None:
             self.shapes = carried_shapes(larger, self.fit)
-        shapes = self.shapes
         theta = unknowns.pack(p, self.fit.coefficients)
-        point = replace(self.fit.point, theta=theta, shapes=shapes)
-        normal = larger.normal_equations(point, larger.linearize(point))
-        return normal.hessian, normal.gradient, unknowns.names
+        point = replace(self.fit.point, theta=theta, shapes=self.shapes)
+        return _Linearized(larger, point, larger.linearize(point))
 
     def run(self, noise_dof: float) -> list[Screened]:
         """Score all candidates, best first.

@@ -127,7 +127,7 @@ class Sweep:
         self.n_phi = model.chain.n_headings
         self.n_unknowns = self.n_phi + model.n_conditions
         self._ends = np.array([pose.vector for pose in self.poses])
-        self._maps: dict[str, _Mapped] = {}
+        self._maps: dict[str | tuple[str, ...], _Mapped] = {}
         self.used_deviations = [DEVIATIONS.index(name) for name in model.deviations]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -297,6 +297,25 @@ class Sweep:
         rests = self.rests(shapes, p, rest)
         z, *slopes = self._call("observation", shapes, p, rests)
         return Observations(z[:, :, 0], *slopes)
+
+    def reach(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """Change of the measured curves by a change of the imbalance (m, nz, N): -dz/dx K^-1."""
+        _, matrix = self.kkt(shapes, p, rest)
+        by_x = self.observe(shapes, p, rest).by_x
+        solved = np.linalg.solve(matrix.transpose(0, 2, 1), by_x.transpose(0, 2, 1))
+        return np.asarray(-solved.transpose(0, 2, 1))
+
+    def slopes_by(
+        self, names: tuple[str, ...], shapes: Shapes, p: FloatArray, rest: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Direct derivatives of the imbalance (m, N, q) and of the measured curves (m, nz, q)."""
+        if names not in self._maps:
+            self._maps[names] = _Mapped(self.model.slopes_by(names), self.m)
+        rests = self.rests(shapes, p, rest)
+        balance, z = self._maps[names](
+            shapes.phi, shapes.lam, p, rests, self._ends, shapes.deviation
+        )
+        return balance, z
 
     def shapes_seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Observation vectors (m, nz) only."""
