@@ -147,6 +147,7 @@ class Chain:
         ratio: ca.SX | None = None,
         rest: ca.SX | None = None,
         bow: ca.SX | None = None,
+        square: ca.SX | None = None,
     ) -> Curve:
         """Build the curve of the headings `phi`.
 
@@ -165,6 +166,8 @@ class Chain:
             Mean rest curvature of each element; arcs follow its variation inside.
         bow : (n,), optional [rad]
             How far the heading in the middle of an element lies beyond the mean of its ends.
+        square : (n,), optional [rad^2]
+            What stands for the square of the bow; that by default.
         """
         bent = phi
         if self.element == "link":
@@ -179,7 +182,8 @@ class Chain:
             variation = ca.DM(self.rest_variation) @ rest
             own = self.h * stretch * ca.reshape(variation, self.n, 2)
         bow = ca.SX.zeros(self.n) if bow is None else bow
-        return Curve(self, phi, bent, ratio, stretch, start, own, bow)
+        square = bow**2 if square is None else square
+        return Curve(self, phi, bent, ratio, stretch, start, own, bow, square)
 
     @property
     def rest_variation(self) -> FloatArray:
@@ -221,6 +225,7 @@ class Curve:
     start: ca.SX
     own: ca.SX
     bow: ca.SX
+    square: ca.SX
 
     def _own_turn(self, e: int, u: ca.SX | float) -> ca.SX:
         """Heading of the rest shape beyond its linear part; zero at both ends of element e."""
@@ -240,8 +245,9 @@ class Curve:
         straight = self.ratio[e] * ca.vertcat(c, s)
         if self.chain.element != "quadratic":
             return straight
-        turn = 4 * u * (1 - u) * self.bow[e]
-        bowed = turn * ca.vertcat(-s, c) - turn * turn / 2 * ca.vertcat(c, s)
+        form = 4 * u * (1 - u)
+        bowed = form * self.bow[e] * ca.vertcat(-s, c)
+        bowed -= form**2 * self.square[e] / 2 * ca.vertcat(c, s)
         return straight + self.stretch * bowed
 
     def _advance(self, e: int, u: ca.SX | float) -> ca.SX:

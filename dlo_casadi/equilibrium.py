@@ -309,17 +309,17 @@ def _from_start(
     phi = np.array(out["x"]).ravel()[: chain.n_headings]
     multipliers = np.array(out["lam_g"]).ravel()
     lam, bound_lam = multipliers[: model.n_conditions], multipliers[model.n_conditions :]
+    # On fine meshes of stiff cables IPOPT's tolerance lies below rounding: it stops at the
+    # minimum all the same, and complains of its tiny steps.
+    stalled = stats["return_status"] == "Search_Direction_Becomes_Too_Small"
     inside = np.abs(np.diff(phi)).max() < JOINT_BOUND - 1e-6
-    if model.bowed and inside and stats["success"]:
+    if model.bowed and inside and (stats["success"] or stalled):
         phi, lam = _balanced(model, phi, lam, (p, rest, ends, deviation))
     gap = np.abs(np.array(out["g"]).ravel()[: model.n_conditions])
     residual = float(gap.max()) if gap.size else 0.0
     arguments = (phi, lam, p, rest, ends, deviation)
     energy, nodes = model.energy(*arguments)
     force, matrix = (np.array(block) for block in model.kkt(*arguments))
-    # On fine meshes of stiff cables IPOPT's tolerance lies below rounding: it stops at the
-    # minimum all the same, and complains of its tiny steps.
-    stalled = stats["return_status"] == "Search_Direction_Becomes_Too_Small"
     balanced = np.abs(force).max() <= ROUNDING * np.abs(matrix).max()
     solved = stats["success"] or (stalled and balanced)
     bend = float(np.abs(np.diff(phi)).max())

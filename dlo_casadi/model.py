@@ -47,14 +47,15 @@ STIFFNESS_PRIOR_STD = float(np.log(1e3))
 DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading", "pull_x", "pull_y")
 
 
-def _stiffening(x: ca.SX) -> ca.SX:
-    """Stiffness 1 + x of a bow under tension; under compression x < 0 it stays above 1/4.
+def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Stiffness 1 + x of a bow under tension and its slope; compressed, x < 0, it stays above 1/4.
 
     Elements of a limp cable would buckle one by one on the way to an equilibrium. Twice
     differentiable, and 1 + x + O(x^3) everywhere.
     """
-    pressed = 4 / 3 * ca.fmin(x, 0)
-    return ca.fmax(x, 0) + 0.25 + 0.75 / (1 - pressed + pressed**2)
+    a = 4 / 3 * ca.fmin(x, 0)
+    pressed = 1 - a + a**2
+    return ca.fmax(x, 0) + 0.25 + 0.75 / pressed, (1 - 2 * a) / pressed**2
 
 
 @dataclass(frozen=True)
@@ -274,7 +275,12 @@ class CableModel:
         """Whether some effect lets the cable stretch under tension."""
         return any(effect.extensible for effect, _ in self._slot(Kinematics))
 
-    def _curve(self, ratio: ca.SX | None = None, bow: ca.SX | None = None) -> Curve:
+    def _curve(
+        self,
+        ratio: ca.SX | None = None,
+        bow: ca.SX | None = None,
+        square: ca.SX | None = None,
+    ) -> Curve:
         held = self._held
         return self.chain.curve(
             self._phi,
@@ -285,6 +291,7 @@ class CableModel:
             ratio,
             self._rest,
             bow,
+            square,
         )
 
     @property
@@ -370,7 +377,7 @@ class CableModel:
             return found
 
         (lagrangian,) = rigid(plain)
-        stretched, bowed = uniform, none
+        stretched = uniform
         if self.extensible:
             (tension,) = rigid(-ca.gradient(plain, ratio) / self.chain.h)
             lagrangian -= self._compliance * self.chain.h * ca.sumsqr(tension) / 2
@@ -379,9 +386,12 @@ class CableModel:
             torque, ones = ca.gradient(plain, bow), ca.SX.ones(self.n)
             elastic = ca.jtimes(ca.gradient(self._bending_energy(curve), bow), bow, ones)
             torque, stiffness, elastic = rigid(torque, ca.jtimes(torque, bow, ones), elastic)
-            bowed = -torque / (elastic * _stiffening(stiffness / elastic - 1))
+            factor, slope = _stiffening(stiffness / elastic - 1)
+            bowed = -torque / (elastic * factor)
             lagrangian += ca.dot(torque, bowed) / 2
-        return lagrangian, self._curve(stretched, bowed)
+            # The curve whose end the Lagrangian's derivative by the multipliers holds.
+            return lagrangian, self._curve(stretched, bowed, bowed**2 * slope)
+        return lagrangian, self._curve(stretched)
 
     @property
     def n_inner(self) -> int:
