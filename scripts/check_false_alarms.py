@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -39,7 +40,7 @@ SESSIONS = ("short_clean", "held_headings", "weightless_fit", "thin")
 def simulate(config, generator):
     """Measured poses of a cable with nothing hidden."""
     declared = declared_model(config)
-    model = declared.model.with_mesh(80)
+    model = declared.model.with_mesh(40)
     cable = config.cable
     tolerances = config.experiment.tolerances
     p = model.nominal.copy()
@@ -97,7 +98,7 @@ def main() -> None:
         work = partial(run_one, seed=args.seed)
         for done in map_as_completed(executor, work, range(args.sets)):
             row = rows[done.index] = done.value
-            seconds.append(done.seconds)
+            seconds.append(row["seconds"])
             if row["added"] or row["verdict"] == "unexplained":
                 print(f"  set {done.index}: {row}", flush=True)
             if len(rows) % 20 == 0 or len(rows) == args.sets:
@@ -123,10 +124,16 @@ def run_one(index: int, seed: int) -> dict:
     measured = None
     while measured is None:
         measured = simulate(config, generator)
+    begin = time.perf_counter()
     fit, _ = fit_declared(config, declared_model(config), measured)
     diagnosis = diagnose(fit)
-    names = [item.candidate.name for item in diagnosis.added]
-    return {"session": config.cable.name, "verdict": diagnosis.verdict, "added": names}
+    return {
+        "session": config.cable.name,
+        "verdict": diagnosis.verdict,
+        "added": [item.candidate.name for item in diagnosis.added],
+        "n": fit.model.n,
+        "seconds": time.perf_counter() - begin,
+    }
 
 
 if __name__ == "__main__":
