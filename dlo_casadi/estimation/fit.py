@@ -33,6 +33,8 @@ FloatArray = NDArray[np.floating]
 # Decades about the prior stiffness from which fits are started.
 DECADES = (0, -1, 1, -2, 2, -3, 3)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
+# Of many poses only so many, evenly picked, tell which decades are worth a start with all.
+POSES_OF_A_SEARCH = 40
 # Slow displacements per pose that are kept out of the noise estimate: many while an effect may
 # be missing, few once the model is taken as complete, because noise is slow, too.
 SMOOTH_MODES = 5
@@ -190,13 +192,16 @@ def starting_points(
     A start takes 0.02 to 0.1 s, less than a process takes to begin: they run in this one unless
     an executor is given.
     """
+    starts = [theta.copy() for _ in decades]
+    for start, decade in zip(starts, decades, strict=True):
+        start[0] += decade * np.log(10)
+    if len(problem.used) > POSES_OF_A_SEARCH and not problem.unknowns.model.has_state:
+        few = problem.thinned(POSES_OF_A_SEARCH)
+        starts = [point.theta for point in starting_points(few, theta, decades, executor)[:3]]
     shapes, feet = measured_shapes(problem)
     problem.refresh(feet)
     held = np.zeros(problem.unknowns.size, dtype=bool)
     held[: problem.unknowns.n_parameters] = True
-    starts = [theta.copy() for _ in decades]
-    for start, decade in zip(starts, decades, strict=True):
-        start[0] += decade * np.log(10)
     begin = partial(all_at_once, problem, shapes, feet, held=held)
     found = map_in_order(executor or InProcess(), begin, starts)
     points = [point for point in found if point is not None and np.isfinite(point.objective)]

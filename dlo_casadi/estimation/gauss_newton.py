@@ -348,6 +348,21 @@ class BatchProblem:
             return None
         return self.evaluate(theta, shapes, point.feet)
 
+    def thinned(self, most: int) -> BatchProblem:
+        """Return the problem of at most so many of the fitted poses, evenly picked.
+
+        Not for models with a state, whose poses depend on those before them.
+        """
+        fitted = [self.measured[j] for j in self.used]
+        return BatchProblem(
+            self.unknowns,
+            fitted[:: -(-len(fitted) // most)],
+            self.noise,
+            self.tolerances,
+            self.roughness_std,
+            self.scatter,
+        )
+
     def changed(
         self, noise: NoiseModel, roughness_std: float, scatter: FloatArray | None = None
     ) -> BatchProblem:

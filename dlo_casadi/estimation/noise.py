@@ -8,7 +8,7 @@ rough (exponential) or smooth (squared exponential) is chosen by likelihood.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -148,7 +148,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
 
 
 def estimate_noise(
-    samples: list[NoiseSample], cable_length: float, max_points: int = 80
+    samples: list[NoiseSample], cable_length: float, max_points: int = 80, max_poses: int = 60
 ) -> NoiseModel:
     """Estimate size and correlation of the noise from normal distances of all poses.
 
@@ -158,9 +158,12 @@ def estimate_noise(
     cable_length : float [m]
     max_points : int
         Points used per pose; evenly thinned beyond that.
+    max_poses : int
+        Poses from which the correlation is estimated, evenly picked; its size is that of all.
     """
     samples = [sample.thinned(max_points) for sample in samples]
     samples = [sample for sample in samples if len(sample.distances) > sample.own.shape[1] + 5]
+    everything, samples = samples, samples[:: max(1, -(-len(samples) // max_poses))]
     white_deviance, white_std = restricted_deviance(NoiseModel(1.0), samples)
     # A correlation that is there but weak must not be dropped: it makes smooth residuals
     # look significant. So the likelihood alone decides, without a price on the parameters.
@@ -188,4 +191,6 @@ def estimate_noise(
             model = unit(found.x)
             _, std = restricted_deviance(model, samples)
             best = NoiseModel(std, float(model.share), float(model.length), kernel)
-    return best
+    if len(everything) == len(samples):
+        return best
+    return replace(best, std=restricted_deviance(replace(best, std=1.0), everything)[1])
