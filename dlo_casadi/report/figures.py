@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import StrMethodFormatter
 from numpy.typing import NDArray
 
+from dlo_casadi.estimation.moment import LEAST_POINTS, law_of, measured_moment_curve
 from dlo_casadi.report.canvas import (
     BLACK,
     BLUE,
@@ -55,6 +56,8 @@ def write_figures(folder: Path, outcome: Outcome) -> None:
         draw_candidates(folder / "candidates.png", outcome)
     if outcome.unexplained is not None:
         draw_unexplained(folder / "unexplained.png", outcome)
+    if outcome.config.experiment.boundary.end == "free":
+        draw_moment(folder / "moment.png", outcome)
     if any(pose.image is not None for pose in outcome.poses):
         write_overlays(folder / "overlays", outcome)
 
@@ -259,6 +262,30 @@ def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
         straight = outcome.config.cable.rest_shape == "straight"
         note = "declared straight, not fitted" if straight else "shape without load"
         drawing.suptitle(f"{outcome.config.cable.name}: rest curvature ({note})", fontsize=12)
+
+
+def draw_moment(path: Path, outcome: Outcome) -> None:
+    """Bending moment against curvature of a cable with a free end, measured and fitted."""
+    cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
+    weight = cable.mass / cable.length * float(np.hypot(*gravity))
+    shown = [p for p in outcome.poses if p.role == "fit" and len(p.points) >= LEAST_POINTS]
+    if not weight or not shown or cable.rest_shape != "straight":
+        return  # the moment needs the weight, and the bend the shape without load
+    with figure(path, (8.5, 4.5)) as drawing:
+        axes = drawing.subplots()
+        most = 0.0
+        for pose in shown:
+            found = measured_moment_curve(pose.points, cable.length, weight, gravity)
+            bend, moment = np.abs(found.curvature), 1e3 * np.abs(found.moment)
+            label = "from the centre-line alone" if pose is shown[0] else None
+            axes.plot(bend, moment, ".", color=BLUE, label=label)
+            most = max(most, float(bend.max()))
+        grid = np.linspace(0.0, most, 200)
+        law = law_of(outcome.fit.model, outcome.fit.p, grid)
+        axes.plot(grid, 1e3 * law, color=VERMILLION, label="fitted law of the section")
+        axes.set(xlabel="curvature [1/m]", ylabel="bending moment [N mm]", xlim=(0, None))
+        drawing.legend(loc="outside lower center", ncols=2)
+        drawing.suptitle(f"{cable.name}: moment against curvature", fontsize=12)
 
 
 # ---- errors ------------------------------------------------------------------------------------
