@@ -33,7 +33,7 @@ FloatArray = NDArray[np.floating]
 # Decades about the prior stiffness from which fits are started.
 DECADES = (0, -1, 1, -2, 2, -3, 3)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
-# Of many poses only so many, evenly picked, tell which decades are worth a start with all.
+# Of many poses only so many, evenly picked, are searched for where to start with all.
 POSES_OF_A_SEARCH = 40
 # Slow displacements per pose that are kept out of the noise estimate: many while an effect may
 # be missing, few once the model is taken as complete, because noise is slow, too.
@@ -195,9 +195,6 @@ def starting_points(
     starts = [theta.copy() for _ in decades]
     for start, decade in zip(starts, decades, strict=True):
         start[0] += decade * np.log(10)
-    if len(problem.used) > POSES_OF_A_SEARCH and not problem.unknowns.model.has_state:
-        few = problem.thinned(POSES_OF_A_SEARCH)
-        starts = [point.theta for point in starting_points(few, theta, decades, executor)[:3]]
     shapes, feet = measured_shapes(problem)
     problem.refresh(feet)
     held = np.zeros(problem.unknowns.size, dtype=bool)
@@ -368,29 +365,35 @@ def fit_model(
         scatter = SCATTER_FLOOR * scatter
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.rest.n_coefficients))
-    points = starting_points(problem, theta, decades) or starting_points(
-        problem, theta, BETWEEN_DECADES
-    )
-    if not points:
+    best = None
+    if len(problem.used) > POSES_OF_A_SEARCH and not model.has_state:
+        rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)
+        best = rough and _search(problem, rough.theta, (0,))
+    best = best or _search(problem, theta, decades)
+    if best is None:
         raise EstimationError(
             f"no stiffness within {max(decades)} decades of {model.cable.bending_stiffness:.3g} "
             "N m^2 gives an equilibrium near the measured shapes.\n"
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )
-    best: tuple[Point, bool] | None = None
-    for point in points[:3]:
-        candidate = problem.descend(point, tolerance=1e-2)
-        if best is None or candidate[0].objective < best[0].objective - 0.5:
-            better = best is not None
-            best = candidate
-            if better:
-                continue
-        elif abs(candidate[0].objective - best[0].objective) < 1.0:
-            break
-    assert best is not None
-    problem, point, converged = refine(problem, best[0], estimate=std is None)
+    problem, point, converged = refine(problem, best, estimate=std is None)
     return Fit(problem, point, converged)
+
+
+def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Point | None:
+    """The best of the minima that the starts over decades of stiffness lead to."""
+    points = starting_points(problem, theta, decades) or starting_points(
+        problem, theta, BETWEEN_DECADES
+    )
+    best: Point | None = None
+    for point in points[:3]:
+        candidate, _ = problem.descend(point, tolerance=1e-2)
+        if best is None or candidate.objective < best.objective - 0.5:
+            best = candidate
+        elif abs(candidate.objective - best.objective) < 1.0:
+            break
+    return best
 
 
 def _continue(
