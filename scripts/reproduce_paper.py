@@ -4,7 +4,7 @@
                                       [--monte-carlo N] [--scale]
 
 Writes index.html, paper.json and figures/ to results/paper/. Parts that are not run keep their
-earlier results.
+earlier results: `--only --scale` runs nothing but the scale.
 """
 
 from __future__ import annotations
@@ -19,29 +19,50 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from paper import energies, page
+from paper import energies, equations, monte_carlo, page, scale, tables, timing
 from paper.content import Part
 
-ORDER = ("table4",)
+from dlo_casadi.parallel import open_executor
+
+ORDER = ("table4", "replica", "equations", "speed")
+LONG = ("monte_carlo", "scale")
 
 
 def main() -> int:
     """Run the parts, print what they found, write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, default=Path("results/paper"))
-    parser.add_argument("--only", nargs="+", choices=ORDER, help="parts to run")
+    parser.add_argument("--only", nargs="*", choices=ORDER, help="of these parts, run no others")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
+    parser.add_argument("--monte-carlo", type=int, default=0, metavar="N", help="simulated sets")
+    parser.add_argument("--scale", action="store_true", help="up to 1000 poses")
     parser.add_argument("--quiet", action="store_true", help="print only what was missed")
     args = parser.parse_args()
-    runs: dict[str, Callable[[], Part]] = {"table4": energies.run}
-    parts = []
-    for name in args.only or runs:
-        begin = perf_counter()
-        part = runs[name]()
-        part.seconds = perf_counter() - begin
-        parts.append(part)
+
+    def tell(text: str) -> None:
         if not args.quiet:
-            print(f"{name}: {part.seconds:.1f} s", flush=True)
-    result = page.write(args.output, parts, ORDER)
+            print(text, flush=True)
+
+    parts = []
+    with open_executor(args.jobs) as executor:
+        runs: dict[str, Callable[[], Part]] = {
+            "table4": energies.run,
+            "replica": lambda: tables.run(executor),
+            "equations": lambda: equations.run(executor),
+            "speed": timing.run,
+            "monte_carlo": lambda: monte_carlo.run(executor, args.monte_carlo, tell),
+            "scale": lambda: scale.run(tell),
+        }
+        chosen = list(ORDER if args.only is None else args.only)
+        chosen += ["monte_carlo"] if args.monte_carlo else []
+        chosen += ["scale"] if args.scale else []
+        for name in chosen:
+            begin = perf_counter()
+            part = runs[name]()
+            part.seconds = perf_counter() - begin
+            parts.append(part)
+            tell(f"{name}: {part.seconds:.1f} s")
+    result = page.write(args.output, parts, (*ORDER, *LONG))
     report(result, args.quiet)
     print(args.output / "index.html")
     return 0

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure as Drawing
+from numpy.typing import NDArray
 
 from dlo_casadi.report.canvas import styled
 
@@ -87,10 +89,15 @@ def drawing(
     with styled(size) as figure:
         yield figure
         text = io.StringIO()
-        # Text stays text, and equal drawings are equal files.
-        with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        # Equal drawings are equal files.
+        with mpl.rc_context({"svg.hashsalt": name}):
             figure.savefig(text, format="svg", metadata={"Date": None})
     section.pictures.append(Picture(name, caption, text.getvalue()))
+
+
+def rms(values: NDArray[np.floating]) -> float:
+    """Root mean square."""
+    return float(np.sqrt((values**2).mean()))
 
 
 def number(value: float | None, digits: int = 2) -> str:

@@ -13,7 +13,7 @@ from dlo_casadi.equilibrium import JOINT_BOUND
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.model import DEVIATIONS
 from paper import published
-from paper.content import Claim, Part, Section, Table, Target, mm, number
+from paper.content import Claim, Part, Section, Table, Target, mm, number, rms
 
 FloatArray = NDArray[np.floating]
 
@@ -77,11 +77,6 @@ def rows_of_table_4(roundings: int = ROUNDINGS) -> list[Row]:
             )
         )
     return rows
-
-
-def rms(distances: FloatArray) -> float:
-    """Root mean square."""
-    return float(np.sqrt((distances**2).mean()))
 
 
 def with_bounded_heading(pose: Pose) -> float:
@@ -190,6 +185,7 @@ def _claims(rows: list[Row], printed: list[dict[str, float]], off: list[float]) 
     good = sum(abs(gap) <= ENERGY_TOLERANCE for gap in off)
     pairs = list(zip(rows, printed, strict=True))
     after = [abs(row.after - line["V_thetaf_alphaf_J"]) for row, line in pairs]
+    close = sum(gap <= 2.0 for gap in after)
     odd = [
         row.pose.name
         for row, line in pairs
@@ -197,6 +193,12 @@ def _claims(rows: list[Row], printed: list[dict[str, float]], off: list[float]) 
     ]
     rises = sum(line["V_theta0_alpha0_J"] < line["V_thetaf_alpha0_J"] for line in printed)
     gain = np.mean([line["rmse_alpha0_m"] - line["rmse_alphaf_m"] for line in printed])
+    share = np.mean([1 - line["rmse_alphaf_m"] / line["rmse_alpha0_m"] for line in printed])
+    gains = [1e3 * (line["rmse_alpha0_m"] - line["rmse_alphaf_m"]) for line in printed]
+    coarse, fine = (next(r for r in published.table(5) if r["n"] == n) for n in (10, 20))
+    seen = published.table(6)
+    factors = [line["rmse_alpha0_m"] / line["rmse_predicted_m"] for line in seen]
+    predicted = max(1e3 * (line["rmse_alpha0_m"] - line["rmse_predicted_m"]) for line in seen)
     without = np.mean([line["rmse_alpha0_m"] - line["rmse_alphaf_m"] for line in printed[:-1]])
     return [
         Claim(
@@ -209,9 +211,9 @@ def _claims(rows: list[Row], printed: list[dict[str, float]], off: list[float]) 
         Claim(
             "Table 4",
             "V(θᶠ, αᶠ) of twelve poses",
-            f"from the printed αᶠ alone: median difference {np.median(after):.2f} J, largest "
+            f"from the printed αᶠ alone: {close} of 12 within 2 J, largest difference "
             f"{max(after):.2f} J",
-            "holds" if max(after) < 10 else "in part",
+            "holds" if close == 12 else "in part",
         ),
         Claim(
             "Table 4",
@@ -232,6 +234,36 @@ def _claims(rows: list[Row], printed: list[dict[str, float]], off: list[float]) 
             f"the printed columns give {1e3 * gain:.1f} mm; without the last pose "
             f"{1e3 * without:.1f} mm",
             "in part",
+        ),
+        Claim(
+            "Section 4.2",
+            "accuracy increased by 28 % on average",
+            f"the printed columns give {100 * share:.0f} %",
+            "holds" if abs(share - 0.28) < 0.01 else "in part",
+        ),
+        Claim(
+            "Section 4.2",
+            "from 10 to 20 links RMSE falls by 0.4 mm and the time grows fourfold",
+            f"Table 5: {1e3 * (coarse['rmse_m'] - fine['rmse_m']):.1f} mm, "
+            f"{fine['average_time_s'] / coarse['average_time_s']:.1f} times",
+            "holds",
+        ),
+        Claim(
+            "Abstract",
+            "parameter estimation reduces prediction errors by an order of magnitude",
+            f"Table 6, the poses that were predicted: a factor of {min(factors):.1f} to "
+            f"{max(factors):.1f}",
+            "does not hold",
+        ),
+        Claim(
+            "Tables 4 and 6",
+            "αᶠ instead of α⁰ moves the shapes onto the cable",
+            "between α⁰ and the printed αᶠ the equilibria move by "
+            f"{mm(min(row.distance for row in rows), 1)} to "
+            f"{mm(max(row.distance for row in rows), 1)} mm; printed gains of up to "
+            f"{max(gains):.0f} mm (Table 4) and {predicted:.0f} mm (Table 6) need more than that. "
+            "In Table 4 θᶠ was also pulled towards the photographs; in Table 6 it was not",
+            "does not hold",
         ),
     ]
 
