@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,8 @@ def estimate_pull(base: Fit) -> Pull | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
     The fit without it may have gone far astray, so that it is no place to start from: on a
-    coarse mesh, stiffnesses over decades and places along the cable are searched anew. The best
-    are refitted in full, the place along with everything else.
+    coarse mesh, stiffnesses over decades and places along the cable are searched anew, the best
+    refitted with the place along with everything else, and the best of those on the base's mesh.
     """
     effect = UnknownPull()
     length = base.model.cable.length
@@ -69,7 +69,7 @@ def estimate_pull(base: Fit) -> Pull | None:
     best: Fit | None = None
     for fit in coarse:
         try:
-            refined = fit_model(
+            best = fit_model(
                 model,
                 base.problem.history,
                 base.problem.tolerances,
@@ -78,10 +78,9 @@ def estimate_pull(base: Fit) -> Pull | None:
                 start=fit,
                 max_iterations=MOST_STEPS,
             )
+            break
         except EstimationError:
             continue
-        if best is None or refined.point.objective < best.point.objective:
-            best = refined
     if best is None:
         return None
     columns = [DEVIATIONS.index(axis) for axis in effect.per_pose]
@@ -95,7 +94,7 @@ def estimate_pull(base: Fit) -> Pull | None:
 
 
 def _search(base: Fit, model: CableModel, free: list[str], name: str) -> list[Fit]:
-    """Best fits on a coarse mesh with the place held, one for each place, the best first."""
+    """Fits on a coarse mesh from the most promising places, the best first."""
     problem = base.problem
     chosen = np.array([key in free for key in model.names])
     starts: list[tuple[BatchProblem, Point]] = []
@@ -119,9 +118,25 @@ def _search(base: Fit, model: CableModel, free: list[str], name: str) -> list[Fi
         starts += [(trial, point) for point in points[:1]]
     starts = sorted(starts, key=lambda item: item[1].objective)[:TRIED]
     fits = []
+    everything = chosen.copy()
+    everything[model.names.index(name)] = True
     for trial, point in starts:
         trial.refresh(point.feet)
-        fits.append(Fit(trial, *trial.descend(point)))
+        held = Fit(trial, *trial.descend(point))
+        unknowns = Unknowns(model, everything, held.p, problem.unknowns.rest_free)
+        moving = BatchProblem(
+            unknowns,
+            problem.history,
+            problem.noise,
+            problem.tolerances,
+            problem.roughness_std,
+            trial.scatter,
+            sweep,
+        )
+        moving.share_metric(trial)
+        theta = unknowns.pack(held.p, held.coefficients)
+        start = replace(held.point, theta=theta)
+        fits.append(Fit(moving, *moving.descend(start, MOST_STEPS)))
     return sorted(fits, key=lambda fit: fit.point.objective)
 
 

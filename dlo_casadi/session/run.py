@@ -39,6 +39,7 @@ from dlo_casadi.session.outcome import Discretization, MeasurementSummary, Outco
 from dlo_casadi.session.progress import Clock, Progress, Silent
 from dlo_casadi.session.remarks import fit_warnings, reading_warnings
 from dlo_casadi.session.stages import algorithm1_stage, fit_stage, initial_stage, stiffness_stage
+from dlo_casadi.workers import one_thread
 
 
 def run_session(config: Config, progress: Progress | None = None) -> Outcome:
@@ -57,7 +58,8 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     clock = Clock()
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
     try:
-        return fit_session(config, inputs, clock, progress)
+        with one_thread():
+            return fit_session(config, inputs, clock, progress)
     except DloError as error:
         error.poses = inputs  # for whoever tells what had been read
         raise

@@ -24,6 +24,7 @@ KEYS = {
     "verdict": str,
     "unexplained": type(None),
     "next_pose": type(None),
+    "structure": type(None),
 }
 
 
