@@ -304,37 +304,28 @@ class CableModel:
         """Whether the end moves with the force on it while the headings stay."""
         return self.extensible or self.bowed
 
-    def _section(self, bend: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Section laws by cell, for the energy EI/2 factor law(bend) per length.
-
-        Returns law, its first and second derivative by the bend, and the mean and half the
-        difference of the factors of the cell's two halves.
-        """
-        cells, k = self.chain.cells, ca.SX.sym("bend", self.chain.n_cells)
-        middle = cells.mean(axis=1)
-        halves = [np.stack(pair, axis=1) for pair in ((cells[:, 0], middle), (middle, cells[:, 1]))]
-        law, first, second = k**2, ca.SX(1), ca.SX(1)
-        for effect, local in self._slot(SectionLaw):
-            factor = effect.factor(k, cells, self.cable, local)
-            if ca.depends_on(factor, k) or not self.bowed:
-                law = law * factor
-            else:
-                first = first * effect.factor(k, halves[0], self.cable, local)
-                second = second * effect.factor(k, halves[1], self.cable, local)
-        slope = ca.gradient(ca.sum1(law), k)
-        function = ca.Function("law", [k, self._p], [law, slope, ca.gradient(ca.sum1(slope), k)])
-        return *function(bend, self._p), (first + second) / 2, (first - second) / 2
-
     def _bending_energy(self, curve: Curve) -> ca.SX:
-        """Bending energy [J]; to second order in the bows, orthogonal to the cell's mean bend."""
-        width = ca.DM(np.diff(self.chain.cells, axis=1).ravel())
-        law, slope, curvature, mean, difference = self._section(curve.strain - self._rest)
-        density = mean * law
+        """Bending energy [J]: of each cell's mean bend, and of its bow to second order."""
+        cells = self.chain.cells
+        width, bend = ca.DM(np.diff(cells, axis=1).ravel()), curve.strain - self._rest
+        density, tangent, uneven = self._p[0] / 2 * bend**2, ca.SX(1), ca.SX(0)
+        middle = cells.mean(axis=1)
+        halves = [np.stack(p, axis=1) for p in ((cells[:, 0], middle), (middle, cells[:, 1]))]
+        for effect, local in self._slot(SectionLaw):
+            if not self.bowed or effect.even:
+                density = density * effect.factor(bend, cells, self.cable, local)
+                tangent = tangent * effect.tangent(bend, cells, self.cable, local)
+                continue
+            first, second = (effect.factor(bend, c, self.cable, local) for c in halves)
+            density = density * (first + second) / 2
+            tangent = tangent * (first + second) / 2
+            uneven += (first - second) / (first + second)
         if self.bowed:
             # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
             bowed = 4 / np.sqrt(3) * curve.bow / (width * self._stretch)
-            density += mean * curvature * bowed**2 / 2 + difference * slope * bowed
-        return self._p[0] / 2 * ca.dot(width, density) * self._stretch
+            # Where the halves resist differently, a mean bend bows the cell.
+            density += self._p[0] / 2 * tangent * (bowed**2 + 2 * uneven * bend * bowed)
+        return ca.dot(width, density) * self._stretch
 
     def _energy(self, curve: Curve) -> ca.SX:
         """Energy of bending, weight, loads and holders [J], without stretching."""

@@ -35,6 +35,7 @@ class BendingSoftening(SectionLaw):
     """
 
     name = "bending_softening"
+    even = True
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the softness."""
@@ -44,7 +45,18 @@ class BendingSoftening(SectionLaw):
         self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
     ) -> ca.SX:
         """Energy over EI k^2 / 2: 2 int_0^1 t / (1 + t |k|/c) dt, by quadrature in t."""
-        delta = _ROUNDING * cable.curvature_scale
-        ratio = params["softness"] * (ca.sqrt(bend * bend + delta**2) - delta)
+        ratio = self._ratio(bend, cable, params)
         terms = [2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)]
         return sum(terms, start=ca.SX.zeros(bend.shape))
+
+    def tangent(
+        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
+    ) -> ca.SX:
+        """dM/dk over EI: (1 + |k|/c)^-2."""
+        return 1 / (1 + self._ratio(bend, cable, params)) ** 2
+
+    @staticmethod
+    def _ratio(bend: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """|k|/c, rounded."""
+        delta = _ROUNDING * cable.curvature_scale
+        return params["softness"] * (ca.sqrt(bend * bend + delta**2) - delta)

@@ -99,6 +99,8 @@ class SectionLaw(Effect):
     """Slot `section`: how much the section resists bending. Section laws multiply."""
 
     slot: ClassVar[str] = "section"
+    # Whether the law is the same all along the cable.
+    even: ClassVar[bool] = False
 
     def factor(
         self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
@@ -117,6 +119,16 @@ class SectionLaw(Effect):
         (n_cells,) [1]
         """
         raise TypeError(f"{self.name} has no section law")
+
+    def tangent(
+        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
+    ) -> ca.SX:
+        """Factor on the stiffness against a small change of the bend, shaped as `factor`.
+
+        Only the bow of quadratic elements asks for it, of laws that are the same all along the
+        cable, so that it may be approximate.
+        """
+        return self.factor(bend, cells, cable, params)
 
 
 class Kinematics(Effect):
