@@ -274,7 +274,9 @@ def test_charts_are_there_for_what_the_outcome_holds(outcome):
     full = diagnosed(outcome, unexplained=LOAD, verdict="unexplained")
     drawn = charts(full)
     assert set(drawn) == always | {"chart-next", "chart-pull"}
-    assert all("NaN" not in text for text in drawn.values())
+    for text in drawn.values():
+        json.loads(text, parse_constant=pytest.fail)
+        assert '"nan"' not in text
 
 
 def test_a_run_without_a_prediction_shows_what_was_measured(outcome):
