@@ -254,6 +254,9 @@ class _BatchNlp:
             {"x": x, "p": p, "f": objective, "g": g},
             {
                 "print_time": False,
+                # Multipliers of p are not wanted; the gradient for them takes minutes to build.
+                "no_nlp_grad": True,
+                "calc_lam_p": False,
                 "grad_f": ca.Function("grad_f", [x, p], [objective, ca.vertcat(by_theta, *by_own)]),
                 "jac_g": ca.Function("jac_g", [x, p], [g, ca.vertcat(*rows)]),
                 "hess_lag": ca.Function("hess_lag", [x, p, lam_f, lam_g], [ca.triu(hessian)]),
