@@ -1,9 +1,10 @@
-"""Benchmark of the generated C solver and of many sessions; prints the compiler and its flags.
+"""Benchmark of the generated C solver, of its peers and of many sessions.
 
     python scripts/benchmark.py --output DIR [--only PART ...]
 
-Saves benchmark.json and benchmark.png. Everything runs on one machine in one run; medians and
-99th percentiles are over all solves, "best" is the median over the poses of each pose's fastest.
+Prints the compiler and its flags; saves benchmark.json and benchmark.png. Everything runs on one
+machine in one run; medians and 99th percentiles are over all solves, "best" is the median over the
+poses of each pose's fastest.
 """
 
 import argparse
@@ -17,11 +18,11 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks import fleet, memory, random_cables, speed
+from benchmarks import fleet, memory, peers, random_cables, speed
 
 from dlo_casadi.chain import ELEMENTS
 
-PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory", "fleet")
+PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory", "peers", "fleet")
 
 
 def run_speed() -> dict[str, Any]:
@@ -141,6 +142,7 @@ def main() -> int:
         "random": lambda: run_random(chosen.cables, 100),
         "ipopt": lambda: run_ipopt(chosen.ipopt_problems),
         "memory": memory.run,
+        "peers": peers.run,
         "fleet": fleet.run,
     }
     result: dict[str, Any] = {"compiler": speed.compiler(), "flags": list(speed.FLAGS)}
