@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, f, norm
 
 from dlo_casadi.estimation.fit import Fit
-from dlo_casadi.estimation.noise import smooth_modes
+from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
 
 FloatArray = NDArray[np.floating]
 
 NO_DEVIATION = (np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
-# Slow sines per pose in which a missing effect would show.
-MODES = 6
 
 
 @dataclass(frozen=True)
@@ -56,12 +54,7 @@ class Structure:
 
 def noise_degrees(fit: Fit) -> float:
     """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
-    if fit.noise.declared:
-        return float("inf")
-    if fit.noise.share == 0:
-        return float(fit.problem.n_points)
-    independent = fit.model.cable.length / (np.sqrt(2 * np.pi) * fit.noise.length)
-    return float(max(4.0, len(fit.problem.used) * independent))
+    return float("inf") if fit.noise.declared else max(4.0, fit.noise.slow_dof)
 
 
 def structure_of(fit: Fit) -> Structure:
@@ -71,7 +64,7 @@ def structure_of(fit: Fit) -> Structure:
     coefficients, own, arms = [], [], []
     inner = normal.inner or [NO_DEVIATION] * len(problem.used)
     for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
-        modes = smooth_modes(s, model.cable.length, MODES, model.end == "free")
+        modes = smooth_modes(s, model.cable.length, SLOW_MODES, model.end == "free")
         basis, _ = np.linalg.qr(problem.whitening(j, s) @ modes)
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
         covariance = np.eye(basis.shape[1])

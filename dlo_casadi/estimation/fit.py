@@ -251,21 +251,23 @@ def noise_of(
     model = problem.unknowns.model
     length = model.cable.length
     size = problem.unknowns.size
-    stacked = np.concatenate([directions[:, :size] for directions in lin.raw_directions])
-    stacked = stacked / np.maximum(np.abs(stacked).max(axis=0), 1e-300)
-    left, values, _ = np.linalg.svd(stacked, full_matrices=False)
-    shared = left[:, values > 1e-6 * values[0]]
-    cuts = np.cumsum([len(s) for s in point.feet])[:-1]
-    samples = []
-    for k, (s, block) in enumerate(zip(point.feet, np.split(shared, cuts), strict=True)):
-        own = lin.raw_directions[k][:, size:]
-        own = own / np.maximum(np.abs(own).max(axis=0), 1e-300)
+    bases, left_over = [], []
+    scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in lin.raw_directions], axis=0)
+    for directions, s in zip(lin.raw_directions, point.feet, strict=True):
+        own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
         slow = smooth_modes(s, length, modes, model.end == "free")
         basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
-        weight = problem.measured[problem.used[k]].relative_std
-        samples.append(
-            NoiseSample(lin.raw[k], s, weight, basis[:, values > 1e-3 * values[0]], block)
-        )
+        basis = basis[:, values > 1e-3 * values[0]]
+        shared = directions[:, :size] / np.maximum(scale, 1e-300)
+        bases.append(basis)
+        left_over.append(shared - basis @ (basis.T @ shared))
+    # A direction that the poses' own ones hold already costs no further degree of freedom.
+    left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
+    blocks = np.split(left[:, values > 1e-6], np.cumsum([len(s) for s in point.feet])[:-1])
+    samples = [
+        NoiseSample(lin.raw[k], s, problem.measured[problem.used[k]].relative_std, own, block)
+        for k, (s, own, block) in enumerate(zip(point.feet, bases, blocks, strict=True))
+    ]
     return estimate_noise(samples, length)
 
 

@@ -19,6 +19,8 @@ from scipy.optimize import minimize
 FloatArray = NDArray[np.floating]
 Kernel = Literal["exponential", "matern", "gaussian"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
+# Slow sines per pose in which a missing effect would show.
+SLOW_MODES = 6
 
 
 def correlation(kernel: Kernel, ratio: FloatArray) -> FloatArray:
@@ -46,6 +48,8 @@ class NoiseModel:
     kernel : "exponential", "matern" or "gaussian"
     declared : bool
         Whether the standard deviation was declared instead of estimated.
+    slow_dof : float
+        Degrees of freedom of chi-square with which the variance of slow modes is known.
     """
 
     std: float
@@ -53,6 +57,7 @@ class NoiseModel:
     length: float = 0.0
     kernel: Kernel = "matern"
     declared: bool = False
+    slow_dof: float = np.inf
 
     def covariance(self, s: FloatArray, weight: FloatArray) -> FloatArray:
         """Covariance matrix (K, K) [m^2] at arc lengths s."""
@@ -91,7 +96,8 @@ class NoiseSample:
     own : (K, a)
         Directions that the curve of this pose alone may take; projected out.
     shared : (K, b)
-        Directions along which all poses move together; projected out.
+        Directions along which all poses move together; projected out. Stacked over the poses
+        they are independent of one another and of the poses' own directions.
     """
 
     distances: FloatArray
@@ -164,33 +170,107 @@ def estimate_noise(
     samples = [sample.thinned(max_points) for sample in samples]
     samples = [sample for sample in samples if len(sample.distances) > sample.own.shape[1] + 5]
     everything, samples = samples, samples[:: max(1, -(-len(samples) // max_poses))]
-    white_deviance, white_std = restricted_deviance(NoiseModel(1.0), samples)
     # A correlation that is there but weak must not be dropped: it makes smooth residuals
     # look significant. So the likelihood alone decides, without a price on the parameters.
-    best, best_deviance = NoiseModel(white_std), white_deviance
-    low, high = np.log(0.002), np.log(0.1)
-    for kernel in KERNELS:
-
-        def unit(q: FloatArray, kernel: Kernel = kernel) -> NoiseModel:
-            share = 0.98 / (1 + np.exp(-np.clip(q[0], -8, 8)))
-            return NoiseModel(1.0, share, cable_length * np.exp(np.clip(q[1], low, high)), kernel)
-
-        def deviance(q: FloatArray) -> float:
-            outside = 10 * float((q[1] - np.clip(q[1], low, high)) ** 2) + 0.02 * float(q[0] ** 2)
-            return restricted_deviance(unit(q), samples)[0] + outside
-
-        simplex = np.log([[0.5, 0.04], [2.0, 0.04], [0.7, 0.1]])
-        found = minimize(
-            deviance,
-            simplex[0],
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.2, "maxfev": 40},
-        )
-        if found.fun < best_deviance:
-            best_deviance = float(found.fun)
-            model = unit(found.x)
-            _, std = restricted_deviance(model, samples)
-            best = NoiseModel(std, float(model.share), float(model.length), kernel)
+    found = [_white(samples, cable_length)]
+    found += [_correlated(samples, cable_length, kernel) for kernel in KERNELS]
+    best = min(found, key=lambda item: item.deviance)
+    noise = replace(best.noise, slow_dof=_slow_dof(found))
     if len(everything) == len(samples):
-        return best
-    return replace(best, std=restricted_deviance(replace(best, std=1.0), everything)[1])
+        return noise
+    return replace(noise, std=restricted_deviance(replace(noise, std=1.0), everything)[1])
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """Most likely noise of one kernel, with what is known of the variance of slow modes."""
+
+    noise: NoiseModel
+    deviance: float
+    log_slow: float  # logarithm of that variance, relative to the other estimates
+    log_slow_variance: float  # and how uncertain it is
+
+
+def _white(samples: list[NoiseSample], cable_length: float) -> _Estimate:
+    deviance, std = restricted_deviance(NoiseModel(1.0), samples)
+    noise = NoiseModel(std)
+    return _Estimate(
+        noise, deviance, _log_slow(noise, samples, cable_length), 2 / _degrees(samples)
+    )
+
+
+def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel) -> _Estimate:
+    """Nelder and Mead's search; the spread from the deviance's curvature at its minimum."""
+    low, high = np.log(0.002), np.log(0.1)
+
+    def unit(q: FloatArray) -> NoiseModel:
+        share = 0.98 / (1 + np.exp(-np.clip(q[0], -8, 8)))
+        return NoiseModel(
+            1.0, float(share), float(cable_length * np.exp(np.clip(q[1], low, high))), kernel
+        )
+
+    def noise_at(q: FloatArray) -> NoiseModel:
+        return replace(unit(q), std=restricted_deviance(unit(q), samples)[1])
+
+    def deviance(q: FloatArray) -> float:
+        outside = 10 * float((q[1] - np.clip(q[1], low, high)) ** 2) + 0.02 * float(q[0] ** 2)
+        return restricted_deviance(unit(q), samples)[0] + outside
+
+    simplex = np.log([[0.5, 0.04], [2.0, 0.04], [0.7, 0.1]])
+    found = minimize(
+        deviance,
+        simplex[0],
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.2, "maxfev": 40},
+    )
+    step = 0.4
+    ahead, behind = found.x + step * np.eye(2), found.x - step * np.eye(2)
+    slope = [
+        _log_slow(noise_at(a), samples, cable_length)
+        - _log_slow(noise_at(b), samples, cable_length)
+        for a, b in zip(ahead, behind, strict=True)
+    ]
+    diagonal = [
+        deviance(a) + deviance(b) - 2 * found.fun for a, b in zip(ahead, behind, strict=True)
+    ]
+    mixed = deviance(found.x + step) + deviance(found.x - step) - 2 * found.fun - sum(diagonal)
+    hessian = np.array([[diagonal[0], mixed / 2], [mixed / 2, diagonal[1]]]) / step**2
+    # -2 log likelihood: the covariance is twice the inverse; the penalty's curvature is the least.
+    values, vectors = np.linalg.eigh(hessian)
+    along = vectors.T @ (np.array(slope) / (2 * step))
+    spread = 2 / _degrees(samples) + 2 * float((along**2 / np.maximum(values, 0.04)).sum())
+    noise = noise_at(found.x)
+    return _Estimate(noise, float(found.fun), _log_slow(noise, samples, cable_length), spread)
+
+
+def _degrees(samples: list[NoiseSample]) -> float:
+    """Points less the directions that are projected out."""
+    own = sum(len(sample.distances) - sample.own.shape[1] for sample in samples)
+    return float(max(own - samples[0].shared.shape[1], 1))
+
+
+def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float) -> float:
+    """Logarithm of the geometric mean of the variance of slow modes' coefficients."""
+    sample = samples[len(samples) // 2]
+    modes = smooth_modes(sample.places, cable_length, SLOW_MODES, free_end=False)
+    seen = noise.whitening(sample.places, sample.weight) @ modes
+    return -float(np.linalg.slogdet(seen.T @ seen)[1]) / SLOW_MODES
+
+
+def _slow_dof(found: list[_Estimate]) -> float:
+    """Degrees of freedom of a chi-square whose logarithm varies as that of the slow variance.
+
+    var(log slow) = E var(log slow | kernel) + var E(log slow | kernel), kernels weighted by their
+    likelihood; var(log chi-square_k) = 2 / k.
+
+    References
+    ----------
+    Satterthwaite, Biometrics Bulletin 2 (1946); Hoeting et al., Statistical Science 14 (1999).
+    """
+    deviance = np.array([item.deviance for item in found])
+    weight = np.exp(-(deviance - deviance.min()) / 2)
+    weight /= weight.sum()
+    mean = np.array([item.log_slow for item in found])
+    within = np.array([item.log_slow_variance for item in found])
+    variance = float(weight @ (within + (mean - weight @ mean) ** 2))
+    return 2 / variance
