@@ -17,9 +17,14 @@ from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.next_pose import NextPose, next_pose
 from dlo_casadi.diagnosis.pull import Pull, estimate_pull
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
-from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
+from dlo_casadi.diagnosis.structure import (
+    Structure,
+    noise_degrees,
+    screening_degrees,
+    structure_of,
+)
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import Fit, fit_model, settle
+from dlo_casadi.estimation.fit import Fit, fit_model, noise_of, settle
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
 
@@ -138,7 +143,7 @@ def diagnose(
     """
     executor = executor or InProcess()
     current, validation = fit, cross_validate(fit)
-    before, first_structure = validation, structure_of(fit)
+    before, first_structure = validation, structure_of(fit, screening_degrees(fit))
     added: list[AddedEffect] = []
     ranked: list[Ranked] = []
     for k in range(max_effects):
@@ -170,7 +175,7 @@ def diagnose(
     step("search for a missing effect", max_effects, max_effects)
     current, added = prune(current, added, significance)
     validation = cross_validate(current)
-    structure = structure_of(current)
+    structure = structure_of(current, noise_degrees(current))
     pull = None
     if structure.p_value < significance:
         pull, current, added = _unexplained(fit, current, added)
@@ -195,7 +200,7 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
     phi = fit.point.shapes.phi
     directions = (float(phi[:, 0].mean()), float(phi[:, -1].mean()))
     listed = candidates(fit.model, center, len(fit.problem.history), exclude, directions)
-    return Screen(fit, listed).run(noise_degrees(fit)) if listed else []
+    return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
 
 
 def _corrected(p_value: float, tried: int) -> float:
@@ -207,23 +212,21 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
     """Significance of an effect under the noise that is left once it is in the model.
 
     The noise estimated without the effect holds a part of the effect, or, where it was kept out,
-    lacks a part of the noise.
+    lacks a part of the noise. Where nothing else is missing all that is left is noise, its slow
+    modes included; where something is, the noise is too large and the significance too low.
     """
-    problem = open_.problem.changed(
-        closed.noise, open_.problem.roughness_std, open_.problem.scatter
-    )
+    noise = noise_of(closed.problem, closed.point, closed.linearization, modes=0)
+    problem = open_.problem.changed(noise, open_.problem.roughness_std, open_.problem.scatter)
     problem.refresh(open_.point.feet)
     point = problem.evaluate(open_.point.theta, open_.point.shapes, open_.point.feet)
     point, _ = problem.descend(point)
-    larger = closed.problem.changed(
-        closed.noise, open_.problem.roughness_std, open_.problem.scatter
-    )
+    larger = closed.problem.changed(noise, open_.problem.roughness_std, open_.problem.scatter)
     larger.refresh(closed.point.feet)
     other = larger.evaluate(closed.point.theta, closed.point.shapes, closed.point.feet)
     other, _ = larger.descend(other)
     gain = max(2 * (point.objective - other.objective), 0.0)
     dof = len(winner.candidate.frees)
-    return _corrected(survival(gain, dof, noise_degrees(closed)), tried)
+    return _corrected(survival(gain, dof, max(4.0, noise.slow_dof)), tried)
 
 
 def _confirmed(
@@ -332,7 +335,8 @@ def _unexplained(
     n = np.log(declared.problem.n_points)
     extra = sum(len(item.candidate.frees) for item in added) * n
     better = pull is None or (2 * alone.fit.point.objective < 2 * pull.fit.point.objective + extra)
-    if better and structure_of(alone.fit).p_value > structure_of(current).p_value:
+    p_alone, p_current = (structure_of(x, noise_degrees(x)).p_value for x in (alone.fit, current))
+    if better and p_alone > p_current:
         return alone, declared, []
     return pull, current, added
 

@@ -57,8 +57,23 @@ def noise_degrees(fit: Fit) -> float:
     return float("inf") if fit.noise.declared else max(4.0, fit.noise.slow_dof)
 
 
-def structure_of(fit: Fit) -> Structure:
-    """Test the residual of a fit for what the noise does not explain."""
+def screening_degrees(fit: Fit) -> float:
+    """Degrees of freedom for a fit whose slow modes were kept out of the noise's estimate.
+
+    Their noise is extrapolated from that of fast modes. It counts as if every correlation length
+    of cable told it, which is too much: what is found so has to pass a second test, under the
+    noise that is left once it is in the model.
+    """
+    if fit.noise.declared:
+        return float("inf")
+    if fit.noise.share == 0:
+        return float(fit.problem.n_points)
+    stretches = fit.model.cable.length / (np.sqrt(2 * np.pi) * fit.noise.length)
+    return float(max(4.0, len(fit.problem.used) * stretches))
+
+
+def structure_of(fit: Fit, noise_dof: float) -> Structure:
+    """Test the residual of a fit for what the noise, known so well, does not explain."""
     problem, lin, normal = fit.problem, fit.linearization, fit.normal
     model = fit.model
     coefficients, own, arms = [], [], []
@@ -87,7 +102,6 @@ def structure_of(fit: Fit) -> Structure:
     kept = values > 0.05
     along = vectors[:, kept].T @ stacked
     statistic, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
-    noise_dof = noise_degrees(fit)
     p_value = (
         float(chi2.sf(statistic, dof))
         if np.isinf(noise_dof)
@@ -109,12 +123,12 @@ def structure_of(fit: Fit) -> Structure:
         _runs(lin.residuals),
         _rank_score(energies, np.arange(len(energies), dtype=float)),
         _rank_score(energies, spans),
-        _position_score(fit),
+        _position_score(fit, noise_dof),
         dict(zip(names, energies.tolist(), strict=True)),
     )
 
 
-def _position_score(fit: Fit) -> float:
+def _position_score(fit: Fit, noise_dof: float) -> float:
     """Score test of the ten terms of first and second degree of a displacement field (x, y)."""
     problem, lin, inner = fit.problem, fit.linearization, fit.normal.inner
     curves = problem.curves(fit.point.theta, fit.point.shapes)
@@ -142,8 +156,8 @@ def _position_score(fit: Fit) -> float:
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     kept = values > 1e-6
     along = vectors[:, kept].T @ (slope * scale)
-    score, dof, noise = float((along**2 / values[kept]).sum()), int(kept.sum()), noise_degrees(fit)
-    p_value = chi2.sf(score, dof) if np.isinf(noise) else f.sf(score / dof, dof, noise)
+    score, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
+    p_value = chi2.sf(score, dof) if np.isinf(noise_dof) else f.sf(score / dof, dof, noise_dof)
     return float(norm.isf(np.clip(p_value, 1e-12, 1 - 1e-12)))
 
 

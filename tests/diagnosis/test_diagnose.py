@@ -13,7 +13,7 @@ from dlo_casadi.diagnosis.candidates import candidates
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.screening import Screen
-from dlo_casadi.diagnosis.structure import structure_of
+from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -93,7 +93,7 @@ def test_leaving_a_pose_out_in_one_step_is_close_to_fitting_again(session):
 
 def test_structure_is_seen_before_and_not_after(fit):
     found = diagnose(fit)
-    assert structure_of(fit).p_value < 1e-6
+    assert structure_of(fit, screening_degrees(fit)).p_value < 1e-6
     assert found.structure_after.p_value > 0.005
 
 
