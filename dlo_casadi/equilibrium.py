@@ -130,9 +130,20 @@ def is_stable(matrix: FloatArray, n_conditions: int) -> bool:
     ----------
     Gould, Mathematical Programming 32 (1985).
     """
-    eigenvalues = np.linalg.eigvalsh((matrix + matrix.T) / 2)
+    # Scaling by congruence leaves the inertia; forces and lengths differ by powers of ten.
+    inner = len(matrix) - n_conditions
+    scale = np.ones(len(matrix))
+    scale[:inner] = np.sqrt(_inverse_of_largest(matrix[:inner, :inner]))
+    scale[inner:] = _inverse_of_largest(matrix[inner:, :inner] * scale[:inner])
+    eigenvalues = np.linalg.eigvalsh((matrix + matrix.T) / 2 * np.outer(scale, scale))
     floor = 1e-13 * np.abs(eigenvalues).max()
     return int((eigenvalues < floor).sum()) == n_conditions
+
+
+def _inverse_of_largest(rows: FloatArray) -> FloatArray:
+    """1 / max|.| of each row, 1 for a row of zeros."""
+    largest = np.abs(rows).max(axis=1)
+    return 1 / np.where(largest > 0, largest, 1.0)
 
 
 # Minima of the potential and of the Lagrangian that lie within this are the same one [rad].

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +45,13 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         p[0] = np.exp(log_ei)
         return p
 
-    def follow(shapes: Shapes, log_ei: float) -> tuple[Shapes, float]:
-        moved, ok = sweep.solve(shapes, at(log_ei), rest)
+    def follow(shapes: Shapes, from_log_ei: float, log_ei: float) -> tuple[Shapes, float]:
+        # Where bending dominates the weight, the shape stays and the forces grow with EI.
+        grown = replace(shapes, lam=shapes.lam * np.exp(log_ei - from_log_ei))
+        start = min(
+            shapes, grown, key=lambda x: float(np.linalg.norm(sweep.kkt(x, at(log_ei), rest)[0]))
+        )
+        moved, ok = sweep.solve(start, at(log_ei), rest)
         if not ok or not sweep.stable(moved, at(log_ei), rest).all():
             cold = _cold(model, at(log_ei), rest, used)
             if cold is None:
@@ -73,12 +78,12 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         shapes = first
         for k in range(3 * _PER_DECADE + 1):
             log_ei = prior + direction * k * step
-            shapes, total = follow(shapes, log_ei)
+            shapes, total = follow(shapes, log_ei - direction * min(k, 1) * step, log_ei)
             grid[log_ei] = (shapes, total)
     best = min(grid, key=lambda q: grid[q][1])
 
     def cost(log_ei: float) -> float:
-        return follow(grid[best][0], log_ei)[1]
+        return follow(grid[best][0], best, log_ei)[1]
 
     found = minimize_scalar(
         cost, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-3}
