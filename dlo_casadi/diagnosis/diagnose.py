@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates
 from dlo_casadi.diagnosis.confirm import Confirmed, confirm
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.equivalents import untried_equivalents
 from dlo_casadi.diagnosis.next_pose import NextPose, next_pose
 from dlo_casadi.diagnosis.pull import Pull, estimate_pull
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
@@ -38,6 +39,9 @@ WORTH = 0.1
 # A rival whose BIC falls short by more than this is told apart by the data ("very strong",
 # Kass and Raftery 1995), whatever its cross-validated error.
 BIC_APART = 10.0
+# Effects are no explanation if a pose that is left out is predicted worse than so many times the
+# noise, and than half of what it was without them.
+UNSEEN = 2.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ class AddedEffect:
         Without and with the effect.
     rivals : tuple of Confirmed
         Candidates that could not be told apart from it.
+    untried : tuple of str
+        Effects that act as it does and were not among the candidates.
     """
 
     candidate: Candidate
@@ -60,6 +66,7 @@ class AddedEffect:
     before: CrossValidation
     after: CrossValidation
     rivals: tuple[Confirmed, ...]
+    untried: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,8 +92,10 @@ class Diagnosis:
     added : tuple of AddedEffect
     ranked : tuple of Ranked
         All candidates of the first step, best first.
+    unexplained : bool
+        Whether structure is left, or poses that were left out are not predicted.
     pull : Pull or None
-        Where structure is left: the load that assumes no cause.
+        Where that is so: the load that assumes no cause; None where none fits.
     proposal : NextPose or None
         What separates the winner from its best rival.
     """
@@ -99,14 +108,15 @@ class Diagnosis:
     structure_after: Structure
     added: tuple[AddedEffect, ...] = ()
     ranked: tuple[Ranked, ...] = ()
+    unexplained: bool = False
     pull: Pull | None = None
     proposal: NextPose | None = None
     proposal_for: tuple[str, ...] = field(default_factory=tuple)
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the model is complete, an effect was found, or structure is left."""
-        if self.pull is not None:
+        """Whether the model is complete, an effect was found, or neither explains the data."""
+        if self.unexplained:
             return "unexplained"
         return "effect_found" if self.added else "complete"
 
@@ -156,7 +166,8 @@ def diagnose(
         confirmed = _confirmed(current, significant, validation, executor)
         if k == 0:
             ranked = _ranking(screened, corrected, confirmed)
-        chosen = _choose(confirmed)
+        # What a second effect explains may be what the first one, if wrong, has left.
+        chosen = _choose(confirmed, np.inf if added else BIC_APART)
         if chosen is None:
             break
         winner, rivals = chosen
@@ -176,9 +187,15 @@ def diagnose(
     current, added = prune(current, added, significance)
     validation = cross_validate(current)
     structure = structure_of(current, noise_degrees(current))
-    pull = None
-    if structure.p_value < significance:
+    pull, found = None, bool(added)
+    unpredicted = found and validation.rmse > max(UNSEEN * current.noise.std, before.rmse / 2)
+    unexplained = structure.p_value < significance or unpredicted
+    if unexplained:
         pull, current, added = _unexplained(fit, current, added)
+    tried = {row.name for row in ranked}
+    added = [
+        replace(item, untried=untried_equivalents(current, item.candidate, tried)) for item in added
+    ]
     proposal, names = _proposal(current, added)
     return Diagnosis(
         fit,
@@ -189,6 +206,7 @@ def diagnose(
         structure,
         tuple(added),
         tuple(ranked),
+        unexplained,
         pull,
         proposal,
         names,
@@ -251,8 +269,13 @@ def _confirmed(
     return out
 
 
-def _choose(confirmed: Sequence[Confirmed]) -> tuple[Confirmed, list[Confirmed]] | None:
-    """The best by cross-validation (BIC among those not clearly worse), and its rivals."""
+def _choose(
+    confirmed: Sequence[Confirmed], apart: float
+) -> tuple[Confirmed, list[Confirmed]] | None:
+    """The best by cross-validation (BIC among those not clearly worse), and its rivals.
+
+    Rivals are those not clearly worse whose BIC falls short by less than `apart`.
+    """
     if not confirmed:
         return None
     leader = min(confirmed, key=lambda item: item.validation.rmse)
@@ -260,7 +283,7 @@ def _choose(confirmed: Sequence[Confirmed]) -> tuple[Confirmed, list[Confirmed]]
         item for item in confirmed if not item.validation.clearly_worse_than(leader.validation)
     ]
     winner = max(close, key=lambda item: item.bic)
-    rivals = [item for item in close if item is not winner and item.bic > winner.bic - BIC_APART]
+    rivals = [item for item in close if item is not winner and item.bic > winner.bic - apart]
     return winner, sorted(rivals, key=lambda item: -item.bic)
 
 

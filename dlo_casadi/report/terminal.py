@@ -272,6 +272,13 @@ def structure_lines(outcome: Outcome) -> list[str]:
 def _verdict(outcome: Outcome) -> str:
     names = " and ".join(effect["name"] for effect in outcome.effects)
     if outcome.verdict == "unexplained":
+        after = outcome.structure["after"] if outcome.structure else None
+        if names and after and after["p_value"] >= outcome.config.diagnosis.significance:
+            error = outcome.effects[-1]["rmse_cross_validated_after"]
+            return (
+                f"Verdict: unexplained. With {names} every pose is fitted, but one that is left "
+                f"out is predicted {_mm(error)} off (noise {_mm(outcome.measurement.std)})."
+            )
         found = f" even with {names}" if names else ""
         return f"Verdict: unexplained. The residual is not noise{found}."
     if outcome.effects:

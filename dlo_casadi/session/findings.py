@@ -23,7 +23,7 @@ def _effect_row(item: AddedEffect, fit: Fit) -> dict[str, Any]:
         "p_value": item.p_value,
         "rmse_cross_validated_before": item.before.rmse,
         "rmse_cross_validated_after": item.after.rmse,
-        "indistinguishable_from": [rival.candidate.name for rival in item.rivals],
+        "indistinguishable_from": [*(rival.candidate.name for rival in item.rivals), *item.untried],
     }
 
 

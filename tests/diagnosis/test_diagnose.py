@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
+from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
@@ -31,9 +32,9 @@ def session():
     return declared_model(config), measured
 
 
-def fit_of(session, measured=None):
+def fit_of(session, measured=None, std=None):
     declared, own = session
-    return fit_model(declared.model.with_mesh(20), measured or own, declared.tolerances)
+    return fit_model(declared.model.with_mesh(20), measured or own, declared.tolerances, std)
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +59,37 @@ def test_without_the_cause_nothing_false_is_claimed(fit):
     found = diagnose(fit, exclude=("bending_softening",))
     tied = all(item.rivals for item in found.added)
     assert found.verdict == "unexplained" or (found.added and tied)
+
+
+def without(name: str, effect: str):
+    """Diagnosis of a bench session whose true effect is in nobody's list."""
+    config = load_config(BENCH / name / "session.yaml")
+    _, measured = read_poses(config, lambda *_: None)
+    std = config.experiment.measurement.std
+    return diagnose(fit_of((declared_model(config), measured), std=std), exclude=(effect,))
+
+
+def test_a_force_along_gravity_may_be_a_weight_that_was_not_tried():
+    (found,) = without("thin", "lumped_mass").added
+    assert found.candidate.name == "point_force"
+    assert found.untried == ("lumped_mass",)
+
+
+def test_a_force_at_a_fixture_may_be_the_fixture():
+    """A pin that grips, without springs: a force beside it fits as well."""
+    found = without("clamped", "start_spring")
+    assert found.verdict == "effect_found"
+    assert found.added[0].untried == ("start_spring",)
+    assert all(item.rivals or item.untried for item in found.added)
+
+
+def test_effects_that_do_not_predict_a_pose_left_out_are_no_explanation(monkeypatch):
+    """A stretching cable, without stretch: others fit every pose, and predict none."""
+    monkeypatch.setattr(module, "estimate_pull", lambda base: None)  # half a minute, not needed
+    found = without("stretch", "axial_stretch")
+    assert found.structure_after.p_value > 0.005
+    assert found.validation_after.rmse > 1e-3
+    assert found.verdict == "unexplained"
 
 
 def test_the_score_predicts_the_gain_of_a_refit(session):
