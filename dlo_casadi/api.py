@@ -10,6 +10,7 @@ result.predict(end=(0.3, -0.1)).points()
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from matplotlib.figure import Figure
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.equilibrium import Branch
+from dlo_casadi.errors import ConfigError
 from dlo_casadi.prediction import PredictedShape, predict
 from dlo_casadi.report.notebook import outcome_figure, outcome_html, outcome_text
 from dlo_casadi.report.parameters_file import parameters_of
@@ -108,6 +110,11 @@ def fit(
     EstimationError
         If no model of the declared cable comes near the measured shapes.
     """
+    if not isinstance(config, str | os.PathLike | Config):
+        raise ConfigError(
+            f"{config!r} is no configuration.\n"
+            '  Try: the path of a YAML file, such as "configs/cable.yaml".'
+        )
     if not isinstance(config, Config):
         config = load_config(config)
     if diagnosis is not None:

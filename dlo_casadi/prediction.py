@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -121,8 +122,13 @@ def predict(
     EquilibriumError
         If the pose has no equilibrium, e.g. because the end is out of reach.
     DloError
-        If the ends are not held as the cable's boundary asks.
+        If the ends are not held as the cable's boundary asks, or are no finite numbers.
     """
+    if not isinstance(parameters, str | os.PathLike | Parameters):
+        raise DloError(
+            f"parameters: {parameters!r} is no path.\n"
+            "  Try: the parameters.yaml or the results folder of a fit."
+        )
     cable = parameters if isinstance(parameters, Parameters) else load_parameters(parameters)
     pose = _pose(cable, end, start, start_heading, end_heading, branch)
     model, p, rest, _ = cable
@@ -142,6 +148,8 @@ def _pose(
 ) -> Pose:
     """End conditions, checked against the boundary; what is not given is as in the session."""
     model, shared = cable.model, cable.metadata.fixtures
+    if branch is not None and branch not in get_args(Branch):
+        raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
     if model.end == "free" and end is not None:
         raise DloError(f"the end of {model.cable.name!r} is free: it cannot be held at {end} m")
     if model.end != "free" and end is None:
@@ -159,6 +167,8 @@ def _pose(
             raise DloError(
                 f"the {side} of {model.cable.name!r} is {held}: a {side}_heading has no meaning"
             )
+        if headings[side] is not None:
+            headings[side] = _heading(headings[side], side)
     return Pose(
         start=_point(start if start is not None else shared.get("start") or (0.0, 0.0), "start"),
         end=None if end is None else _point(end, "end"),
@@ -169,10 +179,23 @@ def _pose(
 
 
 def _point(values: Sequence[float], what: str) -> tuple[float, float]:
-    point = np.asarray(values, dtype=float)
+    try:
+        point = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        point = np.zeros(0)
     if point.shape != (2,) or not np.all(np.isfinite(point)):
-        raise DloError(f"{what}: two finite numbers (x, y) in metres belong here, found {values}")
+        raise DloError(f"{what}: two finite numbers (x, y) in metres belong here, found {values!r}")
     return float(point[0]), float(point[1])
+
+
+def _heading(value: Any, side: str) -> float:
+    try:
+        heading = float(value)
+    except (TypeError, ValueError):
+        heading = np.nan
+    if not np.isfinite(heading):
+        raise DloError(f"{side}_heading: a finite number [rad] belongs here, found {value!r}")
+    return heading
 
 
 def _curve(

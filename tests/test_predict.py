@@ -126,6 +126,13 @@ def test_a_free_end_hangs(overhang):
         ("pinned", {"end": (0.3, float("nan"))}, "end: two finite numbers (x, y) in metres"),
         ("pinned", {"end": (0.3, 0.1, 0.0)}, "end: two finite numbers (x, y) in metres"),
         ("pinned", {"end": (0.3, 0), "start_heading": 1.0}, "a start_heading has no meaning"),
+        (
+            "pinned",
+            {"end": "ab"},
+            "end: two finite numbers (x, y) in metres belong here, found 'ab'",
+        ),
+        ("pinned", {"end": (0.3, 0), "branch": "left"}, "branch must be 'ccw', 'cw' or None"),
+        ("overhang", {"start_heading": float("nan")}, "start_heading: a finite number [rad]"),
         ("overhang", {"end": (0.3, 0.0)}, "the end of 'overhang' is free: it cannot be held"),
         ("overhang", {}, "differed from pose to pose: give start_heading [rad]"),
     ],
@@ -133,6 +140,11 @@ def test_a_free_end_hangs(overhang):
 def test_ends_that_do_not_suit_the_cable(request, file, ends, message):
     with pytest.raises(DloError, match=re.escape(message)):
         predict(request.getfixturevalue(file), **ends)
+
+
+def test_what_is_no_path_is_told():
+    with pytest.raises(DloError, match=r"3 is no path.\n  Try: the parameters.yaml"):
+        predict(3, end=(0.3, 0.0))
 
 
 def test_the_configuration_of_the_readme_is_one(tmp_path):

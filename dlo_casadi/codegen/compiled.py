@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.library import compile_library
+from dlo_casadi.codegen.poses import branch_number, no_equilibrium, one_pose, pose_table
 from dlo_casadi.codegen.shapes import STATUSES, Path2D, Shape, Slope
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
-
-_BRANCHES = {None: 0, "ccw": 1, "cw": 2}
 
 
 class CompiledSolver:
@@ -91,17 +90,6 @@ class CompiledSolver:
             *tail,
         ]
 
-    def _poses(self, ends: ArrayLike, start: ArrayLike, headings: ArrayLike) -> FloatArray:
-        """Poses (m, 6): start, end, headings."""
-        ends = np.atleast_2d(np.asarray(ends, float))
-        if ends.ndim != 2 or ends.shape[1] != 2:
-            raise DloError(f"ends must have the shape (m, 2), got {ends.shape}")
-        poses = np.zeros((len(ends), 6))
-        poses[:, 2:4] = ends
-        poses[:, :2] = np.asarray(start, float)
-        poses[:, 4:] = np.asarray(headings, float)
-        return poses
-
     def _read(self, record: Any, status: int) -> Shape:
         values = {name: record[name] for name in self.record.names or ()}
         scalars = {name: values[name].item() for name in values if values[name].ndim == 0}
@@ -112,6 +100,9 @@ class CompiledSolver:
         """Record of a shape to start from, and its address."""
         if warm is None:
             return None, None
+        count = self.model.chain.n_headings
+        if not isinstance(warm, Shape) or np.shape(warm.headings) != (count,):
+            raise DloError(f"warm: a shape of this solver, with {count} headings, belongs here")
         record = np.zeros(1, self.record)
         record["headings"], record["lam"] = warm.headings, warm.lam
         return record, record.ctypes.data
@@ -147,14 +138,16 @@ class CompiledSolver:
         ------
         EquilibriumError
             If there is no stable equilibrium and `throw` is true.
+        DloError
+            If end, start, headings, branch or warm cannot be used.
         """
-        pose = self._poses(end, start, headings)
+        pose = one_pose(end, start, headings)
         out = np.zeros(1, self.record)
         kept, address = self._warm(warm)
         work = self._work()
         status = self._c.dlo_solve(
             pose.ctypes.data,
-            _BRANCHES[branch],
+            branch_number(branch),
             address,
             out.ctypes.data,
             work.ctypes.data,
@@ -163,10 +156,7 @@ class CompiledSolver:
         del kept
         if status and throw:
             raise EquilibriumError(
-                f"no equilibrium: {STATUSES[status]} with the end at "
-                f"({pose[0, 2]:.4f}, {pose[0, 3]:.4f}) m, the start at "
-                f"({pose[0, 0]:.4f}, {pose[0, 1]:.4f}) m; the cable is "
-                f"{self.model.cable.length:.4f} m long.\n  Try: end in metres?",
+                no_equilibrium(STATUSES[status], pose[0], self.model.cable.length),
                 p_des=(float(pose[0, 2]), float(pose[0, 3])),
             )
         return self._read(out[0], status)
@@ -190,15 +180,20 @@ class CompiledSolver:
         -------
         structured array (m,), (m,)
             Records with the fields of Shape, and statuses (index into STATUSES).
+
+        Raises
+        ------
+        DloError
+            If ends, start and headings do not belong together, or there is no such branch.
         """
-        poses = self._poses(ends, start, headings)
+        poses = pose_table(ends, start, headings)
         out = np.zeros(len(poses), self.record)
         statuses = np.zeros(len(poses), np.intc)
         work = self._work()
         self._c.dlo_batch(
             poses.ctypes.data,
             len(poses),
-            _BRANCHES[branch],
+            branch_number(branch),
             out.ctypes.data,
             statuses.ctypes.data,
             work.ctypes.data,
@@ -225,8 +220,13 @@ class CompiledSolver:
             Of the first pose.
         warm : Shape, optional
             For the first pose.
+
+        Raises
+        ------
+        DloError
+            As in `solve_many`.
         """
-        poses = self._poses(ends, start, headings)
+        poses = pose_table(ends, start, headings)
         out = np.zeros(len(poses), self.record)
         statuses = np.zeros(len(poses), np.intc)
         jump = ctypes.c_size_t(0)
@@ -235,7 +235,7 @@ class CompiledSolver:
         self._c.dlo_path(
             poses.ctypes.data,
             len(poses),
-            _BRANCHES[branch],
+            branch_number(branch),
             address,
             out.ctypes.data,
             statuses.ctypes.data,
@@ -262,7 +262,7 @@ class CompiledSolver:
         EquilibriumError
             If the shape is no stable equilibrium of this pose.
         """
-        pose = self._poses(end, start, headings)
+        pose = one_pose(end, start, headings)
         record, address = self._warm(shape)
         out = np.zeros(1, self._slope)
         work = self._work()

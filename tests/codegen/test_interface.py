@@ -64,8 +64,31 @@ def test_wrong_ends_give_a_status_and_zeros(links, end, status):
     shape = links.solve(end, throw=False)
     assert shape.status == status
     assert all_zero(shape)
-    with pytest.raises(EquilibriumError, match=status):
+    with pytest.raises(EquilibriumError, match=status) as caught:
         links.solve(end)
+    hint = {"not_finite": "finite numbers for end", "unreachable": "is the end in metres?"}
+    assert hint[status] in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"end": "ab"}, "end: numbers belong here, found 'ab'"),
+        ({"end": [(0.3, -0.1), (0.4, 0.1)]}, r"found the shape \(2, 2\). Try: solve_many"),
+        ({"start": (1, 2, 3)}, r"start: two numbers belong here, found the shape \(3,\)"),
+        ({"branch": "left"}, "branch must be 'ccw', 'cw' or None, found 'left'"),
+        ({"branch": ["cw"]}, "branch must be"),
+        ({"warm": 3}, "warm: a shape of this solver, with 10 headings"),
+    ],
+)
+def test_what_is_no_pose_is_refused(links, arguments, message):
+    with pytest.raises(DloError, match=message):
+        links.solve(**({"end": (0.3, -0.1)} | arguments))
+
+
+def test_headings_must_be_as_many_as_ends(links):
+    with pytest.raises(DloError, match=r"shape \(2,\) or, as the ends, \(3, 2\); found \(2, 2\)"):
+        links.solve_many([(0.1, 0.2)] * 3, headings=[(0, 0)] * 2)
 
 
 def test_not_finite_clamps_and_warm_starts(clamped):
@@ -83,7 +106,7 @@ def test_small_workspace_and_wrong_branch(links, monkeypatch):
     assert shape.status == "workspace_too_small"
     assert all_zero(shape)
     monkeypatch.undo()
-    monkeypatch.setattr("dlo_casadi.codegen.compiled._BRANCHES", {None: 7})
+    monkeypatch.setattr("dlo_casadi.codegen.compiled.branch_number", lambda branch: 7)
     assert links.solve((0.5, 0.1), throw=False).status == "bad_argument"
 
 

@@ -54,6 +54,11 @@ def test_a_path_is_a_configuration(tmp_path):
         dlo.fit(str(tmp_path / "rope.yaml"))
 
 
+def test_a_number_is_no_configuration():
+    with pytest.raises(dlo.ConfigError, match=r"3 is no configuration.\n  Try: the path of a YAML"):
+        dlo.fit(3)
+
+
 def test_text_says_what_was_found(result):
     text = str(result)
     assert text.startswith("short_clean: ")
