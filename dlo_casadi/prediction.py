@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium import Branch, Equilibrium, Pose, solve_equilibrium
@@ -22,6 +22,36 @@ from dlo_casadi.report.notebook import shape_html, shape_text
 from dlo_casadi.report.parameters_file import Parameters, load_parameters
 
 FloatArray = NDArray[np.floating]
+
+
+# Arc lengths may miss the cable by so many of its lengths: rounding.
+_ROUNDING = 1e-9
+
+
+class CableCurve(NodeCurve):
+    """A cable from its start at s = 0 to its end at s = L = `length` [m]."""
+
+    def at(self, s: ArrayLike, derivative: int = 0) -> FloatArray:
+        """Positions (K, 2) [m] at arc lengths s (K,) [m] in [0, L], or derivatives by s.
+
+        Raises
+        ------
+        DloError
+            If an arc length lies outside the cable.
+        """
+        try:
+            places = np.atleast_1d(np.asarray(s, dtype=float)).ravel()
+        except (TypeError, ValueError):
+            raise DloError(f"s: arc lengths [m] belong here, found {s!r}") from None
+        slack = _ROUNDING * self.length
+        outside = places[~((places >= -slack) & (places <= self.length + slack))]
+        if len(outside):
+            raise DloError(
+                f"s = {outside[0]:g} m is not on the cable: {len(outside)} of {len(places)} arc "
+                f"lengths lie outside 0 to {self.length:g} m.\n"
+                "  Try: arc lengths in metres from the start."
+            )
+        return super().at(np.clip(places, 0.0, self.length), derivative)
 
 
 @dataclass(frozen=True, repr=False)
@@ -36,20 +66,28 @@ class PredictedShape:
         How its ends are held.
     equilibrium : Equilibrium
         Nodes, reactions, energy and stability.
-    curve : NodeCurve
+    curve : CableCurve
         The cable itself, at any arc length: `curve.at(s)`.
-    seen : NodeCurve
+    seen : CableCurve
         The same as the session's camera would measure it.
     """
 
     cable: Parameters
     pose: Pose
     equilibrium: Equilibrium
-    curve: NodeCurve
-    seen: NodeCurve
+    curve: CableCurve
+    seen: CableCurve
 
     def points(self, count: int = 101) -> FloatArray:
-        """Points (count, 2) [m] evenly spaced along the cable, from start to end."""
+        """Points (count, 2) [m] evenly spaced along the cable, from start to end.
+
+        Raises
+        ------
+        DloError
+            If fewer than two are asked for.
+        """
+        if not isinstance(count, int | np.integer) or count < 2:
+            raise DloError(f"count: two points or more, from start to end, found {count!r}")
         return self.curve.at(np.linspace(0.0, self.curve.length, count))
 
     def plot(self) -> Figure:
@@ -200,16 +238,16 @@ def _heading(value: Any, side: str) -> float:
 
 def _curve(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, eq: Equilibrium
-) -> NodeCurve:
+) -> CableCurve:
     """The curve as the session's camera would measure it."""
     none = np.zeros(len(DEVIATIONS))
     z = model.shape(eq.phi, eq.multipliers, p, rest, pose.vector, none)
-    return NodeCurve.of(model.chain, np.array(z).ravel())
+    return CableCurve.of(model.chain, np.array(z).ravel())
 
 
 def _true_curve(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, eq: Equilibrium
-) -> NodeCurve:
+) -> CableCurve:
     """The curve itself: the same model without what the camera adds."""
     seen = [effect for effect in model.effects if isinstance(effect, MeasurementEffect)]
     if not seen:

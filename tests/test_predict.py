@@ -87,6 +87,20 @@ def test_the_bend_radius_is_that_of_the_curve(pinned):
     assert shape.equilibrium.min_bend_radius == pytest.approx(1 / sharpest, rel=0.1)
 
 
+def test_arc_lengths_beside_the_cable_are_refused(pinned):
+    shape = predict(pinned, end=(0.3, -0.1))
+    length = shape.curve.length
+
+    ends = shape.curve.at([0.0, length * (1 + 1e-12)])  # beyond the end by rounding alone
+    assert ends == pytest.approx(shape.points(2), abs=1e-12)
+    for wrong in ([-0.1, 2.0], [0.1, np.nan]):
+        with pytest.raises(DloError, match=r"is not on the cable: . of 2 .* outside 0 to 0.55 m"):
+            shape.curve.at(wrong)
+    for count in (0, 1, 2.5):
+        with pytest.raises(DloError, match=f"two points or more, from start to end, found {count}"):
+            shape.points(count)
+
+
 def test_branches_turn_the_way_they_are_named(pinned):
     turn = {}
     for branch in ("ccw", "cw"):

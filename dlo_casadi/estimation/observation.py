@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,7 @@ class NodeCurve:
     slopes: FloatArray | None
 
     @classmethod
-    def of(cls, chain: Chain, z: FloatArray) -> NodeCurve:
+    def of(cls, chain: Chain, z: FloatArray) -> Self:
         """Unpack the observation vector z of a chain."""
         table = z.reshape((-1, chain.n + 1)).T
         return cls(chain.length, table[:, :2], table[:, 2:4] if table.shape[1] == 4 else None)
