@@ -52,7 +52,8 @@ class AddedEffect:
     ----------
     candidate : Candidate
     p_value : float
-        Score test, corrected for places and candidates.
+        Score test, corrected for places and candidates. Where the noise is estimated, the larger
+        of it and of the test under the noise that is left once the effect is in the model.
     before, after : CrossValidation
         Without and with the effect.
     rivals : tuple of Confirmed
@@ -91,13 +92,15 @@ class Diagnosis:
     structure_before, structure_after : Structure
     added : tuple of AddedEffect
     ranked : tuple of Ranked
-        All candidates of the first step, best first.
+        All candidates of the first step: those confirmed by BIC, then the others by score.
     unexplained : bool
         Whether structure is left, or poses that were left out are not predicted.
     pull : Pull or None
         Where that is so: the load that assumes no cause; None where none fits.
     proposal : NextPose or None
-        What separates the winner from its best rival.
+        What separates an effect from its best rival.
+    proposal_for : tuple of str
+        Names of those two; empty where there is no rival.
     """
 
     before: Fit

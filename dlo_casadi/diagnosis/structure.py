@@ -13,6 +13,10 @@ from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
 
 FloatArray = NDArray[np.floating]
 
+# Largest normal score of a test: tails beyond a probability of 1e-12 tell no more.
+_TAIL = 1e-12
+LARGEST_SCORE = float(norm.isf(_TAIL))
+
 NO_DEVIATION = (np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
 
 
@@ -33,10 +37,10 @@ class Structure:
         negative = fewer, longer runs. Whitened residuals.
     order_z, span_z : float
         Rank correlation of the poses' slow energy with their order and with their span, as a
-        normal score.
+        normal score, at most LARGEST_SCORE.
     position_z : float
         Score test of a displacement that is a parabola in the measured place (a lens, a board out
-        of its plane, a scale), the same in all poses; as a normal score.
+        of its plane, a scale), the same in all poses; as a normal score, at most LARGEST_SCORE.
     per_pose : dict
         Slow energy per degree of freedom by pose name.
     """
@@ -158,7 +162,7 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
     along = vectors[:, kept].T @ (slope * scale)
     score, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
     p_value = chi2.sf(score, dof) if np.isinf(noise_dof) else f.sf(score / dof, dof, noise_dof)
-    return float(norm.isf(np.clip(p_value, 1e-12, 1 - 1e-12)))
+    return float(norm.isf(np.clip(p_value, _TAIL, 1 - _TAIL)))
 
 
 def _span(fit: Fit, j: int) -> float:
@@ -189,4 +193,4 @@ def _rank_score(a: FloatArray, b: FloatArray) -> float:
         return 0.0
     ranks = [np.argsort(np.argsort(x)).astype(float) for x in (a, b)]
     rho = float(np.corrcoef(ranks[0], ranks[1])[0, 1])
-    return float(np.clip(rho * np.sqrt(len(a) - 1), norm.ppf(1e-12), -norm.ppf(1e-12)))
+    return float(np.clip(rho * np.sqrt(len(a) - 1), -LARGEST_SCORE, LARGEST_SCORE))

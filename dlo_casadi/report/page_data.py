@@ -10,11 +10,13 @@ from dlo_casadi.effects import EFFECTS
 from dlo_casadi.report.canvas import before_after, label_of, millimetres
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.terminal import (
+    CANDIDATE_ORDER,
     cross_validated,
     describe,
     fixed_rows,
     footnotes,
     nuisance_rows,
+    p_value_note,
     rest_rows,
     timing_rows,
     verdict_lines,
@@ -56,6 +58,8 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "correlation": millimetres(m.correlation_length) if m.correlation_length > 0 else None,
         "held_out": m.poses_held_out,
         "candidates": candidate_rows(outcome),
+        "candidate_order": CANDIDATE_ORDER,
+        "p_value_note": p_value_note(outcome),
         "parameters": parameter_rows(outcome),
         "nuisances": nuisance_rows(outcome),
         "fixed": fixed_rows(outcome),

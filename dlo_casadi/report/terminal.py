@@ -11,6 +11,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.canvas import label_of
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.session.outcome import Outcome, ParameterEstimate, StageName
@@ -248,7 +249,7 @@ DEPENDENCES = {
     "runs_z": "runs along the cable",
     "order_z": "the order of the poses",
     "span_z": "the distance of the ends",
-    "position_z": "the place in the picture",
+    "position_z": "the place in the {plane}",
 }
 # Normal scores beyond it are worth a word.
 NOTABLE = 3.0
@@ -259,14 +260,22 @@ def structure_lines(outcome: Outcome) -> list[str]:
     if outcome.structure is None or outcome.verdict == "complete":
         return []
     before = outcome.structure["before"]
+    plane = "picture" if outcome.measurement.kind == "images" else "plane"
     found = [
-        f"{text} (z = {before[key]:+.1f})"
+        f"{text.format(plane=plane)} ({_score(key, before[key])})"
         for key, text in DEPENDENCES.items()
         if abs(before[key]) > NOTABLE
     ]
     if not found:
         return []
     return [f"  The declared model's residual depends on {', '.join(found)}."]
+
+
+def _score(key: str, value: float) -> str:
+    """A normal score; where its test ends, only that it lies beyond."""
+    if key != "runs_z" and abs(value) >= 0.999 * LARGEST_SCORE:
+        return "z > 7" if value > 0 else "z < -7"
+    return f"z = {value:+.1f}"
 
 
 def _verdict(outcome: Outcome) -> str:
@@ -304,9 +313,25 @@ def _quantity(name: str, row: dict[str, Any]) -> str:
     return f"{name} {plus_minus(row['value'], row['std'] or 0.0)} {row['unit']}".strip()
 
 
+# How candidates are ordered; the score alone does not tell how well a refit does.
+CANDIDATE_ORDER = "first those that a refit confirms, by BIC, then the others by score"
+
+
+def p_value_note(outcome: Outcome) -> str:
+    """What the p-values of candidates and of added effects are."""
+    note = "p-value: score test in the declared model, corrected for the number of effects tried."
+    if outcome.effects and outcome.measurement.std_source == "estimated":
+        note += (
+            " The p of an added effect is the larger of that before it was added and that under "
+            "the noise left once it is in the model."
+        )
+    return note
+
+
 def candidate_table(outcome: Outcome) -> Table:
-    """Every effect that was tried, the likeliest first."""
-    table = _table("Effects that were tried, the likeliest first")
+    """Every effect that was tried, in the order of `CANDIDATE_ORDER`."""
+    table = _table(f"Effects that were tried: {CANDIDATE_ORDER}")
+    table.caption, table.caption_justify = p_value_note(outcome), "left"
     table.add_column("effect")
     for column in ("score", "p-value", "cross-validated error"):
         table.add_column(column, justify="right")

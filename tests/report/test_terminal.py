@@ -6,7 +6,14 @@ import pytest
 from rich.console import Console
 from test_figures import EFFECT, LOAD
 
-from dlo_casadi.report.terminal import describe, plus_minus, print_summary, unidentified
+from dlo_casadi.diagnosis.structure import LARGEST_SCORE
+from dlo_casadi.report.terminal import (
+    describe,
+    plus_minus,
+    print_summary,
+    structure_lines,
+    unidentified,
+)
 from dlo_casadi.session.outcome import ParameterEstimate
 
 
@@ -102,6 +109,20 @@ def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):
 
     assert "Verdict: unexplained. The residual is not noise." in text
     assert "pulled by (0, 1) N on average at 0.300 m (0.280 to 0.320 m) from the start" in text
+
+
+def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcome):
+    scores = {"order_z": 4.0, "span_z": -LARGEST_SCORE, "position_z": LARGEST_SCORE, "runs_z": -9.0}
+    found = replace(outcome, verdict="unexplained", structure={"before": scores})
+    photographs = replace(outcome.measurement, kind="images")
+
+    (line,) = structure_lines(found)
+    assert "runs along the cable (z = -9.0)" in line
+    assert "the order of the poses (z = +4.0)" in line
+    assert "the distance of the ends (z < -7)" in line
+    assert "the place in the plane (z > 7)" in line
+    (line,) = structure_lines(replace(found, measurement=photographs))
+    assert "the place in the picture (z > 7)" in line
 
 
 @pytest.mark.parametrize(
