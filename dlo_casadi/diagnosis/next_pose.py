@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 
 FloatArray = NDArray[np.floating]
@@ -20,10 +21,23 @@ SEED = 0
 
 @dataclass(frozen=True)
 class NextPose:
-    """An end pose and the RMS difference [m] of the rivals' predictions there."""
+    """An end pose at which rivals predict different shapes.
+
+    Parameters
+    ----------
+    end : (2,) [m]
+    difference : float [m]
+        RMS difference of the two predictions.
+    separation : float
+        The same in standard deviations of one measured line, its noise and the correlation along
+        the cable included: sqrt(d^T C^-1 d) with the normal distances d between the predictions
+        at the places of the points that the nearest pose has. What a new fit of either rival
+        could adapt to is not taken off.
+    """
 
     end: tuple[float, float]
     difference: float
+    separation: float
 
 
 def next_pose(first: Fit, second: Fit) -> NextPose | None:
@@ -40,7 +54,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     margin = 0.1 * np.maximum(high - low, 0.1 * first.model.cable.length)
     generator = np.random.default_rng(SEED)
     places = np.linspace(0.0, first.model.cable.length, 101)
-    best: NextPose | None = None
+    best: tuple[float, FloatArray, tuple[NodeCurve, NodeCurve]] | None = None
     for _ in range(TRIED):
         end = generator.uniform(low - margin, high + margin)
         nearest = poses[int(((ends - end) ** 2).sum(axis=1).argmin())]
@@ -53,14 +67,29 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
         ]
         if pair[0] is None or pair[1] is None:
             continue
-        gap = pair[0].curve.at(places) - pair[1].curve.at(places)
+        curves = (pair[0].curve, pair[1].curve)
+        gap = curves[0].at(places) - curves[1].at(places)
         difference = float(np.sqrt((gap**2).sum(axis=1).mean()))
         # Beyond a tenth of the length the rivals sit on different branches: no clean test.
         if difference > 0.1 * first.model.cable.length:
             continue
-        if best is None or difference > best.difference:
-            best = NextPose((round(float(end[0]), 4), round(float(end[1]), 4)), difference)
-    return best
+        if best is None or difference > best[0]:
+            best = (difference, end, curves)
+    if best is None:
+        return None
+    difference, end, curves = best
+    place = (round(float(end[0]), 4), round(float(end[1]), 4))
+    return NextPose(place, difference, _separation(first, end, curves))
+
+
+def _separation(fit: Fit, end: FloatArray, curves: tuple[NodeCurve, NodeCurve]) -> float:
+    """Difference of two curves in standard deviations of one line, measured as that nearest."""
+    problem = fit.problem
+    ends = np.array([problem.measured[j].pose.end for j in problem.used])
+    k = int(((ends - end) ** 2).sum(axis=1).argmin())
+    s, weight = fit.point.feet[k], problem.measured[problem.used[k]].relative_std
+    gap = ((curves[0].at(s) - curves[1].at(s)) * curves[0].normals(s)).sum(axis=1)
+    return float(np.linalg.norm(fit.noise.whitening(s, weight) @ gap))
 
 
 def _rest_now(fit: Fit) -> FloatArray:

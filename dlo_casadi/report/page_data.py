@@ -18,6 +18,7 @@ from dlo_casadi.report.terminal import (
     nuisance_rows,
     p_value_note,
     rest_rows,
+    separation_text,
     timing_rows,
     verdict_lines,
 )
@@ -66,6 +67,7 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "footnotes": footnotes(outcome),
         "photographed": m.kind == "images",
         "next_pose": outcome.next_pose,
+        "next_pose_said": outcome.next_pose and sentence(separation_text(outcome.next_pose)),
         "unexplained": outcome.unexplained,
         "timing": timing_rows(outcome),
         "mesh": f"{outcome.discretization.n} {outcome.discretization.element}s, "

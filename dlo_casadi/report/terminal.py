@@ -234,14 +234,34 @@ def verdict_lines(outcome: Outcome) -> list[str]:
             f"  Without naming a cause: pulled by ({force[0]:.3g}, {force[1]:.3g}) N on average "
             f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
-    proposal = outcome.next_pose
-    if proposal is not None:
-        x, y = proposal["end"]
+    if outcome.next_pose is not None:
+        x, y = outcome.next_pose["end"]
         lines.append(
-            f"  To tell {' from '.join(proposal['separates'])}: hold the end at ({x:.3f}, {y:.3f})"
-            f" m; they differ there by {_mm(proposal['expected_difference_m'])}."
+            f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "
+            f"({x:.3f}, {y:.3f}) m; {separation_text(outcome.next_pose)}"
         )
     return lines
+
+
+# Rivals so many standard deviations apart are told from one another.
+APART = 3.0
+# Nobody measures a pose more often.
+MOST_REPEATS = 20
+
+
+def separation_text(proposal: dict[str, Any]) -> str:
+    """How far rivals differ in a proposed pose, and how often it has to be measured."""
+    z = proposal["expected_difference_std"]
+    text = (
+        f"they differ there by {_mm(proposal['expected_difference_m'])} RMS, {z:.2g} standard "
+        "deviations of the noise of one whole line: "
+    )
+    repeats = math.ceil(min((APART / max(z, 1e-9)) ** 2, 1e9))
+    if repeats <= 1:
+        return text + "one measurement suffices."
+    if repeats <= MOST_REPEATS:
+        return text + f"measure it {repeats} times."
+    return text + f"even {MOST_REPEATS} measurements would not tell them apart."
 
 
 # What the residual may depend on, by the key of its normal score.

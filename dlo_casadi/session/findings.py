@@ -94,6 +94,8 @@ def next_pose_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
         "end": list(diagnosis.proposal.end),
         "separates": list(diagnosis.proposal_for),
         "expected_difference_m": diagnosis.proposal.difference,
+        # In standard deviations of one measured line.
+        "expected_difference_std": diagnosis.proposal.separation,
     }
 
 

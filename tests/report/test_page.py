@@ -36,6 +36,7 @@ PROPOSAL = {
     "end": [0.1, -0.2],
     "separates": ["lumped_mass", "point_force"],
     "expected_difference_m": 2.5e-3,
+    "expected_difference_std": 8.2,
 }
 
 

@@ -11,6 +11,7 @@ from dlo_casadi.report.terminal import (
     describe,
     plus_minus,
     print_summary,
+    separation_text,
     structure_lines,
     unidentified,
 )
@@ -81,6 +82,7 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
         "end": [0.1, -0.2],
         "separates": ["lumped_mass", "point_force"],
         "expected_difference_m": 2.5e-3,
+        "expected_difference_std": 8.2,
     }
     text = said(
         replace(
@@ -96,9 +98,28 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
     assert "the declared model lacked lumped_mass; with it the residual is noise" in text
     assert "lumped_mass: mass 0.0500 ± 0.0020 kg (p = 1e-09)" in text
     assert "These data cannot tell it from point_force." in text
-    assert "hold the end at (0.100, -0.200) m; they differ there by 2.5 mm" in text
+    assert (
+        "hold the end at (0.100, -0.200) m; they differ there by 2.5 mm RMS, 8.2 standard" in text
+    )
+    assert "one measurement suffices" in text
     assert "cross-validated" in text
     assert "with lumped_mass" in text
+
+
+@pytest.mark.parametrize(
+    ("std", "words"),
+    [
+        (3.0, "one measurement suffices."),
+        (1.5, "measure it 4 times."),
+        (0.2, "even 20 measurements would not tell them apart."),
+        (0.0, "even 20 measurements would not tell them apart."),
+    ],
+)
+def test_a_proposal_says_how_often_to_measure(std, words):
+    """Repeats average: n lines are sqrt(n) times as sharp as one."""
+    proposal = {"expected_difference_m": 1e-4, "expected_difference_std": std}
+
+    assert separation_text(proposal).endswith(words)
 
 
 def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):

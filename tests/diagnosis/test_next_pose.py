@@ -1,0 +1,38 @@
+"""How far two predictions are apart, in noise of one measured line."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dlo_casadi.diagnosis.next_pose import _separation
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.estimation.observation import NodeCurve
+
+LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4
+
+
+def separation(noise):
+    """Of two straight lines that lie a gap apart, measured at many points."""
+    x = np.linspace(0.0, LENGTH, 11)
+    lines = [NodeCurve(LENGTH, np.column_stack([x, 0 * x + y]), None) for y in (0.0, GAP)]
+    pose = Pose((0.0, 0.0), (LENGTH, 0.0))
+    measured = SimpleNamespace(pose=pose, relative_std=np.ones(POINTS))
+    fit = SimpleNamespace(
+        problem=SimpleNamespace(measured=(measured,), used=(0,)),
+        point=SimpleNamespace(feet=(np.linspace(0.0, LENGTH, POINTS),)),
+        noise=noise,
+    )
+    return _separation(fit, np.array([LENGTH, 0.1]), (lines[0], lines[1]))
+
+
+def test_a_line_averages_the_noise_of_its_points():
+    """White noise: K equal distances d are d sqrt(K) / std standard deviations off."""
+    assert separation(NoiseModel(STD)) == pytest.approx(GAP / STD * np.sqrt(POINTS))
+
+
+def test_noise_that_is_one_for_the_whole_line_does_not_average():
+    alike = NoiseModel(STD, share=0.98, length=100 * LENGTH, kernel="gaussian")
+
+    assert separation(alike) == pytest.approx(GAP / STD, rel=0.02)
