@@ -1,10 +1,12 @@
 """Predictions from a file of fitted parameters: physics, defaults, messages."""
 
 import re
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import DloError, EquilibriumError
@@ -99,6 +101,21 @@ def test_arc_lengths_beside_the_cable_are_refused(pinned):
     for count in (0, 1, 2.5):
         with pytest.raises(DloError, match=f"two points or more, from start to end, found {count}"):
             shape.points(count)
+
+
+@pytest.mark.parametrize("end", [(0.3, -0.1), (0.02, -0.5), (0.5, 0.1)])
+def test_the_numbers_at_the_arrows_lie_inside_the_axes(pinned, end):
+    drawing = predict(pinned, end=end).plot()
+    drawing.savefig(BytesIO())  # places everything
+    (axes,) = drawing.axes
+    numbers = [text for text in axes.texts if text.get_text().endswith(" N")]
+
+    assert len(numbers) == 2
+    inside = axes.get_window_extent()
+    for text in numbers:
+        box = Text.get_window_extent(text)
+        assert inside.x0 < box.x0 < box.x1 < inside.x1
+        assert inside.y0 < box.y0 < box.y1 < inside.y1
 
 
 def test_branches_turn_the_way_they_are_named(pinned):

@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 from dlo_casadi.report.canvas import BLACK, BLUE, GREY, VERMILLION, figure, styled
 
 _SIZE = (7.0, 6.0)
+# Room for the number at the tip of an arrow, as a share of the drawing.
+_LABEL = 0.12
 
 
 def draw_prediction(path: Path, shape: dict[str, Any]) -> None:
@@ -59,8 +61,11 @@ def _draw(drawing: Figure, shape: dict[str, Any]) -> None:
             color=VERMILLION,
             ha="left" if force[0] > 0 else "right",
             va="bottom" if force[1] > 0 else "top",
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
         )
-        axes.plot(*tip, alpha=0)  # an annotation does not count for the axes' limits
+        # Annotations do not count for the axes' limits: keep room for the arrow and its number.
+        room = _LABEL * max(span, reach * largest) * force / size
+        axes.plot(*np.transpose([tip, tip + room]), alpha=0)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.12)
     axes.set(xlabel="x [m]", ylabel="y [m]")

@@ -292,7 +292,7 @@ def draw_moment(path: Path, outcome: Outcome) -> None:
 
 
 def draw_errors(path: Path, outcome: Outcome) -> None:
-    """Errors of all stages as bars, with the noise of the centre-lines."""
+    """Errors of all stages as points on a logarithmic axis, with the noise of the lines."""
     rows: list[tuple[str, str, float | None]] = []
     for stage in outcome.stages:
         label = label_of(stage, outcome)
@@ -301,8 +301,7 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
             rows.append((label, "held_out", stage.rmse_held_out))
     known = [value for *_, value in rows if value]
     floor = outcome.measurement.std
-    left = 10 ** math.floor(math.log10(min([*known, floor]) / 1.5)) if known else floor / 10
-    right = 3.5 * max([*known, floor])
+    left, right = min([*known, floor]) / 2, 3.5 * max([*known, floor])
     per_stage = 2 if outcome.measurement.poses_held_out else 1
     with figure(path, (8.5, 1.7 + 0.36 * len(rows))) as drawing:
         axes = drawing.subplots()
@@ -310,12 +309,12 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
             y = -(k + 0.8 * (k // per_stage))
             color = BLUE if role == "fit" else _HELD_OUT
             if value is None:
-                axes.text(left * 1.1e3, y, "no value", va="center", color=GREY)
+                axes.text(1.1e3 * left, y, "no value", va="center", color=GREY)
                 continue
-            axes.barh(y, 1e3 * value, left=0, height=0.9, color=color)
+            axes.plot(1e3 * value, y, "o" if role == "fit" else "s", color=color, ms=8)
             axes.text(
                 # Beyond the line of the noise, not on it.
-                1.05e3 * (floor if 0.5 * floor < value < floor else value),
+                1.08e3 * (floor if 0.5 * floor < value < floor else value),
                 y,
                 millimetres(value),
                 va="center",
@@ -333,14 +332,18 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
         axes.set_xlim(1e3 * left, 1e3 * right)
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("distance of the measured points from the prediction, RMS [mm]")
-        handles: list[Line2D | Patch] = [Patch(color=BLUE, label="fit poses")]
+        handles = [_dot("o", BLUE, "fit poses")]
         if per_stage == 2:
-            handles.append(Patch(color=_HELD_OUT, label="held-out poses"))
+            handles.append(_dot("s", _HELD_OUT, "held-out poses"))
         handles.append(
             Line2D([], [], color=BLACK, ls="--", label=f"noise floor {millimetres(floor)}")
         )
         drawing.legend(handles=handles, loc="outside lower center", ncols=3)
         drawing.suptitle(f"{outcome.config.cable.name}: error of each stage", fontsize=12)
+
+
+def _dot(marker: str, color: str, label: str) -> Line2D:
+    return Line2D([], [], ls="none", ms=8, marker=marker, color=color, label=label)
 
 
 # ---- diagnosis ---------------------------------------------------------------------------------
