@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, repeatability
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.session.fitting import MESH_SHARE
@@ -15,9 +16,18 @@ from dlo_casadi.session.outcome import PoseInput
 REPEATS = 1.5
 
 
-def reading_warnings(inputs: Sequence[PoseInput]) -> list[str]:
-    """What the camera step noticed, pose by pose."""
-    lines = []
+def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
+    """What the camera step noticed, pose by pose, and which poses were not read at all.
+
+    Parameters
+    ----------
+    skipped : sequence of SkippedPose
+        What the configuration leaves out; poses that are among the inputs say so themselves.
+    """
+    shown = {item.name for item in inputs}
+    lines = [
+        f"{pose.name} is left out: {pose.reason}" for pose in skipped if pose.name not in shown
+    ]
     for item in inputs:
         if item.problem:
             lines.append(f"{item.name} is left out: {item.problem}")

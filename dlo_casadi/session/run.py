@@ -72,7 +72,7 @@ def fit_session(
     odd = raise_if_implausible(config, inputs)
     measured = measured_poses(config, inputs)
     clock.lap("vision")
-    warnings = [*config.warnings, *reading_warnings(inputs), *odd]
+    warnings = [*config.warnings, *reading_warnings(inputs, config.skipped), *odd]
     declared = declared_model(config, _center(inputs), _pixel(inputs))
 
     progress.step("fit the declared model", 0, 1)
