@@ -22,8 +22,8 @@ Branch = Literal["ccw", "cw"]
 JOINT_BOUND = np.pi / 2
 # Largest violation of an end condition [m or rad] of an accepted equilibrium.
 END_TOLERANCE = 1e-8
-# Largest imbalance, relative to the tangent matrix, at which tiny steps are rounding.
-ROUNDING = 1e-12
+# Largest imbalance of an accepted equilibrium, relative to the tangent matrix.
+BALANCE = 1e-12
 
 
 class Status(Enum):
@@ -85,6 +85,10 @@ class Equilibrium:
     bound_multipliers : (n_headings - 1,) [N m]
         Of the joint bounds; zero where a joint bends freely.
     curvature : (n_cells,) [1/m]
+        Mean curvature of each bending cell.
+    min_bend_radius : float [m]
+        Smallest radius of curvature along the cable: of the cells' mean curvatures, continued
+        linearly to both ends; of second order in the cells' length.
     residual : float
         Largest violation of an end condition [m or rad].
     status : Status
@@ -100,6 +104,7 @@ class Equilibrium:
     multipliers: FloatArray
     bound_multipliers: FloatArray
     curvature: FloatArray
+    min_bend_radius: float
     residual: float
     status: Status
     iterations: int
@@ -114,10 +119,17 @@ class Equilibrium:
         """Whether the energy has a strict minimum here under the end conditions."""
         return self.status is Status.STABLE
 
-    @property
-    def min_bend_radius(self) -> float:
-        """Smallest radius of curvature along the cable [m]."""
-        return float(1 / max(np.abs(self.curvature).max(), 1e-300))
+
+def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
+    """Smallest radius [m] of curvatures that are means over cells (n, 2), see `Equilibrium`."""
+    widths = np.diff(cells, axis=1).ravel()
+    largest = float(np.abs(curvature).max())
+    for inner in (1, -2) if len(curvature) > 1 else ():
+        outer = 0 if inner == 1 else -1
+        share = widths[outer] / (widths[outer] + widths[inner])
+        at_end = curvature[outer] + share * (curvature[outer] - curvature[inner])
+        largest = max(largest, abs(float(at_end)))
+    return 1 / max(largest, 1e-300)
 
 
 def is_stable(matrix: FloatArray, n_conditions: int) -> bool:
@@ -148,6 +160,9 @@ def _inverse_of_largest(rows: FloatArray) -> FloatArray:
 
 # Minima of the potential and of the Lagrangian that lie within this are the same one [rad].
 NEARBY = 0.05
+NEWTON_STEPS = 8
+# A joint so near to its bound is at it [rad].
+AT_BOUND = 1e-6
 
 
 @lru_cache(maxsize=32)
@@ -261,8 +276,9 @@ def solve_equilibrium(
 
         min V(phi)   s.t.   r(L) = end, clamped headings, |phi_(i+1) - phi_i| <= pi/2
 
-    Of several equilibria the stable one of lowest energy is returned, unless the pose names a
-    branch or `phi_init` is given (then the one it leads to).
+    Of the equilibria that the first guesses lead to, the stable one of lowest energy is returned;
+    of those on the branch that the pose names, where there is one. With `phi_init`, the one that
+    it leads to.
 
     Parameters
     ----------
@@ -307,7 +323,7 @@ def solve_equilibrium(
 def _from_start(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, phi: FloatArray
 ) -> Equilibrium:
-    """One IPOPT solve from one first guess."""
+    """One IPOPT solve from one first guess, and Newton's method on the Lagrangian."""
     chain = model.chain
     solver = _solver(id(model), _Held(model))
     ends = pose.vector
@@ -319,27 +335,17 @@ def _from_start(
     stats = stats_of(solver)
     phi = np.array(out["x"]).ravel()[: chain.n_headings]
     multipliers = np.array(out["lam_g"]).ravel()
-    lam, bound_lam = multipliers[: model.n_conditions], multipliers[model.n_conditions :]
-    # On fine meshes of stiff cables IPOPT's tolerance lies below rounding: it stops at the
-    # minimum all the same, and complains of its tiny steps.
-    stalled = stats["return_status"] == "Search_Direction_Becomes_Too_Small"
-    inside = np.abs(np.diff(phi)).max() < JOINT_BOUND - 1e-6
-    if model.bowed and inside and (stats["success"] or stalled):
-        phi, lam = _balanced(model, phi, lam, (p, rest, ends, deviation))
-    gap = np.abs(np.array(out["g"]).ravel()[: model.n_conditions])
-    residual = float(gap.max()) if gap.size else 0.0
-    arguments = (phi, lam, p, rest, ends, deviation)
-    energy, nodes = model.energy(*arguments)
-    force, matrix = (np.array(block) for block in model.kkt(*arguments))
-    balanced = np.abs(force).max() <= ROUNDING * np.abs(matrix).max()
-    solved = stats["success"] or (stalled and balanced)
-    bend = float(np.abs(np.diff(phi)).max())
-    if not solved or residual > END_TOLERANCE or not np.isfinite(float(energy)):
+    given = (p, rest, ends, deviation)
+    # Whatever IPOPT says of its end (on fine meshes of stiff cables its tolerance lies below
+    # rounding), what counts is whether the shape that is returned balances.
+    found = _balanced(model, phi, multipliers, given)
+    phi, lam = found.phi, found.lam
+    energy, nodes = model.energy(phi, lam, *given)
+    if not found.holds or not np.isfinite(float(energy)):
         status = Status.FAILED
-    elif is_stable(matrix, model.n_conditions) or bend > JOINT_BOUND - 1e-6:
-        status = Status.STABLE
     else:
-        status = Status.UNSTABLE
+        status = Status.STABLE if found.stable else Status.UNSTABLE
+    curvature = np.array(model.strain(phi, ends, deviation, p)).ravel()
     end_force, moments = split_multipliers(model, lam)
     return Equilibrium(
         phi=phi,
@@ -349,27 +355,81 @@ def _from_start(
         lam_start=total_dead_load(model, p) - end_force,
         moments=moments,
         multipliers=lam,
-        bound_multipliers=bound_lam,
-        curvature=np.array(model.strain(phi, ends, deviation, p)).ravel(),
-        residual=residual,
+        bound_multipliers=found.bound_lam,
+        curvature=curvature,
+        min_bend_radius=smallest_radius(curvature, chain.cells),
+        residual=found.residual,
         status=status,
         iterations=int(stats["iter_count"]),
     )
 
 
+@dataclass(frozen=True)
+class _Balance:
+    """Where Newton's method has led: headings, multipliers, and whether it is an equilibrium."""
+
+    phi: FloatArray
+    lam: FloatArray
+    bound_lam: FloatArray
+    residual: float
+    holds: bool
+    stable: bool
+
+
 def _balanced(
-    model: CableModel, phi: FloatArray, lam: FloatArray, given: tuple[FloatArray, ...]
+    model: CableModel, phi: FloatArray, multipliers: FloatArray, given: tuple[FloatArray, ...]
+) -> _Balance:
+    """Newton's method from the potential's minimum, whose bows are stiff under compression too.
+
+    Joints at their bound are held there; one whose multiplier pulls it back is let go.
+    """
+    n, m = len(phi), model.n_conditions
+    lam, bound_lam = multipliers[:m], multipliers[m:]
+    bends = np.diff(phi)
+    held = np.flatnonzero(np.abs(bends) > JOINT_BOUND - AT_BOUND)
+    while True:
+        bound = np.copysign(JOINT_BOUND, bends[held])
+        arms = np.zeros((len(held), n + m))
+        arms[np.arange(len(held)), held] = -1.0
+        arms[np.arange(len(held)), held + 1] = 1.0
+        x = np.concatenate([phi, lam, bound_lam[held]])
+        for _ in range(NEWTON_STEPS):
+            force, matrix = _bordered(model, x, arms, bound, given)
+            step = np.linalg.lstsq(matrix, -force, rcond=1e-14)[0]
+            if not np.abs(step[:n]).max() < NEARBY:
+                break
+            x = x + step
+            if np.abs(step[:n]).max() < 1e-12:
+                break
+        pulls = x[n + m :] * np.sign(bound)
+        if not np.any(pulls < 0):
+            break
+        held = held[pulls >= 0]
+    force, matrix = _bordered(model, x, arms, bound, given)
+    residual = float(np.abs(force[n:]).max(initial=0.0))
+    imbalance = float(np.abs(force[:n]).max())
+    bound_lam = np.zeros(n - 1)
+    bound_lam[held] = x[n + m :]
+    inside = bool(np.abs(np.diff(x[:n])).max() < JOINT_BOUND + AT_BOUND)
+    holds = imbalance <= BALANCE * np.abs(matrix[:n, :n]).max() and residual <= END_TOLERANCE
+    stable = bool(np.all(np.isfinite(matrix))) and is_stable(matrix, m + len(held))
+    return _Balance(x[:n], x[n : n + m], bound_lam, residual, holds and inside, stable)
+
+
+def _bordered(
+    model: CableModel,
+    x: FloatArray,
+    arms: FloatArray,
+    bound: FloatArray,
+    given: tuple[FloatArray, ...],
 ) -> tuple[FloatArray, FloatArray]:
-    """Newton's method from the potential's minimum, whose bows are stiff under compression too."""
-    for _ in range(5):
-        force, matrix = (np.array(block) for block in model.kkt(phi, lam, *given))
-        step = np.linalg.lstsq(matrix, -force.ravel(), rcond=1e-14)[0]
-        if not np.abs(step[: len(phi)]).max() < NEARBY:
-            break
-        phi, lam = phi + step[: len(phi)], lam + step[len(phi) :]
-        if np.abs(step[: len(phi)]).max() < 1e-12:
-            break
-    return phi, lam
+    """Stationarity and its Jacobian by (phi, lam, multipliers of the joints that are held)."""
+    size = arms.shape[1]
+    n = size - model.n_conditions
+    force, matrix = (np.array(block) for block in model.kkt(x[:n], x[n:size], *given))
+    whole = np.zeros((len(x), len(x)))
+    whole[:size, :size], whole[size:, :size], whole[:size, size:] = matrix, arms, arms.T
+    return np.concatenate([force.ravel() + arms.T @ x[size:], arms @ x[:size] - bound]), whole
 
 
 def split_multipliers(model: CableModel, lam: FloatArray) -> tuple[FloatArray, FloatArray]:

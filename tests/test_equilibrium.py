@@ -415,6 +415,43 @@ def test_a_joint_at_its_bound_is_reported():
     np.testing.assert_allclose(relaxed.bound_multipliers, 0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("end", "headings"),
+    [
+        ((-0.695, -0.071), (-1.74, 1.17)),
+        ((-0.770, 0.096), (-0.56, 0.21)),
+        ((-0.543, 0.743), (-1.38, -0.38)),
+    ],
+)
+def test_a_joint_at_its_bound_beside_others_that_bow(end, headings):
+    """A limp cable that folds between its clamps balances, and ends where it is held."""
+    model = CableModel(Cable(1.0, 0.1, 0.005, 3e-3), 20, start="clamped", end="clamped")
+    pose = Pose((0.0, 0.0), end, *headings)
+    held = solve_equilibrium(model, model.nominal, np.zeros(20), pose)
+    assert held.stable
+    np.testing.assert_allclose(held.points[-1], end, atol=1e-9)
+    moments = held.bound_multipliers
+    assert moments.any()
+    given = (model.nominal, np.zeros(20), pose.vector, np.zeros(6))
+    force = np.array(model.balance(held.phi, held.multipliers, *given)).ravel()[:21]
+    turned = np.concatenate([[0.0], moments]) - np.concatenate([moments, [0.0]])
+    np.testing.assert_allclose(force + turned, 0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("element", ["arc", "quadratic"])
+def test_the_smallest_radius_is_that_at_a_clamp(element):
+    """A cantilever is bent most where it is held; to the second order of the mesh."""
+    stiffness, weight, length, heading = 0.02, 0.2 * 9.81 / 0.8, 0.8, 0.3
+    exact = 1 / abs(cantilever(stiffness, weight, length, heading)(0.0)[1])
+    errors = []
+    for n in (20, 40):
+        model = CableModel(Cable(length, 0.2, 0.01, stiffness), n, element, "clamped", "free")
+        held = solve(model, stiffness, Pose((0.0, 0.0), start_heading=heading))
+        errors.append(abs(held.min_bend_radius / exact - 1))
+    assert errors[0] < 0.03
+    assert errors[1] < errors[0] / 3
+
+
 # ---- messages ----------------------------------------------------------------------------------
 
 
