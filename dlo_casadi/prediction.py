@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium import Branch, Equilibrium, Pose, solve_equilibrium
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.model import DEVIATIONS, CableModel
 from dlo_casadi.report.drawing import prediction_figure
@@ -170,7 +170,15 @@ def predict(
     cable = parameters if isinstance(parameters, Parameters) else load_parameters(parameters)
     pose = _pose(cable, end, start, start_heading, end_heading, branch)
     model, p, rest, _ = cable
-    eq = solve_equilibrium(model, p, rest, pose)
+    try:
+        eq = solve_equilibrium(model, p, rest, pose)
+    except EquilibriumError as error:
+        # What the solver advises concerns a configuration; there is none here.
+        happened = error.message.partition("\n  Try:")[0]
+        raise EquilibriumError(
+            f"{happened}\n  Try: an end in metres, nearer to the start; other headings or branch.",
+            p_des=error.p_des,
+        ) from None
     return PredictedShape(
         cable, pose, eq, _true_curve(model, p, rest, pose, eq), _curve(model, p, rest, pose, eq)
     )
@@ -213,6 +221,7 @@ def _pose(
         start_heading=headings["start"],
         end_heading=headings["end"],
         branch=branch,
+        name=model.cable.name or "cable",
     )
 
 

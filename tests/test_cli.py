@@ -130,6 +130,13 @@ def test_fit_reports_a_missing_configuration(tmp_path, capsys):
     assert "no such file" in capsys.readouterr().err
 
 
+def test_a_folder_for_a_configuration_names_those_in_it(tmp_path, capsys):
+    (tmp_path / "rope.yaml").touch()
+    assert main(["fit", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert f"a folder is no configuration.\n  Try: {tmp_path / 'rope.yaml'}; all in it" in said
+
+
 def test_fit_checks_the_output_before_it_works(config, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(fit_command, "run_session", lambda *_: pytest.fail("started"))
     (tmp_path / "file").touch()

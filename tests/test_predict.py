@@ -140,6 +140,26 @@ def test_an_end_out_of_reach_is_told_with_numbers(pinned):
     with pytest.raises(EquilibriumError, match=message) as caught:
         predict(pinned, end=(0.9, 0.0))
     assert caught.value.p_des == (0.9, 0.0)
+    said = caught.value.message
+    assert said.startswith("short_clean: no equilibrium")
+    assert said.endswith("Try: an end in metres, nearer to the start; other headings or branch.")
+
+
+def test_what_a_fit_has_found_of_the_fixtures_is_told(pinned):
+    shape = predict(pinned, end=(0.3, -0.1))
+    x, y = shape.points()[-1]
+    assert (x, y) != (0.3, -0.1)  # the fitted end_offset
+    assert f"end of the cable: ({x:.5f}, {y:.5f}) m: fixture errors of the fit" in str(shape)
+
+
+def test_folders_of_results_are_suggested_not_configurations(pinned, tmp_path):
+    results = pinned.parents[1]
+    with pytest.raises(DloError, match=re.escape(f"of results.\n  Try: {results / 'cable'}")):
+        predict(results / "cabel", end=(0.3, -0.1))
+    with pytest.raises(DloError, match=re.escape(f"Try: {results / 'cable'}")):
+        predict(results.parent / "nowhere", end=(0.3, -0.1))
+    with pytest.raises(DloError, match=r"no parameters\.yaml in this folder\.\n  Try: the res"):
+        predict(tmp_path, end=(0.3, -0.1))
 
 
 def test_a_free_end_hangs(overhang):

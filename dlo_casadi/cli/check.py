@@ -9,9 +9,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK
-from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.cli.options import command, configuration, console, print_json
 from dlo_casadi.cli.watch import Watch
-from dlo_casadi.config import Config, load_config
+from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.report.check_table import advice_lines, check_dict, check_table
 from dlo_casadi.session.checks import find_suspicions
@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     chosen = parser.parse_args(argv)
 
-    config = load_config(chosen.config)
+    config = configuration(chosen.config)
     with Watch(Console(stderr=True), chosen.quiet) as watch:
         inputs = read_inputs(config, lambda name, k, m: watch.step(f"read {name}", k, m))
         pictures = [] if chosen.show is None else _show(config, chosen.show, watch)

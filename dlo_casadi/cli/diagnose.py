@@ -10,9 +10,8 @@ from pathlib import Path
 from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.cli.options import command, configuration, console, print_json
 from dlo_casadi.cli.watch import Watch
-from dlo_casadi.config import load_config
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import candidate_table, print_summary
 from dlo_casadi.report.writer import ResultsFolder
@@ -39,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     chosen = parser.parse_args(argv)
 
-    config = load_config(chosen.config)
+    config = configuration(chosen.config)
     options = config.diagnosis.model_copy(update={"enabled": True})
     config = replace(config, diagnosis=options)
     results = nullcontext() if chosen.output is None else ResultsFolder(chosen.output, config)

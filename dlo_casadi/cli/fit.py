@@ -9,9 +9,8 @@ from pathlib import Path
 from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.cli.options import command, configuration, console, print_json
 from dlo_casadi.cli.watch import Watch
-from dlo_casadi.config import load_config
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.report.writer import ResultsFolder
@@ -46,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     )
     chosen = parser.parse_args(argv)
 
-    config = load_config(chosen.config)
+    config = configuration(chosen.config)
     if chosen.no_diagnosis:
         diagnosis = config.diagnosis.model_copy(update={"enabled": False})
         config = replace(config, diagnosis=diagnosis)

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+
+from dlo_casadi.config import Config, load_config
+from dlo_casadi.errors import ConfigError
 
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
@@ -29,6 +33,16 @@ def command(name: str, description: str, examples: str, codes: str = "") -> argp
         epilog=f"examples:\n{listed}\n\n{EXIT_CODES}{'; ' * bool(codes)}{codes}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def configuration(path: Path) -> Config:
+    """Load a configuration; of a folder, say which configurations it holds."""
+    if path.is_dir():
+        found = [str(file) for file in sorted(path.glob("*.y*ml"))[:5]]
+        hint = ", ".join(found) or "a YAML file, such as configs/cable.yaml"
+        many = f"; all in it and below: dlo fit-many {path}" if found else ""
+        raise ConfigError(f"a folder is no configuration.\n  Try: {hint}{many}", path)
+    return load_config(path)
 
 
 def console(quiet: bool = False) -> Console:

@@ -5,6 +5,7 @@ Prediction, code generation and comparisons of cables read nothing else.
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 import math
@@ -28,6 +29,9 @@ from dlo_casadi.session.outcome import Outcome
 FloatArray = NDArray[np.floating]
 
 SCHEMA = "dlo-parameters/1"
+FILE = "parameters.yaml"
+# Folders of results that a message lists.
+_LISTED = 5
 # What a prediction depends on beside the values of the parameters.
 _MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
 # Effects that a file may name: those of a configuration, and what every photograph has.
@@ -278,7 +282,11 @@ def load_parameters(path: str | Path) -> Parameters:
     """
     source = Path(path)
     if source.is_dir():
-        source = source / "parameters.yaml"
+        source = source / FILE
+        if not source.is_file():
+            raise ConfigError(f"no {FILE} in this folder.{_results_near(source)}", source.parent)
+    elif not source.exists():
+        raise ConfigError(f"no such file or folder of results.{_results_near(source)}", source)
     document = read_yaml(source)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         found = document.get("schema") if isinstance(document, dict) else type(document).__name__
@@ -295,6 +303,20 @@ def load_parameters(path: str | Path) -> Parameters:
         raise ConfigError(f"damaged parameters: {error.args[0]} is missing", source) from None
     except (TypeError, ValueError, AttributeError) as error:
         raise ConfigError(f"damaged parameters: {error}", source) from None
+
+
+def _results_near(path: Path) -> str:
+    """What to try instead of a path: folders of results beside it, the nearest name first."""
+    wanted = path.parent if path.suffix else path
+    known = {
+        folder.name: folder
+        for base in (wanted.parent / "results", wanted.parent)
+        for folder in sorted(base.glob("*"))
+        if (folder / FILE).is_file()
+    }
+    names = difflib.get_close_matches(wanted.name, known, 1) or list(known)[:_LISTED]
+    listed = ", ".join(str(known[name]) for name in names)
+    return f"\n  Try: {listed}" if listed else "\n  Try: the results folder of a fit (dlo fit)."
 
 
 def parameters_of(outcome: Outcome) -> Parameters:

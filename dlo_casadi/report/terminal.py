@@ -245,6 +245,8 @@ def verdict_lines(outcome: Outcome) -> list[str]:
 
 # Rivals so many standard deviations apart are told from one another.
 APART = 3.0
+# Distances [m] that the table of a prediction shows.
+_SHOWN = 5e-6
 # Nobody measures a pose more often.
 MOST_REPEATS = 20
 
@@ -442,6 +444,10 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
             continue
         x, y = shape[f"force_on_{side}"]
         rows.append((side, f"({at[0]:g}, {at[1]:g}) m"))
+        reached = shape["points"][0 if side == "start" else -1]
+        if math.dist(at, reached) > _SHOWN:
+            place = f"({reached[0]:.5f}, {reached[1]:.5f}) m"
+            rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
         rows.append((f"force of the cable on its {side}", f"({x:.4g}, {y:.4g}) N"))
         if shape[f"{side}_heading"] is not None:
             moment = shape[f"moment_on_{side}"]
