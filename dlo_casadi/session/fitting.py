@@ -42,7 +42,7 @@ def fit_declared(
     )
     if finest:
         fit = refine_mesh(fit, finest)
-        return fit, discretization_error(fit)
+        return fit, mesh_error(fit)
     return fine_enough(fit, FIRST_MESH)
 
 
@@ -54,15 +54,25 @@ def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float
     while True:
         if n != fit.model.n:
             fit = refine_mesh(fit, n, modes)
-        try:
-            error = discretization_error(fit)
-        except EstimationError:
-            error = np.inf
+        error = mesh_error(fit)
         largest = FINEST_MESH if np.isfinite(error) else SEARCH_MESH
-        allowed = MESH_SHARE * max(fit.noise.std, fit.residual_rms)
+        allowed = allowed_mesh_error(fit)
         if error <= allowed or n >= largest:
             return fit, error
         n = min(_finer(n, error / allowed, fit.model.element), largest)
+
+
+def mesh_error(fit: Fit) -> float:
+    """Error of a fit's mesh [m]; infinite if its shapes cannot be followed to a finer one."""
+    try:
+        return discretization_error(fit)
+    except EstimationError:
+        return float("inf")
+
+
+def allowed_mesh_error(fit: Fit) -> float:
+    """Error of the mesh [m] that is far below the noise and whatever else is left."""
+    return MESH_SHARE * max(fit.noise.std, fit.residual_rms)
 
 
 def _finer(n: int, excess: float, element: str) -> int:

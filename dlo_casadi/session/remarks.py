@@ -9,7 +9,7 @@ import numpy as np
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, repeatability
 from dlo_casadi.estimation.fit import Fit
-from dlo_casadi.session.fitting import MESH_SHARE
+from dlo_casadi.session.fitting import MESH_SHARE, allowed_mesh_error
 from dlo_casadi.session.outcome import PoseInput
 
 # Poses that repeat worse than this many times the noise get a warning.
@@ -62,7 +62,7 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"the fitted shapes cannot be followed to a mesh finer than {fit.model.n} elements: "
             "some pose is close to losing its stability"
         )
-    elif error > MESH_SHARE * fit.noise.std:
+    elif error > allowed_mesh_error(fit):
         lines.append(
             f"the mesh of {fit.model.n} elements is off by {1e3 * error:.3g} mm, more than "
             f"{MESH_SHARE:.0%} of the noise: model.n larger?"

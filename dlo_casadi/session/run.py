@@ -31,6 +31,7 @@ from dlo_casadi.session.fitting import (
     SEARCH_MESH,
     fine_enough,
     fit_declared,
+    mesh_error,
     reweighted,
     solved_by_ipopt,
 )
@@ -91,7 +92,6 @@ def fit_session(
     reported = _declared_names(config, fit.model)
     stages.append(fit_stage("batch", fit, measured, stiffness_interval(fit), reported))
     clock.lap("fit")
-    warnings += fit_warnings(fit, error)
     outcome = Outcome(
         config=config,
         poses=tuple(inputs),
@@ -104,7 +104,7 @@ def fit_session(
         versions=versions(),
     )
     if not config.diagnosis.enabled:
-        return outcome
+        return replace(outcome, warnings=(*warnings, *fit_warnings(fit, error)))
     return close_the_loop(outcome, measured, reported, _center(inputs), clock, progress)
 
 
@@ -136,7 +136,10 @@ def close_the_loop(
         step=progress.step,
     )
     fit, stages = diagnosis.after, list(outcome.stages)
-    fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
+    if outcome.config.model.n:
+        error = mesh_error(fit)
+    else:
+        fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     if diagnosis.added:
         fit = solved_by_ipopt(fit)
     mesh = Discretization(fit.model.n, fit.model.element, error)
@@ -146,7 +149,7 @@ def close_the_loop(
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [name for name in fit.model.names if name.split(".")[0] in labels]
         stages.append(fit_stage("closed", fit, measured, interval, [*reported, *names]))
-    elif diagnosis.pull is None:
+    elif not diagnosis.unexplained:
         # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
         stages[-1] = fit_stage("batch", fit, measured, interval, reported)
     clock.lap("diagnosis")
@@ -164,6 +167,7 @@ def close_the_loop(
         next_pose=next_pose_row(diagnosis),
         structure=structure_rows(diagnosis),
         diagnosis=diagnosis,
+        warnings=(*outcome.warnings, *fit_warnings(fit, error)),
     )
 
 
