@@ -29,7 +29,7 @@ def results(name, folder):
     fit = fit_model(model, measured[:4], declared.tolerances, 3e-4, decades=(0,))
     document = parameters_file.fit_dict(fit)
     document["fixtures"] = parameters_file.shared_fixtures(config)
-    document["model_hash"] = parameters_file.model_hash(document)
+    document["model_hash"] = parameters_file.parameters_hash(document)
     folder.mkdir(parents=True)
     (folder / "parameters.yaml").write_text(dump_yaml(document))
     return folder / "parameters.yaml"

@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
     except OSError as error:
         raise DloError(f"--output {chosen.output}: cannot be written: {error.strerror}") from None
     if chosen.json:
-        print_json({"files": [str(path) for path in written], "model_hash": solver.hash})
+        print_json({"files": [str(path) for path in written], "solver_hash": solver.hash})
     elif not chosen.quiet:
         print(*written, f"model hash {solver.hash}", sep="\n")
     return OK

@@ -90,7 +90,7 @@ def main(argv: Sequence[str]) -> int:
             progress=counter.show,
         )
     if chosen.json:
-        print_json({"output": str(output), "model_hash": plan.digest, "poses": counts})
+        print_json({"output": str(output), "solver_hash": plan.digest, "poses": counts})
     else:
         said = ", ".join(f"{n} {status.replace('_', ' ')}" for status, n in counts.items())
         console(chosen.quiet).print(f"{output}: {said or 'complete already'}", soft_wrap=True)

@@ -17,6 +17,7 @@ from dlo_casadi.codegen.kernels import Group, groups_of, kernels_to_c, table_of,
 from dlo_casadi.codegen.prefix import check_prefix
 from dlo_casadi.codegen.program import c_number
 from dlo_casadi.codegen.split import Split
+from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.equilibrium import total_dead_load
 from dlo_casadi.model import CableModel
 
@@ -35,7 +36,7 @@ class Solver:
     prefix : str
         Of all public names and of the files.
     hash : str
-        SHA-256 of the model, its parameters and its rest curvature.
+        SHA-256 of all that decides the solver's numbers: see `solver_hash`.
     files : dict
         File name -> text.
     workspace : int
@@ -59,15 +60,29 @@ class Solver:
         return written
 
 
-def model_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
-    """SHA-256 of everything that decides the solver's numbers."""
+def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
+    """SHA-256 of everything that decides the solver's numbers: DLO_MODEL_HASH in its header.
+
+    Effects of the camera and of the history enter no solver, so they are left out. The hash in a
+    parameters.yaml is another one: that of the whole fitted model.
+    """
+    left_out = [e for e in model.effects if isinstance(e, MeasurementEffect | StateEffect)]
+    prefixes = tuple(f"{effect.label}." for effect in left_out)
     content = {
         "cable": [model.cable.length, model.cable.mass],
         "mesh": [model.n, model.element],
         "boundary": [model.start, model.end],
         "gravity": list(map(float, model.gravity)),
-        "effects": [[type(effect).__name__, effect.label] for effect in model.effects],
-        "parameters": dict(zip(model.names, map(float, p), strict=True)),
+        "effects": [
+            [type(effect).__name__, effect.label]
+            for effect in model.effects
+            if effect not in left_out
+        ],
+        "parameters": {
+            name: float(value)
+            for name, value in zip(model.names, p, strict=True)
+            if not name.startswith(prefixes)
+        },
         "rest": list(map(float, rest)),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -185,7 +200,7 @@ def generate(
     check_prefix(prefix)
     split = Split(model, p, rest)
     groups = groups_of(split.slots, inline)
-    digest = model_hash(model, split.p, split.rest)
+    digest = solver_hash(model, split.p, split.rest)
     values = _values(split, groups, prefix, digest)
     source = "".join(_template(name) for name in ("solver.c.in", "guesses.c.in", "interface.c.in"))
     names = {

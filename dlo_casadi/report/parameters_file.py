@@ -60,7 +60,7 @@ class Metadata:
     interval_95 : (float or None, float or None) or None [N m^2]
         Of the bending stiffness; None in it = unbounded.
     model_hash : str
-        As written.
+        As written; see `parameters_hash`.
     edited : bool
         Whether the model is no longer the one that was written.
     config : str
@@ -140,7 +140,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
     if config.cable.youngs_modulus is not None:
         document["cable"]["youngs_modulus"] = config.cable.youngs_modulus
     document["fixtures"] = shared_fixtures(config)
-    document["model_hash"] = model_hash(document)
+    document["model_hash"] = parameters_hash(document)
     document["config"] = config.name
     document["config_hash"] = _file_hash(config.path)
     document["versions"] = dict(outcome.versions)
@@ -192,8 +192,11 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
     return plain
 
 
-def model_hash(document: Mapping[str, Any]) -> str:
-    """SHA-256 of what determines predictions; bounds and standard deviations do not."""
+def parameters_hash(document: Mapping[str, Any]) -> str:
+    """SHA-256 of what determines predictions; bounds and standard deviations do not.
+
+    It stands in the file as `model_hash`. A generated solver has its own: `codegen.solver_hash`.
+    """
     content = {key: document[key] for key in _MODEL_KEYS}
     content["values"] = {key: row["value"] for key, row in document["parameters"].items()}
     content["coefficients"] = document["rest_curvature"]["coefficients"]
@@ -367,7 +370,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         identifiable=rows["bending_stiffness"].get("identifiable"),
         interval_95=None if interval is None else (interval[0], interval[1]),
         model_hash=str(document["model_hash"]),
-        edited=model_hash(document) != document["model_hash"],
+        edited=parameters_hash(document) != document["model_hash"],
         config=str(document.get("config")),
         versions=dict(document.get("versions") or {}),
         document=document,

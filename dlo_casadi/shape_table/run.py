@@ -68,7 +68,7 @@ def shape_table(
     identity = json.dumps(
         {
             "schema": SCHEMA,
-            "model_hash": plan.digest,
+            "solver_hash": plan.digest,
             "branch": plan.branch,
             "dlo_casadi": __version__,
             **poses.identity,

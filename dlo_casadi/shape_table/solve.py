@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.codegen.compiled import Branch, CompiledSolver
-from dlo_casadi.codegen.generate import model_hash
+from dlo_casadi.codegen.generate import solver_hash
 from dlo_casadi.durable import write_durably
 from dlo_casadi.model import CableModel
 
@@ -43,7 +43,7 @@ class Plan:
     @property
     def digest(self) -> str:
         """SHA-256 of all that decides the shapes, as in the C header."""
-        return model_hash(self.model, self.p, self.rest)
+        return solver_hash(self.model, self.p, self.rest)
 
     @property
     def chunk(self) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate, library
-from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, EndOffset
+from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, EndOffset, ImageScale
 from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model import CableModel
@@ -225,6 +225,17 @@ def test_equal_input_gives_equal_bytes_and_another_model_another_hash():
     assert other.hash != one.hash
     assert one.hash in one.files["dlo_solver.h"]
     assert not re.search(r"@[A-Z_]+@", one.files["dlo_solver.c"] + one.files["dlo_solver.h"])
+
+
+def test_what_the_camera_adds_is_in_no_solver_and_not_in_its_hash():
+    model, p, rest = cable()
+    plain = generate(model, p, rest)
+    seen = model.with_effect(ImageScale())
+    same = generate(seen, np.append(p, 1.01), rest)
+    assert same.hash == plain.hash
+    assert same.files["dlo_solver.c"] == plain.files["dlo_solver.c"]
+    held = model.with_effect(EndOffset())
+    assert generate(held, np.append(p, [1e-3, 0.0]), rest).hash != plain.hash
 
 
 @pytest.mark.parametrize("prefix", ["", "9lives", "a-b", "double", "class", "x y", "ä", "dlo_"])

@@ -65,7 +65,7 @@ def test_rows_are_predictions_in_the_order_of_the_grid(parameters, tmp_path, cap
     assert [row["status"] for row in rows].count("ok") == told["poses"]["ok"]
     assert table.schema.field("points").metadata[b"unit"] == b"m"
     assert table.schema.field("force_on_end_x").metadata[b"unit"] == b"N"
-    assert json.loads(table.schema.metadata[b"identity"])["model_hash"] == told["model_hash"]
+    assert json.loads(table.schema.metadata[b"identity"])["solver_hash"] == told["solver_hash"]
     for row, end in zip(rows, ends, strict=True):
         if np.hypot(*end) > 0.56:  # the cable is 0.55 m long
             assert row["status"] == "unreachable"

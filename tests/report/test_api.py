@@ -131,7 +131,7 @@ def test_the_solver_of_a_folder_of_results(written, tmp_path, capsys):
     assert main([*command, str(tmp_path / "c"), "--json"]) == 0
     files = json.loads(capsys.readouterr().out)
     assert {Path(file).name for file in files["files"]} >= {"dlo_solver.c", "dlo_solver.h"}
-    assert len(files["model_hash"]) >= 16
+    assert len(files["solver_hash"]) >= 16
     (tmp_path / "file").touch()
     assert main([*command, str(tmp_path / "file")]) == 2
     assert "cannot be written: File exists" in capsys.readouterr().err

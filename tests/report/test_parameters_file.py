@@ -19,7 +19,7 @@ from dlo_casadi.report.parameters_file import (
     final_rest,
     fit_dict,
     load_parameters,
-    model_hash,
+    parameters_hash,
     parameters_text,
 )
 from dlo_casadi.session.declared import declared_model
@@ -142,13 +142,13 @@ def test_the_next_pose_finds_the_cable_as_the_last_one_left_it(outcome, tmp_path
 
 def test_the_hash_depends_on_the_model_alone(outcome):
     document = fit_dict(outcome.fit)
-    before = model_hash(document)
+    before = parameters_hash(document)
 
     document["parameters"]["bending_stiffness"]["std"] = 99.0
     document["n"] = 20.0
-    assert model_hash(document) == before
+    assert parameters_hash(document) == before
     document["parameters"]["bending_stiffness"]["value"] *= 1 + 1e-12
-    assert model_hash(document) != before
+    assert parameters_hash(document) != before
 
 
 def test_a_file_changed_by_hand_is_noticed(file, tmp_path):
