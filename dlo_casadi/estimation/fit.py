@@ -19,7 +19,13 @@ from dlo_casadi.estimation.gauss_newton import (
     Point,
     Tolerances,
 )
-from dlo_casadi.estimation.noise import NoiseModel, NoiseSample, estimate_noise, smooth_modes
+from dlo_casadi.estimation.noise import (
+    NoiseModel,
+    NoiseSample,
+    estimate_noise,
+    smooth_modes,
+    tell_of_noise,
+)
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
 from dlo_casadi.estimation.sweep import Shapes
@@ -41,6 +47,8 @@ SMOOTH_MODES = 5
 SETTLED_MODES = 2
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
+# Degrees of freedom from which the size of the noise can be estimated.
+LEAST_SPARE = 3.0
 ROUGHNESS_START = 0.3
 ROUGHNESS_FLOOR = 1e-3
 # Smallest scatter of the poses' ends, as a share of the tolerance.
@@ -105,8 +113,8 @@ class Fit:
         return np.asarray(np.linalg.pinv(self.normal.hessian, hermitian=True))
 
     @cached_property
-    def degrees_of_freedom(self) -> float:
-        """Number of points minus the effective number of unknowns that they determine."""
+    def determined_unknowns(self) -> float:
+        """Effective number of unknowns that the points determine, priors being what they are."""
         problem = self.problem
         effective = problem.unknowns.size - float(np.trace(self.covariance @ problem.precision))
         precision = np.diag(1 / problem.deviation_std**2)
@@ -115,7 +123,12 @@ class Fit:
             arm = inverse @ cross
             full = inverse + arm @ self.covariance @ arm.T
             effective += len(block) - float(np.trace(full @ precision))
-        return max(problem.n_points - effective, 1.0)
+        return effective
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Number of points minus the effective number of unknowns that they determine."""
+        return max(self.problem.n_points - self.determined_unknowns, 1.0)
 
     @property
     def chi2_per_dof(self) -> float:
@@ -247,7 +260,46 @@ def refine(
 def noise_of(
     problem: BatchProblem, point: Point, lin: Linearization, modes: int = SMOOTH_MODES
 ) -> NoiseModel:
-    """Noise estimated from the residuals with all that the shape may do projected out."""
+    """Noise estimated from the residuals with all that the shape may do projected out.
+
+    Lines of few points leave nothing over then: fewer slow displacements are projected out of
+    them, and at last the noise is white, of the size that the residuals have for each degree of
+    freedom.
+
+    Raises
+    ------
+    EstimationError
+        If the points are hardly more than the unknowns that they determine.
+    """
+    for count in range(modes, -1, -1):
+        samples = _noise_samples(problem, point, lin, count)
+        if tell_of_noise(samples):
+            return estimate_noise(samples, problem.unknowns.model.cable.length)
+    return _white_noise(problem, point)
+
+
+def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
+    """White noise of the size of the residuals over their degrees of freedom."""
+    fit = Fit(problem, point, converged=True)
+    spare = problem.n_points - fit.determined_unknowns
+    if spare < LEAST_SPARE:
+        raise EstimationError(
+            f"the {problem.n_points} points of {len(problem.used)} fit poses determine "
+            f"{fit.determined_unknowns:.1f} unknowns (stiffness, rest curvature, deviations within "
+            f"the tolerances): {max(spare, 0.0):.1f} degrees of freedom are left to estimate the "
+            f"noise from, {LEAST_SPARE:g} are needed.\n"
+            "  Try: more points on each line, more poses, the noise as measurement.std, or "
+            "rest_shape: straight."
+        )
+    weight = np.concatenate([problem.measured[j].relative_std for j in problem.used])
+    raw = np.concatenate(fit.linearization.raw) / weight
+    return NoiseModel(float(np.sqrt((raw**2).sum() / spare)), slow_dof=spare)
+
+
+def _noise_samples(
+    problem: BatchProblem, point: Point, lin: Linearization, modes: int
+) -> list[NoiseSample]:
+    """Residuals of each pose beside the directions that its curve may take."""
     model = problem.unknowns.model
     length = model.cable.length
     size = problem.unknowns.size
@@ -264,11 +316,10 @@ def noise_of(
     # A direction that the poses' own ones hold already costs no further degree of freedom.
     left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
     blocks = np.split(left[:, values > 1e-6], np.cumsum([len(s) for s in point.feet])[:-1])
-    samples = [
+    return [
         NoiseSample(lin.raw[k], s, problem.measured[problem.used[k]].relative_std, own, block)
         for k, (s, own, block) in enumerate(zip(point.feet, bases, blocks, strict=True))
     ]
-    return estimate_noise(samples, length)
 
 
 def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> float:

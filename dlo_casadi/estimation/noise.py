@@ -21,6 +21,9 @@ Kernel = Literal["exponential", "matern", "gaussian"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 # Slow sines per pose in which a missing effect would show.
 SLOW_MODES = 6
+# Points beyond its own directions that a pose needs to tell of the noise, and degrees of freedom
+# that all poses need together for a size and a correlation.
+_SPARE_POINTS, _LEAST_DEGREES = 5, 6
 
 
 def correlation(kernel: Kernel, ratio: FloatArray) -> FloatArray:
@@ -166,9 +169,12 @@ def estimate_noise(
         Points used per pose; evenly thinned beyond that.
     max_poses : int
         Poses from which the correlation is estimated, evenly picked; its size is that of all.
+
+    See Also
+    --------
+    tell_of_noise : whether there is enough to estimate it from.
     """
-    samples = [sample.thinned(max_points) for sample in samples]
-    samples = [sample for sample in samples if len(sample.distances) > sample.own.shape[1] + 5]
+    samples = [sample.thinned(max_points) for sample in _telling(samples)]
     everything, samples = samples, samples[:: max(1, -(-len(samples) // max_poses))]
     # A correlation that is there but weak must not be dropped: it makes smooth residuals
     # look significant. So the likelihood alone decides, without a price on the parameters.
@@ -179,6 +185,17 @@ def estimate_noise(
     if len(everything) == len(samples):
         return noise
     return replace(noise, std=restricted_deviance(replace(noise, std=1.0), everything)[1])
+
+
+def tell_of_noise(samples: list[NoiseSample]) -> bool:
+    """Whether enough of the points is left to `estimate_noise` by what is projected out."""
+    kept = _telling(samples)
+    return bool(kept) and _degrees(kept) >= _LEAST_DEGREES
+
+
+def _telling(samples: list[NoiseSample]) -> list[NoiseSample]:
+    """Poses with points to spare."""
+    return [x for x in samples if len(x.distances) > x.own.shape[1] + _SPARE_POINTS]
 
 
 @dataclass(frozen=True)
@@ -252,9 +269,11 @@ def _degrees(samples: list[NoiseSample]) -> float:
 def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float) -> float:
     """Logarithm of the geometric mean of the variance of slow modes' coefficients."""
     sample = samples[len(samples) // 2]
-    modes = smooth_modes(sample.places, cable_length, SLOW_MODES, free_end=False)
+    # Sines vanish at the fixtures, where points may lie: they determine no mode.
+    count = min(SLOW_MODES, len(sample.places) - 3)
+    modes = smooth_modes(sample.places, cable_length, count, free_end=False)
     seen = noise.whitening(sample.places, sample.weight) @ modes
-    return -float(np.linalg.slogdet(seen.T @ seen)[1]) / SLOW_MODES
+    return -float(np.linalg.slogdet(seen.T @ seen)[1]) / count
 
 
 def _slow_dof(found: list[_Estimate]) -> float:

@@ -1,0 +1,44 @@
+"""Centre-lines of a few points, as somebody clicks them: the noise is still estimated."""
+
+import numpy as np
+import pytest
+from test_gauss_newton import CABLE, STD, measured_from
+
+from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.gauss_newton import Tolerances
+from dlo_casadi.model import CableModel
+from dlo_casadi.session.declared import nuisances
+
+EI = 0.09  # N m^2
+
+
+def fitted(points, poses=8):
+    """Fit of poses, with what lies within the tolerances as nuisances."""
+    truth = CableModel(CABLE, 16, n_rest=5)
+    measured = measured_from(
+        truth, np.array([EI]), np.array([0.5, 1.0, 1.5, 0.8, 0.4]), poses, STD, points
+    )
+    return fit_model(nuisances(truth, Tolerances()), measured, Tolerances())
+
+
+@pytest.mark.parametrize("points", [12, 9, 5])
+def test_noise_of_few_points(points):
+    """Five points leave some twenty degrees of freedom in all: the size is good to a factor of two."""
+    fit = fitted(points)
+    assert STD / 2 < fit.noise.std < 2 * STD
+    assert not fit.noise.declared
+    assert 3 <= fit.noise.slow_dof < 8 * points
+    assert abs(fit.value("bending_stiffness") - EI) < 3 * fit.std("bending_stiffness")
+    assert 0 <= structure_of(fit, noise_degrees(fit)).p_value <= 1
+
+
+def test_fewer_points_than_unknowns():
+    with pytest.raises(
+        EstimationError,
+        match=r"the 4 points of 4 fit poses determine \d+\.\d unknowns .* "
+        r"3 are needed.\n  Try: more points on each line, more poses, the noise as "
+        r"measurement.std, or rest_shape: straight.",
+    ):
+        fitted(1, poses=4)
