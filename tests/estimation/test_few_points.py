@@ -25,7 +25,7 @@ def fitted(points, poses=8):
 
 @pytest.mark.parametrize("points", [12, 9, 5])
 def test_noise_of_few_points(points):
-    """Five points leave some twenty degrees of freedom in all: the size is good to a factor of two."""
+    """Five points leave some twenty degrees of freedom in all, good to a factor of two."""
     fit = fitted(points)
     assert STD / 2 < fit.noise.std < 2 * STD
     assert not fit.noise.declared
