@@ -32,7 +32,7 @@ __all__ = [
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Times that a task is given again to a worker after it was lost with one, the last time alone.
+# Times that a task that was lost with a worker is given to another, the last time alone.
 RETRIES = 2
 # 90 % of a normal distribution lie within so many standard deviations.
 NINETY = 1.645
@@ -52,8 +52,8 @@ class Finished(Generic[Item, Result]):
         Place of the item among the items.
     item : object
     result : object or None
-    error : Exception or None
-        What the function raised instead.
+    error : BaseException or None
+        What the function raised instead, or a `LostTaskError`.
     seconds : float
         That it took, on its worker.
     worker : str
@@ -109,9 +109,9 @@ def map_as_completed(
     """Apply a function to all items; yield each as soon as it has ended.
 
     What the function raises ends its own item alone. A task that is lost with a killed worker
-    is given to another; one that is lost every time, the last time alone, ends with a
-    `LostTaskError`. Each task has one thread of BLAS, OpenMP and OpenCV, so that its numbers do
-    not depend on where it runs.
+    is given to another, in its last repetition with no task beside it; one that is lost every
+    time ends with a `LostTaskError`. Each task has one thread of BLAS, OpenMP and OpenCV, so
+    that its numbers do not depend on where it runs.
 
     Parameters
     ----------
@@ -126,7 +126,8 @@ def map_as_completed(
     in_flight : int, optional
         Most tasks under way; by default two for each worker.
     retries : int
-        Times that a lost task is repeated.
+        Times that a lost task is repeated, the last of them alone; with 0 its first loss, to which
+        any task beside it may have led, ends it.
     progress : callable, optional
         Called after each task.
     """
@@ -173,9 +174,10 @@ def map_as_completed(
                         # With no other beside it, nobody else can be to blame for the next loss.
                         suspects.append(task)
                         continue
+                    times = f"{task.lost} times, at last alone" if retries else "once"
                     error = LostTaskError(
-                        f"task {task.index} was lost {task.lost} times, at last alone: its worker "
-                        "was killed.\n  Try: more memory; see the workers' logs."
+                        f"task {task.index} was lost {times}: its worker was killed.\n"
+                        "  Try: more memory; see the workers' logs."
                     )
                 if error is None:
                     result, error, seconds, worker = future.result()

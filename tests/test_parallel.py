@@ -3,7 +3,7 @@
 import os
 import signal
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -188,3 +188,15 @@ def test_bad_numbers_of_processes():
     both = open_executor(jobs=2, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(DloError, match="its own number of workers"), both:
         pass
+
+
+def test_without_retries_the_first_loss_ends_a_task():
+    class Losing(Executor):
+        def submit(self, function, /, *args, **kwargs):
+            future = Future()
+            future.set_exception(BrokenExecutor())
+            return future
+
+    (ended,) = map_as_completed(Losing(), abs, [-1], retries=0)
+    with pytest.raises(LostTaskError, match="task 0 was lost once: its worker was killed"):
+        ended.value  # noqa: B018

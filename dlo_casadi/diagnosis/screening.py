@@ -232,21 +232,28 @@ class Screen:
         return Screened(candidate, score, p_value, start)
 
     def _within_bounds(self, candidate: Candidate, step: FloatArray, score: float) -> float:
-        """Score of a one-parameter candidate is zero where physics forbids the step's sign."""
+        """Zero where a candidate's one parameter would fall below a bound at which it vanishes.
+
+        Steps of several parameters and beyond other bounds keep their score: a refit decides.
+        """
         if len(step) != 1:
             return score
         i = self.model.names.index(candidate.screened[0])
         parameter = self.model.parameters[i]
-        value = self.p[i] + step[0] * parameter.scale
-        return (
-            score
-            if parameter.lower <= value <= parameter.upper or score == 0
-            else (0.0 if parameter.lower == parameter.nominal and step[0] < 0 else score)
-        )
+        below = self.p[i] + step[0] * parameter.scale < parameter.lower
+        return 0.0 if below and parameter.lower == parameter.nominal else score
 
 
 def survival(score: float, dof: int, noise_dof: float) -> float:
-    """Probability of a larger score where nothing is missing."""
+    """Probability of a larger score where nothing is missing: chi-square, or F.
+
+    Parameters
+    ----------
+    dof : int
+        Of the score, at least one.
+    noise_dof : float
+        With which the noise is known; inf where it is declared.
+    """
     if np.isinf(noise_dof):
         return float(chi2.sf(score, dof))
     return float(f.sf(score / dof, dof, noise_dof))

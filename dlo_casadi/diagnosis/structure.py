@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, f, norm
+from scipy.stats import norm
 
+from dlo_casadi.diagnosis.screening import survival
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
 
@@ -106,11 +107,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     kept = values > 0.05
     along = vectors[:, kept].T @ stacked
     statistic, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
-    p_value = (
-        float(chi2.sf(statistic, dof))
-        if np.isinf(noise_dof)
-        else float(f.sf(statistic / max(dof, 1), max(dof, 1), noise_dof))
-    )
+    p_value = survival(statistic, max(dof, 1), noise_dof)
     energies = np.array(
         [
             float((c**2).sum()) / max(float(np.trace(v)), 0.1)
@@ -161,7 +158,7 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
     kept = values > 1e-6
     along = vectors[:, kept].T @ (slope * scale)
     score, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
-    p_value = chi2.sf(score, dof) if np.isinf(noise_dof) else f.sf(score / dof, dof, noise_dof)
+    p_value = survival(score, max(dof, 1), noise_dof)
     return float(norm.isf(np.clip(p_value, _TAIL, 1 - _TAIL)))
 
 
