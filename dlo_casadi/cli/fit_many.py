@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from dlo_casadi.cli.counter import Counter
-from dlo_casadi.cli.guard import OK
+from dlo_casadi.cli.guard import BAD_INPUT, OK
 from dlo_casadi.cli.options import command, console, print_json
 from dlo_casadi.fleet import FleetResult, Options, find_sessions, fit_fleet
 from dlo_casadi.fleet.outliers import judge
@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> int:
         "shows the odd ones first, and the results of each. The same command goes on after an\n"
         "interruption; what is finished and unchanged is not repeated.",
         EXAMPLES,
-        "a session that fails is a row with its message",
+        "2 is also a session without results: it is a row with its message, the others are done",
     )
     parser.add_argument("where", metavar="FOLDER", help="folder, or a pattern in quotes")
     add_workers(parser)
@@ -81,7 +81,7 @@ def main(argv: Sequence[str]) -> int:
         print_json(list(result.rows))
     else:
         _summary(result, output, chosen.quiet)
-    return OK
+    return BAD_INPUT if result.failed else OK
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:

@@ -67,6 +67,16 @@ def test_numbers_are_those_of_the_report_and_results_are_linked(fleet, expected,
     assert 'href="sessions/session.yaml/report.' in (tmp_path / "index.html").read_text()
 
 
+def test_a_session_without_results_is_told_by_the_exit_code(tmp_path, capsys):
+    (tmp_path / "cables").mkdir()
+    (tmp_path / "cables/broken.yaml").write_text("cable: {lenght: 1.0}\nexperiment: {}\n")
+    command = ["fit-many", str(tmp_path / "cables"), "--output", str(tmp_path / "out"), "--json"]
+    for _ in range(2):  # fitted, then taken over
+        assert main([*command, "--quiet"]) == 2
+        (row,) = json.loads(capsys.readouterr().out)
+        assert row["status"] == "failed"
+
+
 def test_a_killed_worker_of_the_pool_changes_nothing(fleet, expected, tmp_path):
     killed = []
 
