@@ -360,10 +360,21 @@ def test_what_looks_odd_is_a_warning(tmp_path, old, new, warning):
     assert any(warning in text for text in config.warnings), config.warnings
 
 
-def test_headings_in_degrees_are_a_warning(tmp_path):
-    clamped = ("start: pinned", "start: clamped")
-    config = load(tmp_path, clamped, ("end: [0.", "start_heading: 90, end: [0."))
-    assert any("in radians? a 90, b 90, c 90" in text for text in config.warnings)
+@pytest.mark.parametrize(
+    ("end", "degrees", "radians"), [("start", "-65", "-1.134"), ("end", "-360", "-6.283")]
+)
+def test_headings_in_degrees_are_a_mistake(tmp_path, end, degrees, radians):
+    clamped = (f"{end}: pinned", f"{end}: clamped")
+    text = rf"{end}_heading: {degrees} rad: in degrees\? then {radians}"
+    with pytest.raises(ConfigError, match=rf"line 12: pose 1 \(a.csv\): {text}\n"):
+        load(tmp_path, clamped, ("end: [0.", f"{end}_heading: {degrees}, end: [0."))
+
+
+def test_headings_of_up_to_a_turn_and_of_coils_are_allowed(tmp_path):
+    clamped = ("{start: pinned, end: pinned}", "{start: clamped, end: clamped}")
+    headings = "start_heading: -6.283186, end_heading: -18.85, end: [0."
+    poses = load(tmp_path, clamped, ("end: [0.", headings)).experiment.poses
+    assert [(pose.start_heading, pose.end_heading) for pose in poses] == 3 * [(-6.283186, -18.85)]
 
 
 def test_yaml_round_trip_keeps_every_digit_and_the_order(tmp_path):

@@ -87,6 +87,10 @@ def load_config(path: str | Path) -> Config:
 
 _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 
+# A start needs no more than a full turn [rad]; an end is continuous along a cable that may turn
+# round several times.
+_LARGEST_HEADINGS = {"start": 6.3, "end": 25.0}
+
 
 def _contradictions(experiment: Experiment) -> list[Problem]:
     """Find poses that do not fit the boundary, the kind of measurement, or each other."""
@@ -95,8 +99,8 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
     names: dict[str, int] = {}
     for i, pose in enumerate(experiment.poses):
 
-        def wrong(message: str, i: int = i, pose: Pose = pose) -> None:
-            at = ("experiment", "poses", i)
+        def wrong(message: str, i: int = i, pose: Pose = pose, key: str | None = None) -> None:
+            at = ("experiment", "poses", i) if key is None else ("experiment", "poses", i, key)
             problems.append(Problem(at, f"pose {i + 1} ({pose.file.name}): {message}"))
 
         if pose.name in names:
@@ -107,6 +111,13 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
         names.setdefault(pose.name, i)
         if held.start == "clamped" and pose.start_heading is None:
             wrong("a clamped start needs a start_heading [rad]")
+        for key, most in _LARGEST_HEADINGS.items():
+            heading = getattr(pose, f"{key}_heading")
+            if heading is not None and getattr(held, key) == "clamped" and abs(heading) > most:
+                wrong(
+                    f"{key}_heading: {heading:g} rad: in degrees? then {math.radians(heading):.4g}",
+                    key=f"{key}_heading",
+                )
         if held.end == "clamped" and pose.end_heading is None:
             wrong("a clamped end needs an end_heading [rad], continuous along the cable")
         if held.end != "free" and pose.end is None:
@@ -200,7 +211,4 @@ def _oddities(file: File) -> list[str]:
         given = {name: value for name, value in headings.items() if value is not None}
         if given and getattr(held, end) == "pinned":
             warnings.append(f"{end}_heading is not used, the {end} is pinned: {', '.join(given)}")
-        large = [f"{name} {value:g}" for name, value in given.items() if abs(value) > 25.0]
-        if large and getattr(held, end) == "clamped":
-            warnings.append(f"{end}_heading turns around often, in radians? {', '.join(large)}")
     return warnings

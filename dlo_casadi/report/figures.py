@@ -299,7 +299,7 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
         rows.append((label, "fit", stage.rmse_fit))
         if outcome.measurement.poses_held_out:
             rows.append((label, "held_out", stage.rmse_held_out))
-    known = [value for *_, value in rows if value]
+    known = [value for *_, value in rows if value and np.isfinite(value)]
     floor = outcome.measurement.std
     left, right = min([*known, floor]) / 2, 3.5 * max([*known, floor])
     per_stage = 2 if outcome.measurement.poses_held_out else 1
@@ -308,7 +308,7 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
         for k, (_, role, value) in enumerate(rows):
             y = -(k + 0.8 * (k // per_stage))
             color = BLUE if role == "fit" else _HELD_OUT
-            if value is None:
+            if value is None or not np.isfinite(value):
                 axes.text(1.1e3 * left, y, "no value", va="center", color=GREY)
                 continue
             axes.plot(1e3 * value, y, "o" if role == "fit" else "s", color=color, ms=8)

@@ -28,6 +28,8 @@ from dlo_casadi.report.terminal import cross_validated
 from dlo_casadi.session.outcome import Outcome, Stage
 
 _BAND = "#E8EEF3"
+# Errors beyond these are drawn at the edge of an axis [mm].
+_LEAST_MM, _MOST_MM = 1e-9, 1e9
 _SYMBOLS = {"fit": "circle", "cross-validated": "diamond", "held out": "square"}
 
 
@@ -97,9 +99,9 @@ def _filled(kind: str) -> dict[str, Any]:
 
 
 def _log_range(values: list[float]) -> Range1d:
-    """Range of a logarithmic axis [mm] that leaves room on both sides."""
-    known = [value for value in values if value > 0]
-    return Range1d(min(known) / 1.6, max(known) * 1.6)
+    """Range of a logarithmic axis [mm] that leaves room on both sides; finite in any case."""
+    known = [min(max(value, _LEAST_MM), _MOST_MM) for value in values if 0 < value < np.inf]
+    return Range1d(min(known, default=0.1) / 1.6, max(known, default=10.0) * 1.6)
 
 
 def _plain_numbers(chart: figure) -> None:

@@ -83,16 +83,30 @@ class ResultsFolder:
             error.add_note(f"Pose by pose: {page}")
 
     def write(self, outcome: Outcome) -> Path:
-        """Write all results, then put them in place of the previous ones."""
+        """Write all results, then put them in place of the previous ones.
+
+        A page or a figure that cannot be drawn does not lose the numbers: they are put in place
+        before the error goes on.
+        """
         assert self._draft is not None, "use as a context: with ResultsFolder(path) as folder"
         complete = self._draft / "complete"
         try:
             complete.mkdir()
-            fill(complete, outcome)
+            write_numbers(complete, outcome)
+            failed = None
+            try:
+                draw(complete, outcome)
+            except OSError:
+                raise
+            except Exception as error:
+                failed = error
             _swap(complete, self.path, self._draft / "previous")
         except OSError as error:
             raise self._cannot_write(error) from None
         self._made.clear()
+        if failed is not None:
+            failed.add_note(f"All but the drawings is in {self.path}.")
+            raise failed
         return self.path
 
     def _make_parents(self) -> None:
@@ -120,16 +134,20 @@ class ResultsFolder:
         )
 
 
-def fill(folder: Path, outcome: Outcome) -> None:
-    """Write all results of a run into an empty folder."""
+def write_numbers(folder: Path, outcome: Outcome) -> None:
+    """Write all results of a run that are numbers into an empty folder."""
     (folder / "report.json").write_text(report_text(outcome), encoding="utf-8")
-    (folder / "report.html").write_text(report_page(outcome), encoding="utf-8")
     (folder / "parameters.yaml").write_text(parameters_text(outcome), encoding="utf-8")
     lines = folder / "centerlines"
     lines.mkdir()
     for pose in outcome.poses:
         if len(pose.points):
             write_centerline(lines / f"{pose.name}.csv", pose.points)
+
+
+def draw(folder: Path, outcome: Outcome) -> None:
+    """Write the page and the figures beside the numbers."""
+    (folder / "report.html").write_text(report_page(outcome), encoding="utf-8")
     figures = folder / "figures"
     figures.mkdir()
     write_figures(figures, outcome)

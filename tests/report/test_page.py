@@ -332,3 +332,11 @@ def test_colours_have_a_contrast_of_four_and_a_half():
     for color, ground in pairs:
         contrast = (luminance(ground) + 0.05) / (luminance(color) + 0.05)
         assert contrast >= 4.5, (color, ground, contrast)
+
+
+@pytest.mark.parametrize("error", [np.inf, 0.0, 1e300, np.nan])
+def test_charts_of_any_error_have_a_finite_range(outcome, error):
+    stages = tuple(replace(stage, rmse_fit=error, shapes={}) for stage in outcome.stages)
+    chart = page_charts.errors_chart(replace(outcome, stages=stages))
+    assert 0 < chart.x_range.start < chart.x_range.end < np.inf
+    assert 0 < len(chart.xaxis[0].ticker.ticks) < 100

@@ -85,12 +85,14 @@ def test_a_run_that_stops_before_writing_leaves_no_trace(earlier, error):
     assert [path.name for path in earlier.parent.iterdir()] == ["results"]
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
-def test_a_run_that_stops_while_writing_leaves_no_trace(outcome, monkeypatch, earlier, error):
-    def stop(folder, outcome):
+@pytest.mark.parametrize(
+    ("error", "step"), [(KeyboardInterrupt, "write_figures"), (ValueError, "parameters_text")]
+)
+def test_a_run_that_stops_while_writing_leaves_no_trace(outcome, monkeypatch, earlier, error, step):
+    def stop(*_):
         raise error
 
-    monkeypatch.setattr(writer, "write_figures", stop)
+    monkeypatch.setattr(writer, step, stop)
     before = tree(earlier)
     with pytest.raises(error), ResultsFolder(earlier) as folder:
         folder.write(outcome)
@@ -164,3 +166,18 @@ def test_files_of_the_same_names_from_elsewhere_are_not_replaced(tmp_path):
         ResultsFolder(tmp_path),
     ):
         pass
+
+
+def test_a_chart_that_cannot_be_drawn_does_not_lose_the_numbers(outcome, earlier, monkeypatch):
+    def broken(outcome):
+        raise ZeroDivisionError("no range")
+
+    monkeypatch.setattr(writer, "report_page", broken)
+    with pytest.raises(ZeroDivisionError) as caught, ResultsFolder(earlier) as folder:
+        folder.write(outcome)
+
+    assert caught.value.__notes__ == [f"All but the drawings is in {earlier}."]
+    assert json.loads((earlier / "report.json").read_text())["stages"]
+    assert "dlo-parameters/1" in (earlier / "parameters.yaml").read_text()
+    assert not (earlier / "report.html").exists()
+    assert not list(earlier.glob(".*"))
