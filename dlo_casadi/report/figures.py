@@ -378,7 +378,7 @@ def draw_candidates(path: Path, outcome: Outcome) -> None:
         shown = [bool(added), bool(tied), True]
         handles = [handle for handle, show in zip(handles, shown, strict=True) if show]
         drawing.legend(handles=handles, loc="outside lower center", ncols=3)
-        title = "what the declared model may lack, what a refit confirms first"
+        title = "what the declared model may lack: refits by BIC, then by score"
         if outcome.verdict == "unexplained":
             title = "candidates tried; what is left is not explained by any"
         elif not outcome.effects:
