@@ -293,12 +293,20 @@ def solve_equilibrium(
     Raises
     ------
     EquilibriumError
-        If the end is out of reach, or no start leads to an equilibrium.
+        If the end is out of reach or not finite, or no start leads to an equilibrium.
 
     References
     ----------
     Eq. 8 of Quartaro et al. 2025, the bounds on the joints only.
     """
+    if not np.all(np.isfinite(pose.vector)):
+        raise EquilibriumError(
+            f"no equilibrium: a number of the pose is not finite: start {pose.start} m, end "
+            f"{pose.end} m, headings {pose.start_heading} and {pose.end_heading} rad.\n"
+            "  Try: see where these numbers come from.",
+            pose.name,
+            pose.end,
+        )
     named = dict(zip(model.names, p, strict=True))
     stretch = 1 + named.get("length_error.length_difference", 0.0) / model.cable.length
     check_reach(model, pose, stretch)

@@ -455,6 +455,11 @@ def test_the_smallest_radius_is_that_at_a_clamp(element):
 # ---- messages ----------------------------------------------------------------------------------
 
 
+def test_a_pose_that_is_not_finite_is_named():
+    with pytest.raises(EquilibriumError, match=r"pose_08: .*not finite: start \(0.0, 0.0\) m"):
+        solve(CableModel(HEAVY, 8), 0.1, Pose((0.0, 0.0), (0.6, np.nan), name="pose_08"))
+
+
 def test_unreachable_pose_is_named_with_numbers():
     model = CableModel(HEAVY, 8)
     pose = Pose((0.0, 0.0), (0.6, 0.6), name="pose_07")
