@@ -34,35 +34,71 @@ NEVERTHELESS = (
 
 # Elements, poses and stiffnesses (over the declared one) that show which way a cable hangs.
 _MESH, _POSES = 12, 8
+# Points of a line between which its length is measured.
+_SPARSE = 60
 # Of the length: no other explanation is looked for once one comes so near.
 _CLEAR = 0.02
 _STIFFNESSES = sorted(10.0 ** np.arange(-2.0, 2.1, 0.5), key=lambda factor: abs(np.log(factor)))
 
 
-def raise_if_implausible(config: Config, inputs: Sequence[PoseInput]) -> list[str]:
-    """Return what looks odd, as warnings.
+def without_implausible(
+    config: Config, inputs: Sequence[PoseInput]
+) -> tuple[tuple[PoseInput, ...], list[str]]:
+    """Leave out single poses that contradict the configuration.
+
+    With the option `estimation.plausibility` off, all poses stay.
+
+    Returns
+    -------
+    inputs : tuple of PoseInput
+        Those left out have no points and say why.
+    odd : list of str
+        What looks like a mistake but stays.
 
     Raises
     ------
     MeasurementError
-        If the measured lines contradict the configuration beyond doubt, unless the option
-        `estimation.plausibility` is off.
+        If the measured lines of the session contradict the configuration beyond doubt, or if those
+        of most poses do.
     """
     found = find_suspicions(config, inputs)
-    certain = [item.message for item in found if item.certain]
-    if certain and config.estimation.plausibility:
-        raise MeasurementError("\n".join([*certain, NEVERTHELESS]))
-    return [item.message for item in found]
+    if not config.estimation.plausibility:
+        return tuple(inputs), [item.message for item in found]
+    bad = {item.pose: item.message for item in found if item.pose}
+    read = [item for item in inputs if len(item.points)]
+    fit_left = [item for item in read if item.role == "fit" and item.name not in bad]
+    refused = [item.message for item in found if item.certain]
+    if not refused and bad and (2 * len(bad) > len(read) or not fit_left):
+        refused = [
+            f"{len(bad)} of {len(read)} poses contradict the configuration:",
+            *(f"  {message}" for message in bad.values()),
+        ]
+    if refused:
+        raise MeasurementError("\n".join([*refused, NEVERTHELESS]))
+    return tuple(
+        PoseInput(
+            item.name, item.role, np.zeros((0, 2)), problem=_reason(item.name, bad[item.name])
+        )
+        if item.name in bad
+        else item
+        for item in inputs
+    ), [item.message for item in found if not item.pose]
+
+
+def _reason(name: str, message: str) -> str:
+    """What is said of a pose, without its name."""
+    return message.removeprefix(name).lstrip(": ")
 
 
 def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
     """Everything in a session that looks like a mistake, by `plausibility`."""
     read = [item for item in inputs if len(item.points)]
-    found = suspicions(lines_of(config, inputs)) + repeated(
-        [item.name for item in read], [item.points for item in read]
-    )
+    found = suspicions(lines_of(config, inputs))
     if not any(item.certain for item in found):
-        found += hangs_elsewhere(config, read)
+        doubtful = {item.pose for item in found}
+        sound = [item for item in read if item.name not in doubtful]
+        found += repeated([item.name for item in sound], [item.points for item in sound])
+        found += hangs_elsewhere(config, sound)
     return found
 
 
@@ -94,10 +130,16 @@ def _lines(config: Config, points: dict[str, FloatArray]) -> Lines:
         np.array([(pose.start, pose.end or unknown) for pose in poses]).reshape(-1, 2, 2),
         np.array([points[pose.name][[0, -1]] for pose in poses]).reshape(-1, 2, 2),
         np.array(
-            [np.linalg.norm(np.diff(points[p.name], axis=0), axis=1).sum() for p in poses]
+            [np.linalg.norm(np.diff(_sparse(points[p.name]), axis=0), axis=1).sum() for p in poses]
         ).reshape(-1),
         config.cable.length,
     )
+
+
+def _sparse(points: FloatArray) -> FloatArray:
+    """Every so manieth point, both ends among them: noise makes a dense line longer."""
+    kept = np.linspace(0, len(points) - 1, min(len(points), _SPARSE)).round().astype(int)
+    return points[kept]
 
 
 def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:

@@ -21,6 +21,8 @@ FloatArray = NDArray[np.floating]
 # Shares of the cable's length. Lines end up to 0.08 from their fixtures where a holder or a gap
 # hides the cable; ends that fit are well below, ends that do not are well above.
 FITS, CONTRADICTS = 0.04, 0.1
+# A line longer than so many cables does not follow the cable.
+_TOO_LONG = 1.5
 # Ends that fit another pose need not be as far from their own.
 OUT_OF_STEP = 0.05
 # An explanation leaves at most this share of the misfit.
@@ -42,10 +44,14 @@ FRAMES: dict[str, FloatArray] = {
 
 
 class Suspicion(NamedTuple):
-    """What looks like a mistake, what to do about it, and whether nothing else explains it."""
+    """What looks like a mistake, and what to do about it.
+
+    It is certain where nothing else explains the whole session; of a single pose it tells the name.
+    """
 
     message: str
     certain: bool
+    pose: str = ""
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ class Lines:
     measured : (m, 2, 2) [m]
         The two ends of each measured line, in any order.
     lengths : (m,) [m]
-        Along each measured line.
+        Along each measured line, from point to point.
     length : float [m]
         Of the cable.
     """
@@ -98,7 +104,9 @@ def suspicions(lines: Lines) -> tuple[Suspicion, ...]:
         found = look(lines)
         if found is not None:
             return (found,)
-    return (*exchanged(lines), *far_ends(lines))
+    single = (*too_long(lines), *exchanged(lines), *far_ends(lines))
+    first = {item.pose: item for item in reversed(single)}
+    return tuple(item for item in single if first[item.pose] is item)
 
 
 def wrong_units(lines: Lines) -> Suspicion | None:
@@ -191,6 +199,19 @@ def out_of_step(lines: Lines) -> Suspicion | None:
     )
 
 
+def too_long(lines: Lines) -> tuple[Suspicion, ...]:
+    """Single poses whose points, in their order, run to and fro."""
+    return tuple(
+        Suspicion(
+            f"{lines.names[i]}: from point to point its line is {lines.lengths[i]:.4g} m long, the "
+            f"cable {lines.length:.4g} m. Try: are its points in order along the cable?",
+            False,
+            lines.names[i],
+        )
+        for i in np.flatnonzero(lines.lengths > _TOO_LONG * lines.length)
+    )
+
+
 def exchanged(lines: Lines) -> tuple[Suspicion, ...]:
     """Poses whose end is where all others have their start, as if both were exchanged."""
     starts, ends = lines.declared[:, 0], lines.declared[:, 1]
@@ -207,6 +228,7 @@ def exchanged(lines: Lines) -> tuple[Suspicion, ...]:
             f"{lines.names[i]}: its end ({ends[i][0]:g}, {ends[i][1]:g}) m is where the other "
             "poses have their start. Try: are start and end exchanged?",
             False,
+            lines.names[i],
         )
         for i in np.flatnonzero(turned)
     )
@@ -221,6 +243,7 @@ def far_ends(lines: Lines) -> tuple[Suspicion, ...]:
             f"{_at(lines.measured[i, 1])} m, {own[i] * lines.length:.3g} m RMS away from the "
             "declared ends. Try: start and end of this pose, and whether it is the right file.",
             False,
+            lines.names[i],
         )
         for i in np.flatnonzero(own > CONTRADICTS)
     )
@@ -238,6 +261,7 @@ def repeated(names: Sequence[str], points: Sequence[FloatArray]) -> tuple[Suspic
                     f"{name} holds exactly the points of {seen[key]}, and no two measurements "
                     "agree to the last digit. Try: is one file there twice, under two names?",
                     False,
+                    name,
                 )
             )
         seen.setdefault(key, name)

@@ -18,7 +18,7 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import stiffness_interval
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model import CableModel
-from dlo_casadi.session.checks import raise_if_implausible
+from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.declared import Declared, declared_model, straight
 from dlo_casadi.session.findings import (
     candidate_rows,
@@ -70,7 +70,7 @@ def fit_session(
     config: Config, inputs: Sequence[PoseInput], clock: Clock, progress: Progress
 ) -> Outcome:
     """Fit and report a session whose poses have been read; raises as `run_session` does."""
-    odd = raise_if_implausible(config, inputs)
+    inputs, odd = without_implausible(config, inputs)
     measured = measured_poses(config, inputs)
     clock.lap("vision")
     warnings = [*config.warnings, *reading_warnings(inputs, config.skipped), *odd]
