@@ -391,7 +391,7 @@ def fit_model(
         Where the parameters start, or stay if they are not estimated; nominal by default.
     start : Fit, optional
         A fit of a similar model on the same mesh to start from; its noise is kept.
-    decades : sequence of int
+    decades : sequence of float
         Stiffnesses to start from, powers of ten about the prior.
     max_iterations : int
         Of a fit that continues from `start`.

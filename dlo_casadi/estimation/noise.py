@@ -3,7 +3,8 @@
     cov(d_i, d_k) = std^2 w_i w_k [ (1 - share) delta_ik + share k(|s_i - s_k| / l) ]
 
 for normal distances d at arc lengths s with relative weights w. Whether the correlated part is
-rough (exponential) or smooth (squared exponential) is chosen by likelihood.
+rough (exponential), once differentiable (Matern 3/2) or smooth (squared exponential) is chosen by
+likelihood.
 """
 
 from __future__ import annotations
@@ -267,7 +268,7 @@ def _degrees(samples: list[NoiseSample]) -> float:
 
 
 def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float) -> float:
-    """Logarithm of the geometric mean of the variance of slow modes' coefficients."""
+    """Logarithm of the geometric mean of the variance of slow modes, in the middle pose for all."""
     sample = samples[len(samples) // 2]
     # Sines vanish at the fixtures, where points may lie: they determine no mode.
     count = min(SLOW_MODES, len(sample.places) - 3)
