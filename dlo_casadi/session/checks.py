@@ -14,6 +14,7 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.declared import declared_model, straight
+from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import conditions, line_without_end
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.plausibility import (
@@ -98,7 +99,10 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
         doubtful = {item.pose for item in found}
         sound = [item for item in read if item.name not in doubtful]
         found += repeated([item.name for item in sound], [item.points for item in sound])
-        found += hangs_elsewhere(config, sound)
+        found += wrong_headings(config, sound)
+    if not any(item.certain for item in found):
+        doubtful = {item.pose for item in found}
+        found += hangs_elsewhere(config, [item for item in read if item.name not in doubtful])
     return found
 
 

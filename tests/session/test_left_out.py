@@ -94,7 +94,6 @@ def test_one_bad_pose_is_left_out_of_the_fit(session, tmp_path, change, words):
 
 def test_a_fit_is_that_without_the_bad_pose(session, tmp_path):
     """Two routes: a pose with x and y exchanged, and no such pose."""
-
     exchange = changed_line(tmp_path, "pose_02", lambda points: points[:, ::-1])
 
     def with_it(poses):
