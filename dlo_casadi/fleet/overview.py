@@ -26,6 +26,9 @@ td { white-space: nowrap; vertical-align: top; } th { vertical-align: bottom; }
 pre { white-space: pre-wrap; margin: 0; font: inherit; }
 """
 
+# Of a session whose diagnosis was switched off.
+UNDIAGNOSED = "not diagnosed"
+
 HEAD = (
     ("session", "text"),
     ("verdict", "text"),
@@ -70,7 +73,7 @@ def overview_html(rows: Sequence[Row], output: Path) -> str:
 
 def _summary(judged: Sequence[Judged]) -> str:
     verdicts = Counter(
-        item.row["verdict"] if item.row["status"] == "done" else item.row["status"]
+        item.row["verdict"] or UNDIAGNOSED if item.row["status"] == "done" else item.row["status"]
         for item in judged
     )
     counts = ", ".join(f"{n} {str(name).replace('_', ' ')}" for name, n in verdicts.most_common())
@@ -88,7 +91,7 @@ def _line(item: Judged, output: Path) -> str:
             f'<tr><td class="text long">{name}</td><td></td><td class="text">{odd}</td>'
             f'<td class="text long" colspan="{len(HEAD) - 3}">{text}</td></tr>'
         )
-    verdict = str(row["verdict"])
+    verdict = str(row["verdict"] or UNDIAGNOSED)
     error = last_error(row)
     cells = (
         ("text long", name),

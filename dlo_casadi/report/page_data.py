@@ -43,7 +43,7 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
     return {
         "title": outcome.config.cable.name,
         "config_name": outcome.config.name,
-        "verdict": outcome.verdict if outcome.config.diagnosis.enabled else "off",
+        "verdict": outcome.verdict or "off",
         "verdict_word": verdict_word(outcome),
         "sentence": sentence(said[0]),
         "details": said[1:],
@@ -85,7 +85,7 @@ def sentence(line: str) -> str:
 
 def verdict_word(outcome: Outcome) -> str:
     """The verdict in one or two words."""
-    if not outcome.config.diagnosis.enabled:
+    if outcome.verdict is None:
         return "Not diagnosed"
     return VERDICT_WORDS[outcome.verdict]
 

@@ -222,7 +222,7 @@ def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
 
 def verdict_lines(outcome: Outcome) -> list[str]:
     """What the diagnosis has led to, in sentences."""
-    if not outcome.config.diagnosis.enabled:
+    if outcome.verdict is None:
         return ["Diagnosis: switched off; nothing was looked for in the residual."]
     lines = [_verdict(outcome), *structure_lines(outcome)]
     for effect in outcome.effects:

@@ -186,6 +186,8 @@ class Outcome:
     ----------
     effects, candidates, unexplained, next_pose
         As in report.json ("dlo-report/1"), ready to be written.
+    verdict : Verdict or None
+        None where no diagnosis was made: nothing is claimed then.
     structure : dict or None
         Tests of the residual "before" and "after", see `diagnosis.structure.Structure`.
     fit : Fit
@@ -201,7 +203,7 @@ class Outcome:
     discretization: Discretization
     timing: dict[str, float]
     fit: Fit
-    verdict: Verdict = "complete"
+    verdict: Verdict | None = None
     warnings: tuple[str, ...] = ()
     effects: tuple[dict[str, Any], ...] = ()
     candidates: tuple[dict[str, Any], ...] = ()

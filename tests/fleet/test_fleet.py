@@ -208,6 +208,12 @@ def test_the_odd_ones_come_first():
     assert all(not reasons[f"plain_{k}"] for k in range(7))
 
 
+def test_a_session_without_a_diagnosis_is_not_called_complete(tmp_path):
+    page = overview_html([fake("plain", 0.3, verdict=None)], tmp_path)
+    assert "<p>1 not diagnosed. 0 to look at first.</p>" in page
+    assert '<td class="text">not diagnosed</td>' in page
+
+
 def test_the_page_is_escaped_and_asks_for_nothing(tmp_path):
     row = fake("<script>alert(1)</script>", 0.3)
     failed = empty_row('a"b&c', "hash", "failed", "<img src=x onerror=y>", 0.0)

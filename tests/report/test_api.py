@@ -120,9 +120,10 @@ def test_a_result_predicts_as_its_file_does(result, written):
 
 def test_a_result_writes_what_the_command_writes(result, tmp_path, monkeypatch):
     filled = []
-    monkeypatch.setattr(writer, "fill", lambda folder, outcome: filled.append(outcome))
+    for step in ("write_numbers", "draw"):
+        monkeypatch.setattr(writer, step, lambda folder, outcome: filled.append(outcome))
     assert result.write(tmp_path / "rope") == tmp_path / "rope"
-    assert filled == [result]
+    assert filled == [result, result]
 
 
 def test_the_solver_of_a_folder_of_results(written, tmp_path, capsys):

@@ -21,7 +21,7 @@ KEYS = {
     "discretization": dict,
     "effects": list,
     "candidates": list,
-    "verdict": str,
+    "verdict": type(None),  # the diagnosis is switched off
     "unexplained": type(None),
     "next_pose": type(None),
     "structure": type(None),

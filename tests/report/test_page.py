@@ -68,8 +68,9 @@ def test_the_verdict_is_a_sentence(outcome):
 
 
 def test_a_diagnosis_that_is_switched_off_is_no_verdict(outcome):
+    assert outcome.verdict is None
     data = page_data(outcome)
-    assert data["verdict_word"] == "Not diagnosed"
+    assert (data["verdict"], data["verdict_word"]) == ("off", "Not diagnosed")
     assert data["sentence"].startswith("Diagnosis: switched off")
     assert "What the declared model may lack" not in report_page(outcome)
 
