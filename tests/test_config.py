@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from dlo_casadi.config import Centerlines, Config, Images, dump_yaml, load_config, read_yaml
+from dlo_casadi.effects import EFFECTS
 from dlo_casadi.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -254,6 +255,36 @@ def test_a_file_that_cannot_be_read(tmp_path):
     (tmp_path / "photo.yaml").write_bytes(b"\xff\xd8\xff\xe0\x00\x10JFIF")
     with pytest.raises(ConfigError, match="not a YAML text file"):
         load_config(tmp_path / "photo.yaml")
+
+
+@pytest.mark.parametrize(
+    ("options", "line", "message"),
+    [
+        ("model: {effects: [wind]}", 15, "model.effects: no effect is called 'wind'; known here: "),
+        ("model:\n  effects:\n    - lumped_mas", 17, "'lumped_mas'; did you mean 'lumped_mass'?"),
+        (
+            "model:\n  effects:\n    - name: lumped_mass\n      parameters: {masss: 0.1}",
+            18,
+            "lumped_mass has no parameter 'masss'; did you mean 'mass'?",
+        ),
+        (
+            "diagnosis:\n  exclude: [point_farce]",
+            16,
+            "diagnosis.exclude: no effect is called 'point_farce'; did you mean 'point_force'?",
+        ),
+    ],
+)
+def test_unknown_effects_are_named_with_their_line(tmp_path, options, line, message):
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, text=GOOD + options + "\n")
+    assert caught.value.line == line
+    assert message in str(caught.value)
+
+
+def test_every_effect_can_be_declared(tmp_path):
+    names = ", ".join(EFFECTS)
+    config = load(tmp_path, text=f"{GOOD}model: {{effects: [{names}]}}\n")
+    assert [item.name for item in config.model.effects] == list(EFFECTS)
 
 
 def test_headings_follow_the_boundary(tmp_path):

@@ -16,7 +16,7 @@ PARALLEL = {"executors", "parallel"}
 # layer -> what it may import beside itself. A new module gets its line here.
 MAY_IMPORT: dict[str, set[str]] = {
     **{layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)},
-    "config": {"errors", "parameters"},
+    "config": {"errors", "parameters", "effects"},
     "measurements": {"errors", "config"},
     "vision": {"errors"},
     "estimation": MECHANICS | {"config", "measurements"} | PARALLEL,

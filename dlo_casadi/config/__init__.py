@@ -5,7 +5,7 @@ each with its line.
 """
 
 from dlo_casadi.config.document import dump_yaml, read_yaml
-from dlo_casadi.config.load import load_config
+from dlo_casadi.config.load import load_config, unknown_effect
 from dlo_casadi.config.sections import (
     Board,
     Boundary,
@@ -47,4 +47,5 @@ __all__ = [
     "dump_yaml",
     "load_config",
     "read_yaml",
+    "unknown_effect",
 ]

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.explain import explain
-from dlo_casadi.config.problems import Problem, kind_of
+from dlo_casadi.config.problems import Problem, did_you_mean, kind_of
 from dlo_casadi.config.sections import (
     Cable,
     Config,
@@ -21,6 +21,8 @@ from dlo_casadi.config.sections import (
     SkippedPose,
     Tolerances,
 )
+from dlo_casadi.effects import EFFECTS
+from dlo_casadi.effects import Cable as EffectsCable
 from dlo_casadi.errors import ConfigError
 
 
@@ -57,7 +59,7 @@ def load_config(path: str | Path) -> Config:
     except ValidationError as error:
         raise document.error(explain(error.errors(), document.data)) from None
 
-    if problems := _contradictions(file.experiment):
+    if problems := [*_contradictions(file.experiment), *_unknown_effects(file)]:
         raise document.error(problems)
 
     poses = file.experiment.poses
@@ -134,6 +136,36 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
     if not any(pose.role == "fit" for pose in experiment.poses):
         at = ("experiment", "poses")
         problems.append(Problem(at, "no pose has role: fit, there is nothing to fit to"))
+    return problems
+
+
+def unknown_effect(name: str) -> str | None:
+    """What is wrong with the name of an effect, if no effect is called so."""
+    return None if name in EFFECTS else f"no effect is called {name!r}{did_you_mean(name, EFFECTS)}"
+
+
+def _unknown_effects(file: File) -> list[Problem]:
+    """Find names of effects, and of their parameters, that do not exist."""
+    problems: list[Problem] = []
+    cable = EffectsCable(
+        file.cable.length, file.cable.mass, file.cable.diameter, file.cable.prior_bending_stiffness
+    )
+    for i, item in enumerate(file.model.effects):
+        if (wrong := unknown_effect(item.name)) is not None:
+            problems.append(Problem(("model", "effects", i, "name"), f"model.effects: {wrong}"))
+            continue
+        known = [q.name for q in EFFECTS[item.name]().parameters(cable)]
+        problems += [
+            Problem(
+                ("model", "effects", i, "parameters", name),
+                f"model.effects: {item.name} has no parameter {name!r}{did_you_mean(name, known)}",
+            )
+            for name in item.parameters
+            if name not in known
+        ]
+    for i, name in enumerate(file.diagnosis.exclude):
+        if (wrong := unknown_effect(name)) is not None:
+            problems.append(Problem(("diagnosis", "exclude", i), f"diagnosis.exclude: {wrong}"))
     return problems
 
 

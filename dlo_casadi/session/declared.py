@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.config import Config
+from dlo_casadi.config import Config, unknown_effect
 from dlo_casadi.effects import (
     EFFECTS,
     Cable,
@@ -163,12 +162,8 @@ def declared_model(
 
 
 def _check_name(name: str, where: str, config: Config) -> None:
-    if name not in EFFECTS:
-        near = difflib.get_close_matches(name, EFFECTS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ConfigError(
-            f"{where}: no effect is called {name!r}{hint} Known: {', '.join(EFFECTS)}", config.path
-        )
+    if (wrong := unknown_effect(name)) is not None:
+        raise ConfigError(f"{where}: {wrong}", config.path)
 
 
 def straight(model: CableModel) -> CableModel:
