@@ -24,6 +24,7 @@ from dlo_casadi.config.sections import (
     Reference,
     SkippedPose,
     Tolerances,
+    implausible_sizes,
 )
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "SkippedPose",
     "Tolerances",
     "dump_yaml",
+    "implausible_sizes",
     "load_config",
     "read_yaml",
     "unknown_effect",

@@ -55,6 +55,24 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
+def implausible_sizes(length: float, mass: float, diameter: float) -> list[Problem]:
+    """Find sizes [m], [kg] of a cable that no cable has, by their key."""
+    problems: list[Problem] = []
+    if length > 100.0:
+        text = f"{length:g} m: units are SI, did you mean {length / 1e3:g}?"
+        problems.append(Problem(("length",), text))
+    elif diameter > length:
+        text = (
+            f"{diameter:g} m is larger than the length {length:g} m: units are SI, "
+            f"did you mean {diameter / 1e3:g}?"
+        )
+        problems.append(Problem(("diameter",), text))
+    if mass > min(1000.0, 100.0 * length):
+        text = f"{mass:g} kg for {length:g} m: units are SI, did you mean {mass / 1e3:g}?"
+        problems.append(Problem(("mass",), text))
+    return problems
+
+
 class Cable(Section):
     """The cable between its two fixtures."""
 
@@ -83,8 +101,7 @@ class Cable(Section):
 
     @model_validator(mode="after")
     def _plausible(self) -> Cable:
-        length, mass, diameter = self.length, self.mass, self.diameter
-        problems = []
+        problems = implausible_sizes(self.length, self.mass, self.diameter)
         if self.youngs_modulus is None and self.bending_stiffness is None:
             problems.append(
                 Problem((), "give youngs_modulus [Pa] or bending_stiffness [N m^2], found neither")
@@ -95,18 +112,6 @@ class Cable(Section):
                     ("bending_stiffness",), "give youngs_modulus or bending_stiffness, found both"
                 )
             )
-        if length > 100.0:
-            text = f"{length:g} m: units are SI, did you mean {length / 1e3:g}?"
-            problems.append(Problem(("length",), text))
-        elif diameter > length:
-            text = (
-                f"{diameter:g} m is larger than the length {length:g} m: units are SI, "
-                f"did you mean {diameter / 1e3:g}?"
-            )
-            problems.append(Problem(("diameter",), text))
-        if mass > min(1000.0, 100.0 * length):
-            text = f"{mass:g} kg for {length:g} m: units are SI, did you mean {mass / 1e3:g}?"
-            problems.append(Problem(("mass",), text))
         if problems:
             raise Contradiction(*problems)
         return self

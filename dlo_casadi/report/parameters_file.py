@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.chain import ELEMENTS
-from dlo_casadi.config import Config, dump_yaml, read_yaml
+from dlo_casadi.config import Config, dump_yaml, implausible_sizes, read_yaml
 from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.model import CableModel
+from dlo_casadi.parameters import Parameter
 from dlo_casadi.report.json_report import finite
 from dlo_casadi.session.outcome import Outcome
 
@@ -281,7 +282,8 @@ def load_parameters(path: str | Path) -> Parameters:
     Raises
     ------
     ConfigError
-        If the file is no parameters.yaml of this schema; the message names the key.
+        If the file is no parameters.yaml of this schema, or if a value in it lies outside of its
+        bounds; the message names the key.
     """
     source = Path(path)
     if source.is_dir():
@@ -337,6 +339,8 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         name=str(declared["name"]),
         straight=declared["rest_shape"] == "straight",
     )
+    for (key, *_), message in implausible_sizes(cable.length, cable.mass, cable.diameter):
+        raise DloError(f"cable.{key}: {message}")
     gravity = _numbers(document["gravity"], 2, "gravity")
     boundary = document["boundary"]
     tolerances = {name: row.get("tolerance") for name, row in rows.items()}
@@ -354,7 +358,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     if set(rows) != set(model.names):
         wrong = ", ".join(sorted(set(rows) ^ set(model.names)))
         raise DloError(f"parameters and effects do not belong together: {wrong}")
-    values = [rows[name]["value"] for name in model.names]
+    values = [_within_bounds(q, rows[q.name]) for q in model.parameters]
     coefficients = document["rest_curvature"]["coefficients"]
     rest = document["state"]["rest_curvature"]
     names = tuple(document["covariance"]["names"])
@@ -399,6 +403,22 @@ def _positive(section: Mapping[str, Any], where: str, key: str) -> float:
     value = section[key]
     if not isinstance(value, int | float) or not 0 < value < math.inf:
         raise DloError(f"{where}.{key} must be a positive number, found {value!r}")
+    return float(value)
+
+
+def _within_bounds(q: Parameter, row: Mapping[str, Any]) -> float:
+    """Value of a parameter, within the bounds of the file and of the model."""
+    value = row["value"]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise DloError(f"parameters.{q.name}.value must be finite, found {value!r}")
+    lower = max(q.lower, -math.inf if row.get("lower") is None else float(row["lower"]))
+    upper = min(q.upper, math.inf if row.get("upper") is None else float(row["upper"]))
+    slack = 1e-9 * q.scale  # of the solver, which may end beside a bound by so much
+    if (q.log and value <= 0) or not lower - slack <= value <= upper + slack:
+        raise DloError(
+            f"parameters.{q.name}.value: {value:g} {q.unit} lies outside of its bounds "
+            f"[{lower:g}, {upper:g}]. Try: the file as a fit has written it"
+        )
     return float(value)
 
 

@@ -184,6 +184,23 @@ def damaged(file, tmp_path, change):
         (lambda d: d["effects"].pop(), "do not belong together: end_offset.dx, end_offset.dy"),
         (lambda d: d["state"]["rest_curvature"].pop(), "20 numbers belong here, found 19"),
         (lambda d: d["parameters"]["end_offset.dx"].update(value=None), "must be finite"),
+        (
+            lambda d: d["parameters"]["bending_stiffness"].update(value="soft"),
+            "parameters.bending_stiffness.value must be finite, found 'soft'",
+        ),
+        (
+            lambda d: d["parameters"]["bending_stiffness"].update(value=-0.3),
+            "parameters.bending_stiffness.value: -0.3 N m^2 lies outside of its bounds "
+            "[1e-12, 1e+09]",
+        ),
+        (
+            lambda d: d["parameters"]["end_offset.dx"].update(value=0.02, upper=0.01),
+            "parameters.end_offset.dx.value: 0.02 m lies outside of its bounds",
+        ),
+        (
+            lambda d: d["cable"].update(length=550.0),
+            "cable.length: 550 m: units are SI, did you mean 0.55?",
+        ),
     ],
 )
 def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
