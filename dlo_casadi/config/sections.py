@@ -367,7 +367,7 @@ class EstimationOptions(Section):
     robust: Switch = False
     """Whether outlying points weigh less."""
     plausibility: Switch = True
-    """Whether lines that contradict units, ends or gravity as declared stop the fit."""
+    """Whether contradictions of the configuration stop the fit, or leave out a single pose."""
     rest_curvature_coefficients: Count | None = None
     """Number of coefficients of the rest curvature; chosen from the data when absent."""
 
