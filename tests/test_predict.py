@@ -158,8 +158,10 @@ def test_folders_of_results_are_suggested_not_configurations(pinned, tmp_path):
         predict(results / "cabel", end=(0.3, -0.1))
     with pytest.raises(DloError, match=re.escape(f"Try: {results / 'cable'}")):
         predict(results.parent / "nowhere", end=(0.3, -0.1))
+    bare = tmp_path / "alone" / "bare"
+    bare.mkdir(parents=True)
     with pytest.raises(DloError, match=r"no parameters\.yaml in this folder\.\n  Try: the res"):
-        predict(tmp_path, end=(0.3, -0.1))
+        predict(bare, end=(0.3, -0.1))
 
 
 def test_a_free_end_hangs(overhang):
