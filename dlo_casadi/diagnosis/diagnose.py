@@ -236,7 +236,10 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
     lacks a part of the noise. Where nothing else is missing all that is left is noise, its slow
     modes included; where something is, the noise is too large and the significance too low.
     """
-    noise = noise_of(closed.problem, closed.point, closed.linearization, modes=0)
+    try:
+        noise = noise_of(closed.problem, closed.point, closed.linearization, modes=0)
+    except EstimationError:  # with the effect hardly a point is left over: nothing is shown
+        return 1.0
     problem = open_.problem.changed(noise, open_.problem.roughness_std, open_.problem.scatter)
     problem.refresh(open_.point.feet)
     point = problem.evaluate(open_.point.theta, open_.point.shapes, open_.point.feet)

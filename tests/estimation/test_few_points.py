@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from test_gauss_newton import CABLE, STD, measured_from
 
+from dlo_casadi.diagnosis.diagnose import _p_with_closed_noise
 from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
@@ -14,13 +15,13 @@ from dlo_casadi.session.declared import nuisances
 EI = 0.09  # N m^2
 
 
-def fitted(points, poses=8):
+def fitted(points, poses=8, std=None):
     """Fit of poses, with what lies within the tolerances as nuisances."""
     truth = CableModel(CABLE, 16, n_rest=5)
     measured = measured_from(
         truth, np.array([EI]), np.array([0.5, 1.0, 1.5, 0.8, 0.4]), poses, STD, points
     )
-    return fit_model(nuisances(truth, Tolerances()), measured, Tolerances())
+    return fit_model(nuisances(truth, Tolerances()), measured, Tolerances(), std)
 
 
 @pytest.mark.parametrize("points", [12, 9, 5])
@@ -42,3 +43,8 @@ def test_fewer_points_than_unknowns():
         r"measurement.std, or rest_shape: straight.",
     ):
         fitted(1, poses=4)
+
+
+def test_an_effect_that_leaves_no_point_over_is_not_significant():
+    fit = fitted(1, poses=4, std=STD)
+    assert _p_with_closed_noise(fit, fit, winner=None, tried=1) == 1.0
