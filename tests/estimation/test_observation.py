@@ -226,18 +226,18 @@ def test_white_noise_is_recovered():
 @pytest.mark.parametrize("truth", NOISES[1:], ids=lambda noise: noise.kernel)
 def test_correlated_noise_is_recovered(truth):
     """Size and correlation over the distances that points and knots are apart, from 60 poses."""
-    found = [estimate_noise(simulated(truth, poses=60, seed=k), LENGTH) for k in range(5)]
+    found = [estimate_noise(simulated(truth, poses=60, seed=k), LENGTH) for k in range(3)]
     # L / length * 60 = 1000 to 1800 independent stretches know the variance to 3 %, less what
     # four slow displacements a pose take of a correlation that is nearly as slow: 5 % of the
-    # root, two of them. Correlations scatter by 0.03 to 0.04, three of them for the mean of five.
-    assert [noise.std for noise in found] == pytest.approx([truth.std] * 5, rel=0.1)
+    # root, two of them. Correlations scatter by 0.03 to 0.04, three of them for the mean of three.
+    assert [noise.std for noise in found] == pytest.approx([truth.std] * 3, rel=0.1)
     lags = np.array([0.0, 0.02, 0.04, 0.08])
     exact, *estimates = (x.covariance(lags, np.ones(4))[0] / x.std**2 for x in (truth, *found))
-    np.testing.assert_allclose(np.mean(estimates, axis=0), exact, atol=0.05)
+    np.testing.assert_allclose(np.mean(estimates, axis=0), exact, atol=0.065)
     if truth.kernel == "gaussian":  # smooth enough to be told from the others
         assert {noise.kernel for noise in found} == {"gaussian"}
-        assert [noise.share for noise in found] == pytest.approx([truth.share] * 5, abs=0.06)
-        assert [noise.length for noise in found] == pytest.approx([truth.length] * 5, rel=0.1)
+        assert [noise.share for noise in found] == pytest.approx([truth.share] * 3, abs=0.06)
+        assert [noise.length for noise in found] == pytest.approx([truth.length] * 3, rel=0.1)
 
 
 def test_how_well_slow_modes_are_known_is_known():
@@ -250,8 +250,8 @@ def test_how_well_slow_modes_are_known_is_known():
         seen = noise.whitening(s, weight) @ modes
         return -float(np.linalg.slogdet(seen.T @ seen)[1]) / 6
 
-    found = [estimate_noise(simulated(truth, 6, 80, seed=k), LENGTH) for k in range(40)]
+    found = [estimate_noise(simulated(truth, 6, 80, seed=k), LENGTH) for k in range(24)]
     errors = np.array([log_variance(noise) - log_variance(truth) for noise in found])
     told = np.array([2 / noise.slow_dof for noise in found])
-    # Forty draws know their own mean square to a factor of 1.25, twice that is 1.6.
-    assert 1 / 1.6 < np.mean(errors**2 / told) < 1.6
+    # 24 draws know their own mean square to a factor of 1.3, twice that is 1.7.
+    assert 1 / 1.7 < np.mean(errors**2 / told) < 1.7
