@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from dlo_casadi.chain import ELEMENTS
 from dlo_casadi.cli.counter import Counter
 from dlo_casadi.cli.fit_many import add_workers
 from dlo_casadi.cli.guard import OK
@@ -53,6 +54,11 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--end-heading", type=float, metavar="R", help="of all poses [rad]")
     parser.add_argument("--branch", choices=("ccw", "cw"), help="which way the cable turns")
     parser.add_argument("--elements", type=int, help="number of elements, instead of the fit's")
+    parser.add_argument(
+        "--element",
+        choices=ELEMENTS,
+        help="instead of the fit's; arcs are several times faster than quadratic elements",
+    )
     add_workers(parser)
     parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead")
     parser.add_argument("--restart", action="store_true", help="replace what lies there")
@@ -63,10 +69,10 @@ def main(argv: Sequence[str]) -> int:
     parquet_library()
     cable = load_parameters(chosen.parameters)
     model, p, rest, metadata = cable
-    if chosen.elements:
+    if chosen.elements or chosen.element:
         if model.has_state:
             raise DloError("the state of a drifting cable belongs to the fit's own elements")
-        model = model.with_mesh(chosen.elements)
+        model = model.with_mesh(chosen.elements or model.n, chosen.element)
         rest = model.rest_basis @ metadata.coefficients
     fixed, needed = _ends(cable, chosen.start, chosen.start_heading, chosen.end_heading)
     poses: Poses

@@ -76,7 +76,7 @@ def growth(folder: Path, counts: Sequence[int] = (10, 30, 100, 300)) -> dict[str
 
 
 def million(folder: Path, side: int = 1000) -> dict[str, Any]:
-    """A million shapes of 20 elements by two processes, with the memory of all of them."""
+    """A million shapes of 20 arcs by two processes, with the memory of all of them."""
     folder.mkdir()
     config = load_config(write_sessions(folder / "cables", 1, poses=3, every=6, n=20)[0])
     (folder / "parameters.yaml").write_text(parameters_text(run_session(config)))
@@ -84,6 +84,7 @@ def million(folder: Path, side: int = 1000) -> dict[str, Any]:
     grid = [-reach, reach, side, -reach, reach, side]
     output = folder / "shapes.parquet"
     command = ["shape_table.py", str(folder), "--grid", *map(str, grid), "--elements", "20"]
+    command += ["--element", "arc"]
     timed = measured([*command, "--output", str(output), "--jobs", "2"])
     statuses = pq.read_table(output, columns=["status"])["status"].value_counts().to_pylist()
     size = output.stat().st_size / 1e6
