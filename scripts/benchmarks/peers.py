@@ -46,7 +46,7 @@ GRAVITY = -9.81
 SIZES = (10, 20, 40)
 # At rest: no node faster than this [m/s] on average over two intervals [s] one after the other.
 REST_SPEED, INTERVAL = 1e-5, 0.02
-COURANT = 0.9  # time step over the largest stable one of the linear problem
+COURANT = 0.5  # time step over the largest stable one of either on its own
 PATIENCE = 20.0  # simulated time after which a relaxation has failed [s]
 # Damping [1/s] of PyElastica, and of a joint in MuJoCo relative to its stiffness [s].
 UNIFORM_DAMPING, JOINT_DAMPING = 10.0, 0.1
