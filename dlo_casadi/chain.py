@@ -227,37 +227,40 @@ class Curve:
     bow: ca.SX
     square: ca.SX
 
-    def _own_turn(self, e: int, u: ca.SX | float) -> ca.SX:
-        """Heading of the rest shape beyond its linear part; zero at both ends of element e."""
+    def _own_turns(self, u: ca.SX | float) -> ca.SX:
+        """Headings (n,) of the rest shape beyond its linear part; zero at both ends of elements."""
         x = u - 0.5
-        return self.own[e, 0] * (x * x - 0.25) / 2 + self.own[e, 1] * x * (x * x - 0.25) / 3
+        return self.own[:, 0] * (x * x - 0.25) / 2 + self.own[:, 1] * x * (x * x - 0.25) / 3
 
-    def _heading_in(self, e: int, u: ca.SX | float) -> ca.SX:
-        """Heading in element e at the fraction u of its length, without the bow."""
+    def _headings(self, u: ca.SX | float) -> ca.SX:
+        """Heading (n,) in each element at the fraction u, or (n,) fractions, without the bow."""
         if not self.chain.nodal:
-            return self.phi[e]
-        return self.phi[e] + u * (self.phi[e + 1] - self.phi[e]) + self._own_turn(e, u)
+            return self.phi
+        return self.phi[:-1] + u * (self.phi[1:] - self.phi[:-1]) + self._own_turns(u)
 
-    def _tangent(self, e: int, u: ca.SX | float) -> ca.SX:
-        """Derivative of position by s in element e (2,) [1]."""
-        heading = self._heading_in(e, u)
-        c, s = ca.cos(heading), ca.sin(heading)
-        straight = self.ratio[e] * ca.vertcat(c, s)
+    def _tangents(self, u: ca.SX | float) -> ca.SX:
+        """Derivative of position by s (n, 2) in each element [1]."""
+        headings = self._headings(u)
+        c, s = ca.cos(headings), ca.sin(headings)
+        straight = ca.horzcat(self.ratio * c, self.ratio * s)
         if self.chain.element != "quadratic":
             return straight
         form = 4 * u * (1 - u)
-        bowed = form * self.bow[e] * ca.vertcat(-s, c)
-        bowed -= form**2 * self.square[e] / 2 * ca.vertcat(c, s)
+        across, back = form * self.bow, form**2 * self.square / 2
+        bowed = ca.horzcat(-across * s - back * c, across * c - back * s)
         return straight + self.stretch * bowed
 
-    def _advance(self, e: int, u: ca.SX | float) -> ca.SX:
-        """Vector from the start of element e to the fraction u of its length [m]."""
+    def _advances(self, u: ca.SX | float) -> ca.SX:
+        """Vector from the start of each element to the fraction u of its length (n, 2) [m]."""
+        h = self.chain.h
         if not self.chain.nodal:
-            return self.chain.h * u * self._tangent(e, u)
-        total = ca.SX.zeros(2)
-        for node, weight in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
-            total += weight * self._tangent(e, u * node)
-        return self.chain.h * u * total
+            parts = self._tangents(u)
+        else:
+            parts = sum(
+                weight * self._tangents(u * node)
+                for node, weight in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True)
+            )
+        return ca.horzcat(h * u * parts[:, 0], h * u * parts[:, 1])
 
     @property
     def strain(self) -> ca.SX:
@@ -268,10 +271,7 @@ class Curve:
     @property
     def nodes(self) -> ca.SX:
         """Positions of the element boundaries (n + 1, 2) [m]."""
-        points = [self.start]
-        for e in range(self.chain.n):
-            points.append(points[-1] + self._advance(e, 1.0))
-        return ca.horzcat(*points).T
+        return ca.cumsum(ca.vertcat(self.start.T, self._advances(1.0)), 0)
 
     @property
     def node_headings(self) -> ca.SX:
@@ -291,22 +291,16 @@ class Curve:
 
     def position(self, s: ca.SX | float) -> ca.SX:
         """Position at the arc length s (2,) [m], once differentiable in s."""
-        total = self.start
-        for e in range(self.chain.n):
-            u = ca.fmin(ca.fmax(s / self.chain.h - e, 0), 1)
-            total = total + self._advance(e, u)
-        return total
+        u = ca.fmin(ca.fmax(s / self.chain.h - np.arange(self.chain.n), 0), 1)
+        return self.start + ca.sum1(self._advances(u)).T
 
     def heading(self, s: ca.SX | float) -> ca.SX:
         """Direction of the cable at the arc length s [rad], continuous in s."""
-        places = self.chain.heading_places
-        total = self.phi[0]
-        for i in range(self.chain.n_headings - 1):
-            u = ca.fmin(ca.fmax((s - places[i]) / self.chain.h, 0), 1)
-            total = total + u * (self.phi[i + 1] - self.phi[i])
-            if self.chain.nodal:
-                total = total + self._own_turn(i, u) + 4 * u * (1 - u) * self.bow[i]
-        return total
+        u = ca.fmin(ca.fmax((s - self.chain.heading_places[:-1]) / self.chain.h, 0), 1)
+        turns = u * (self.phi[1:] - self.phi[:-1])
+        if self.chain.nodal:
+            turns += self._own_turns(u) + 4 * u * (1 - u) * self.bow
+        return self.phi[0] + ca.sum1(turns)
 
     @property
     def start_direction(self) -> ca.SX:
@@ -325,11 +319,11 @@ class Curve:
         By parts: int r ds = L r(0) + int (L - s) dr/ds ds, a sum of terms of single elements.
         """
         h, n = self.chain.h, self.chain.n
+        rule = [(0.5, 1.0)]
+        if self.chain.nodal:
+            rule = list(zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True))
         total = self.chain.length * self.start
-        for e in range(n):
-            if not self.chain.nodal:
-                total = total + h * h * (n - e - 0.5) * self._tangent(e, 0.5)
-                continue
-            for node, gauss in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
-                total = total + gauss * h * h * (n - e - node) * self._tangent(e, node)
+        for node, weight in rule:
+            arm = weight * h * h * (n - node - np.arange(n))
+            total += (ca.DM(arm).T @ self._tangents(node)).T
         return total

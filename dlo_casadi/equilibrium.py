@@ -146,7 +146,9 @@ def is_stable(matrix: FloatArray, n_conditions: int) -> bool:
     inner = len(matrix) - n_conditions
     scale = np.ones(len(matrix))
     scale[:inner] = np.sqrt(_inverse_of_largest(matrix[:inner, :inner]))
-    scale[inner:] = _inverse_of_largest(matrix[inner:, :inner] * scale[:inner])
+    give = np.sqrt(np.abs(np.diag(matrix)[inner:]))
+    conditions = np.column_stack([matrix[inner:, :inner] * scale[:inner], give])
+    scale[inner:] = _inverse_of_largest(conditions)
     eigenvalues = np.linalg.eigvalsh((matrix + matrix.T) / 2 * np.outer(scale, scale))
     floor = 1e-13 * np.abs(eigenvalues).max()
     return int((eigenvalues < floor).sum()) == n_conditions
