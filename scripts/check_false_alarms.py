@@ -66,8 +66,8 @@ def simulate(config, generator):
         deviation,
     )
     sweep = Sweep(model, poses)
-    shapes, ok = sweep.solve(shapes, p, rest)
-    if not ok:
+    shapes, converged = sweep.solve(shapes, p, rest)
+    if not converged.all():
         return None
     std, share = generator.uniform(1e-4, 4e-4), generator.uniform(0.0, 0.6)
     noise = NoiseModel(std, share, generator.uniform(0.02, 0.04), "gaussian")

@@ -132,32 +132,17 @@ def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[N
     rest = np.repeat(fit.rest[None], sweep.m, axis=0)
     for j, theta in zip(problem.used, thetas, strict=True):
         p[j], rest[j] = unknowns.p(theta), unknowns.rest(theta)
-    solved, ok = sweep.solve(plain, p, rest)
-    if not ok:
-        return _one_by_one(fit, plain, p, rest)
+    solved, converged = sweep.solve(plain, p, rest)
     z = sweep.shapes_seen(solved, p, rest)
-    return [NodeCurve.of(model.chain, z[j]) for j in problem.used]
-
-
-def _one_by_one(fit: Fit, plain: Shapes, p: FloatArray, rest: FloatArray) -> list[NodeCurve | None]:
-    """The same where some pose has no equilibrium nearby: only that one is lost."""
-    sweep = fit.problem.sweep
-    out: list[NodeCurve | None] = []
-    for j in fit.problem.used:
-        own_p, own_rest = np.repeat(fit.p[None], sweep.m, 0), np.repeat(fit.rest[None], sweep.m, 0)
-        own_p[j], own_rest[j] = p[j], rest[j]
-        solved, ok = sweep.solve(plain, own_p, own_rest)
-        z = sweep.shapes_seen(solved, own_p, own_rest)[j] if ok else None
-        out.append(None if z is None else NodeCurve.of(fit.model.chain, z))
-    return out
+    return [NodeCurve.of(model.chain, z[j]) if converged[j] else None for j in problem.used]
 
 
 def _predict_all(fit: Fit, plain: Shapes, theta: FloatArray) -> list[NodeCurve | None]:
     """All poses in order at one value of the unknowns, a state carried along."""
     sweep, unknowns = fit.problem.sweep, fit.problem.unknowns
     p, rest = unknowns.p(theta), unknowns.rest(theta)
-    solved, ok = sweep.solve(plain, p, rest)
-    if not ok:
+    solved, converged = sweep.solve(plain, p, rest)
+    if not converged.all():
         return [None] * sweep.m
     return [NodeCurve.of(fit.model.chain, z) for z in sweep.shapes_seen(solved, p, rest)]
 
@@ -188,9 +173,9 @@ def _stretches(fit: Fit) -> CrossValidation:
             fit.point.shapes.phi, fit.point.shapes.lam, np.zeros_like(fit.point.shapes.deviation)
         )
         p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
-        solved, ok = sweep.solve(plain, p, rest)
+        solved, converged = sweep.solve(plain, p, rest)
         counts.append(len(rows))
-        if not ok:
+        if not converged.all():
             squares.append(np.inf)
             complete = False
             continue

@@ -473,7 +473,7 @@ def _continue(
         start.problem.scatter,
     )
     shapes, solved = problem.sweep.solve(carried_shapes(problem, start), p, unknowns.rest(theta))
-    if not solved:
+    if not solved.all():
         raise EstimationError("the shapes of the first fit are no equilibria of the second model")
     feet = _feet_for(problem, start)
     problem.refresh(feet)

@@ -342,9 +342,9 @@ class BatchProblem:
             point.shapes.phi + change[:, :n_phi], point.shapes.lam + change[:, n_phi:], deviation
         )
         shapes, converged = self.sweep.solve(
-            guess, self.unknowns.p(theta), self.unknowns.rest(theta)
+            guess, self.unknowns.p(theta), self.unknowns.rest(theta), reach=1.0
         )
-        if not converged or np.abs(shapes.phi - guess.phi).max() > 1.0:
+        if not converged.all():
             return None
         return self.evaluate(theta, shapes, point.feet)
 

@@ -25,8 +25,8 @@ def on_mesh(fit: Fit, n: int) -> tuple[Sweep, Shapes, FloatArray, bool]:
     sweep = Sweep(model, [item.pose for item in fit.problem.measured])
     rest = model.rest_basis @ fit.coefficients
     shapes = on_other_mesh(fit.point.shapes, fit.model, model)
-    solved, ok = sweep.solve(shapes, fit.p, rest)
-    return sweep, solved, rest, ok
+    solved, converged = sweep.solve(shapes, fit.p, rest)
+    return sweep, solved, rest, bool(converged.all())
 
 
 def discretization_error(fit: Fit) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -144,23 +145,27 @@ def _held(fit: Fit, log_value: float, near: Point) -> tuple[Point, float] | None
     )
     problem.refresh(near.feet)
     theta = near.theta
-    shapes, ok = problem.sweep.solve(near.shapes, unknowns.p(theta), unknowns.rest(theta))
-    if not ok:
+    shapes, converged = problem.sweep.solve(near.shapes, unknowns.p(theta), unknowns.rest(theta))
+    if not converged.all():
         return None
     point, _ = problem.descend(problem.evaluate(theta, shapes, near.feet), tolerance=1e-2)
     return point, 2 * point.objective - base
 
 
-def _crossing(held, log_ei, direction, below, above, near) -> float:  # type: ignore[no-untyped-def]
+def _crossing(
+    held: Callable[[float, Point], tuple[Point, float] | None],
+    log_ei: float,
+    direction: int,
+    below: tuple[float, float],
+    above: tuple[float, float],
+    near: Point,
+) -> float:
     """Place where the profile crosses the threshold, by two secant steps on its root."""
     (a, f_a), (b, f_b) = below, above
     for _ in range(2):
-        # The profile is close to a parabola: its square root is close to linear.
-        base = f_a - 1e-12 if a == 0 else None
-        if base is not None:
-            guess = b * np.sqrt(-f_a / (f_b - f_a))
-        else:
-            guess = a + (b - a) * (-f_a) / (f_b - f_a)
+        # The profile is close to a parabola: from its lowest point its square root is linear.
+        share = -f_a / (f_b - f_a)
+        guess = b * np.sqrt(share) if a == 0 else a + (b - a) * share
         tried = held(log_ei + direction * guess, near)
         if tried is None:
             break

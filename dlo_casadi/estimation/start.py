@@ -191,7 +191,7 @@ def all_at_once(
         if not np.all(np.isfinite(shapes.phi)):
             return None
     final, converged = sweep.solve(shapes, unknowns.p(theta), unknowns.rest(theta), 40)
-    if not converged or np.abs(final.phi - shapes.phi).max() > 1.5:
+    if not converged.all():
         return None
     return problem.evaluate(theta, final, feet)
 

@@ -51,8 +51,8 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         start = min(
             shapes, grown, key=lambda x: float(np.linalg.norm(sweep.kkt(x, at(log_ei), rest)[0]))
         )
-        moved, ok = sweep.solve(start, at(log_ei), rest)
-        if not ok or not sweep.stable(moved, at(log_ei), rest).all():
+        moved, converged = sweep.solve(start, at(log_ei), rest)
+        if not converged.all() or not sweep.stable(moved, at(log_ei), rest).all():
             cold = _cold(model, at(log_ei), rest, used)
             if cold is None:
                 return shapes, np.inf

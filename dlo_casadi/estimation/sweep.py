@@ -20,6 +20,11 @@ from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.floating]
 
+# Newton's method in a sweep: longest step of a heading, and how far headings may move from where
+# it started [rad].
+LONGEST_STEP = 0.5
+REACH = 1.5
+
 
 @dataclass(frozen=True)
 class Shapes:
@@ -79,34 +84,35 @@ class Observations:
         return self.by_x[j] @ sens.deviation[j] + self.by_deviation[j]
 
 
-class _Mapped:
-    """A CasADi function over m poses that reads and writes NumPy's memory, without copies.
+class _OverPoses:
+    """A CasADi function called pose by pose that reads and writes NumPy's memory, without copies.
 
     Converting between DM and NumPy costs several times the evaluation itself.
     """
 
     def __init__(self, function: ca.Function, m: int) -> None:
-        self._function = function if m == 1 else function.map(m)
         # Any: CasADi's stubs do not know that a buffer takes NumPy's memory.
         self._buffer: Any
-        self._buffer, self._run = self._function.buffer()
+        self._buffer, self._run = function.buffer()
         self._inputs: list[Any] = [
             np.zeros((m, function.size1_in(i))) for i in range(function.n_in())
         ]
+        self._rows = [[memoryview(row) for row in block] for block in self._inputs]
         self._shapes = [
-            (m, function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
+            (function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
         ]
-        for i, block in enumerate(self._inputs):
-            self._buffer.set_arg(i, memoryview(block))
 
-    def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
-        """Arguments (m, rows) or (rows,) for all alike -> outputs (m, rows, columns)."""
+    def __call__(self, count: int, *arguments: FloatArray) -> list[FloatArray]:
+        """Arguments (count, rows) or (rows,) for all alike -> outputs (count, rows, columns)."""
         for block, value in zip(self._inputs, arguments, strict=True):
-            block[...] = value
-        outputs: list[Any] = [np.zeros(shape) for shape in self._shapes]
-        for i, out in enumerate(outputs):
-            self._buffer.set_res(i, memoryview(out))
-        self._run()
+            block[:count] = value
+        outputs = [np.zeros((count, *shape)) for shape in self._shapes]
+        for j in range(count):
+            for i, rows in enumerate(self._rows):
+                self._buffer.set_arg(i, rows[j])
+            for i, out in enumerate(outputs):
+                self._buffer.set_res(i, memoryview(out[j]))
+            self._run()
         return [block.transpose(0, 2, 1) for block in outputs]
 
 
@@ -127,26 +133,35 @@ class Sweep:
         self.n_phi = model.chain.n_headings
         self.n_unknowns = self.n_phi + model.n_conditions
         self._ends = np.array([pose.vector for pose in self.poses])
-        self._maps: dict[str | tuple[str, ...], _Mapped] = {}
+        self._functions: dict[str | tuple[str, ...], _OverPoses] = {}
         self.used_deviations = [DEVIATIONS.index(name) for name in model.deviations]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without compiled functions: another process makes its own."""
-        return {**self.__dict__, "_maps": {}}
+        return {**self.__dict__, "_functions": {}}
 
-    def _call(self, name: str, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[FloatArray]:
-        """Evaluate a function of the model for all poses; each output (m, rows, columns)."""
-        if name not in self._maps:
-            self._maps[name] = _Mapped(getattr(self.model, name), self.m)
-        mapped = self._maps[name]
-        return mapped(shapes.phi, shapes.lam, p, rest, self._ends, shapes.deviation)
+    def _call(
+        self,
+        name: str,
+        shapes: Shapes,
+        p: FloatArray,
+        rest: FloatArray,
+        chosen: NDArray[np.intp] | None = None,
+    ) -> list[FloatArray]:
+        """Evaluate a function of the model, for all poses or those chosen: (m, rows, columns)."""
+        if name not in self._functions:
+            self._functions[name] = _OverPoses(getattr(self.model, name), self.m)
+        ends = self._ends if chosen is None else self._ends[chosen]
+        return self._functions[name](
+            len(ends), shapes.phi, shapes.lam, p, rest, ends, shapes.deviation
+        )
 
     def _after(self, j: int, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[FloatArray]:
         """Rest curvature after pose j and its derivatives by (phi, rest before, p)."""
-        if "after" not in self._maps:
-            self._maps["after"] = _Mapped(self.model.next_rest, 1)
+        if "after" not in self._functions:
+            self._functions["after"] = _OverPoses(self.model.next_rest, 1)
         arguments = (shapes.phi[j], shapes.lam[j], p, rest, self._ends[j], shapes.deviation[j])
-        return [block[0] for block in self._maps["after"](*arguments)]
+        return [block[0] for block in self._functions["after"](1, *arguments)]
 
     def kkt(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Imbalance (m, N) and KKT matrices (m, N, N); `rest` is that before the first pose."""
@@ -189,8 +204,9 @@ class Sweep:
         rest: FloatArray,
         max_iterations: int = 25,
         tolerance: float = 1e-10,
-    ) -> tuple[Shapes, bool]:
-        """Newton's method from nearby shapes.
+        reach: float = REACH,
+    ) -> tuple[Shapes, NDArray[np.bool_]]:
+        """Newton's method from nearby shapes, for each pose until it has converged or is lost.
 
         Parameters
         ----------
@@ -201,35 +217,51 @@ class Sweep:
             Before the first pose, or of each pose.
         tolerance : float [rad]
             Largest step at convergence.
+        reach : float [rad]
+            A pose whose headings move farther is lost: it runs for another equilibrium, or none.
 
         Returns
         -------
-        Shapes, bool
-            The shapes and whether every pose converged.
+        Shapes, (m,) bool
+            The shapes, and which poses have converged; the others stay where they started. Where
+            a state couples the poses, all have converged or none.
         """
         phi, lam = shapes.phi.copy(), shapes.lam.copy()
-        last = np.inf
+        converged = np.zeros(self.m, dtype=bool)
+        coupled = self.model.has_state and rest.ndim == 1
+        active, last = np.arange(self.m), np.full(self.m, np.inf)
         for _ in range(max_iterations):
-            now = replace(shapes, phi=phi, lam=lam)
-            rests = self.rests(now, p, rest)
-            force, matrix = self._call("kkt", now, p, rests)
-            if not np.all(np.isfinite(matrix)):
-                return shapes, False
+            now = Shapes(phi[active], lam[active], shapes.deviation[active])
+            rests = self.rests(replace(shapes, phi=phi, lam=lam), p, rest)[active]
+            own = p if p.ndim == 1 else p[active]
+            force, matrix = self._call("kkt", now, own, rests, active)
+            finite = np.isfinite(matrix).all(axis=(1, 2))
+            if not finite.all():
+                matrix[~finite], force[~finite] = np.eye(matrix.shape[1]), np.nan
             try:
                 step = -np.linalg.solve(matrix, force)[:, :, 0]
             except np.linalg.LinAlgError:
-                return shapes, False
-            if self.model.has_state and rest.ndim == 1:
+                break
+            if coupled:
                 step = self._pass_on(now, p, rests, matrix, step)
-            size = float(np.abs(step[:, : self.n_phi]).max())
-            damp = min(1.0, 0.5 / size) if size > 0 else 1.0
-            phi = phi + damp * step[:, : self.n_phi]
-            lam = lam + damp * step[:, self.n_phi :]
-            # Newton's method has reached rounding when steps are tiny and no longer shrink.
-            if size < tolerance or (size < 1e-7 and size > 0.5 * last):
-                return replace(shapes, phi=phi, lam=lam), True
-            last = size
-        return replace(shapes, phi=phi, lam=lam), False
+            size = np.abs(step[:, : self.n_phi]).max(axis=1)
+            if coupled:
+                size[:] = size.max()
+            damp = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
+            phi[active] += damp[:, None] * step[:, : self.n_phi]
+            lam[active] += damp[:, None] * step[:, self.n_phi :]
+            done = _settled(size, last[active], tolerance)
+            moved = np.abs(phi[active] - shapes.phi[active]).max(axis=1)
+            lost = ~(moved <= reach)
+            converged[active[done & ~lost]] = True
+            last[active] = size
+            if coupled and lost.any():
+                break
+            active = active[~(done | lost)]
+            if not len(active):
+                break
+        phi[~converged], lam[~converged] = shapes.phi[~converged], shapes.lam[~converged]
+        return replace(shapes, phi=phi, lam=lam), converged
 
     def _pass_on(
         self,
@@ -309,11 +341,11 @@ class Sweep:
         self, names: tuple[str, ...], shapes: Shapes, p: FloatArray, rest: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Direct derivatives of the imbalance (m, N, q) and of the measured curves (m, nz, q)."""
-        if names not in self._maps:
-            self._maps[names] = _Mapped(self.model.slopes_by(names), self.m)
+        if names not in self._functions:
+            self._functions[names] = _OverPoses(self.model.slopes_by(names), self.m)
         rests = self.rests(shapes, p, rest)
-        balance, z = self._maps[names](
-            shapes.phi, shapes.lam, p, rests, self._ends, shapes.deviation
+        balance, z = self._functions[names](
+            self.m, shapes.phi, shapes.lam, p, rests, self._ends, shapes.deviation
         )
         return balance, z
 
@@ -331,3 +363,14 @@ class Sweep:
                 for k, bend in zip(matrix, bends, strict=True)
             ]
         )
+
+
+def _settled(size: FloatArray, last: FloatArray, tolerance: float) -> NDArray[np.bool_]:
+    """Whether Newton's method has converged with steps of this size after the last ones.
+
+    Steps that shrink quadratically need no further one to show that it would be too small, and
+    steps at rounding no longer shrink.
+    """
+    ahead = size * (size / last) ** 2
+    quadratic = np.isfinite(last) & (size < 1e-4) & (ahead < tolerance / 100)
+    return (size < tolerance) | quadratic | ((size < 1e-7) & (size > 0.5 * last))

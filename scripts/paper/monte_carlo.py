@@ -111,8 +111,8 @@ def simulate(truth: Truth, rng: np.random.Generator) -> list[MeasuredPose] | Non
         truth.deviation,
     )
     sweep = Sweep(model, published.poses())
-    moved, ok = sweep.solve(stacked, truth.p, rest)
-    if not ok:
+    moved, converged = sweep.solve(stacked, truth.p, rest)
+    if not converged.all():
         return None
     measured = []
     for pose, z in zip(published.poses(), sweep.shapes_seen(moved, truth.p, rest), strict=True):
@@ -132,8 +132,8 @@ def bound(fit: Fit, truth: Truth) -> tuple[float, FloatArray]:
     problem = BatchProblem(unknowns, fit.problem.history, truth.noise, TOLERANCES, truth.roughness)
     theta = unknowns.pack(truth.p, truth.coefficients)
     start = Shapes(fit.point.shapes.phi, fit.point.shapes.lam, truth.deviation)
-    shapes, ok = problem.sweep.solve(start, truth.p, unknowns.rest(theta))
-    if not ok:
+    shapes, converged = problem.sweep.solve(start, truth.p, unknowns.rest(theta))
+    if not converged.all():
         raise DloError("the true parameters have no equilibria near the fitted ones")
     problem.refresh(fit.point.feet)
     point = problem.evaluate(theta, shapes, fit.point.feet)

@@ -79,7 +79,7 @@ def solved(problem: BatchProblem, theta: np.ndarray, deviation: np.ndarray | Non
     shapes, converged = problem.sweep.solve(
         Shapes(phi, lam, still if deviation is None else deviation), p, rest
     )
-    assert converged
+    assert converged.all()
     return shapes
 
 
@@ -101,13 +101,32 @@ def test_poses_solved_together_are_those_solved_alone(element):
         np.zeros((3, len(DEVIATIONS))),
     )
     together, converged = sweep.solve(guess, p, rest)
-    assert converged
+    assert converged.all()
     # IPOPT's tol of 1e-11 on the balance, over a tangent stiffness of 1e-2 N m.
     np.testing.assert_allclose(together.phi, [eq.phi for eq in alone], atol=1e-8)
     np.testing.assert_allclose(together.lam, [eq.multipliers for eq in alone], atol=1e-7)
     force, _ = sweep.kkt(together, p, rest)
     assert np.abs(force).max() < 1e-11  # rounding of terms of order one
     np.testing.assert_array_equal(sweep.stable(together, p, rest), True)
+
+
+def test_a_pose_that_is_lost_leaves_the_others_alone():
+    """An end beyond the cable's length has no equilibrium; its shape stays where it started."""
+    model = CableModel(CABLE, 8)
+    p, rest = np.array([0.06]), np.full(8, 0.8)
+    near = poses_at(3)
+    alone = [solve_equilibrium(model, p, rest, pose) for pose in near]
+    guess = Shapes(
+        np.array([eq.phi for eq in alone]) + 0.02,
+        np.array([eq.multipliers for eq in alone]),
+        np.zeros((3, len(DEVIATIONS))),
+    )
+    far = replace(near[1], end=(1.5 * CABLE.length, 0.0))
+    solved, converged = Sweep(model, [near[0], far, near[2]]).solve(guess, p, rest)
+    np.testing.assert_array_equal(converged, [True, False, True])
+    np.testing.assert_array_equal(solved.phi[1], guess.phi[1])
+    for j in (0, 2):
+        np.testing.assert_allclose(solved.phi[j], alone[j].phi, atol=1e-8)  # IPOPT's tol
 
 
 def test_a_drift_is_carried_in_order():
@@ -129,7 +148,7 @@ def test_a_drift_is_carried_in_order():
         by_hand = rests[j - 1] + 0.3 * (curvature - rests[j - 1])
         np.testing.assert_allclose(rests[j], by_hand, rtol=1e-12)
     moved, converged = sweep.solve(replace(stacked, phi=stacked.phi + 0.01), p, rest)
-    assert converged
+    assert converged.all()
     np.testing.assert_allclose(moved.phi, stacked.phi, atol=1e-8)  # IPOPT's tol
 
 
@@ -173,7 +192,7 @@ def residuals(problem: BatchProblem, point: Point, theta, deviation=None) -> lis
     shapes, converged = problem.sweep.solve(
         start, problem.unknowns.p(theta), problem.unknowns.rest(theta), tolerance=1e-12
     )
-    assert converged
+    assert converged.all()
     distances, moved = problem.raw_residuals(problem.curves(theta, shapes), point.feet)
     return [
         problem.whitening(j, s) @ d for j, s, d in zip(problem.used, moved, distances, strict=True)
