@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -83,6 +84,7 @@ def fit(
     *,
     diagnosis: bool | None = None,
     progress: Progress | None = None,
+    executor: Executor | None = None,
 ) -> Result:
     """Fit a cable to its photographs or centre-lines.
 
@@ -95,6 +97,9 @@ def fit(
     progress : Progress, optional
         Told how far the run has come: an object with `step(name, done, total)` and
         `message(text)`.
+    executor : Executor, optional
+        Where the search for missing effects does its refits, such as
+        `dlo_casadi.parallel.open_executor(jobs=2)`; in this process by default.
 
     Returns
     -------
@@ -120,5 +125,5 @@ def fit(
     if diagnosis is not None:
         options = config.diagnosis.model_copy(update={"enabled": diagnosis})
         config = replace(config, diagnosis=options)
-    outcome = run_session(config, progress)
+    outcome = run_session(config, progress, executor)
     return Result(**{field.name: getattr(outcome, field.name) for field in fields(outcome)})

@@ -221,7 +221,7 @@ def test_the_schema_knows_the_short_forms(tmp_path):
 def test_diagnose_searches_although_the_configuration_does_not(tmp_path, monkeypatch, capsys):
     asked = []
 
-    def run(config, progress):
+    def run(config, progress, executor):
         asked.append(config.diagnosis.enabled)
         raise ConfigError("enough")
 

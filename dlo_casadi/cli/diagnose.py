@@ -10,8 +10,9 @@ from pathlib import Path
 from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, configuration, console, print_json
+from dlo_casadi.cli.options import add_jobs, command, configuration, console, print_json
 from dlo_casadi.cli.watch import Watch
+from dlo_casadi.parallel import open_executor
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import candidate_table, print_summary
 from dlo_casadi.report.writer import ResultsFolder
@@ -34,6 +35,7 @@ def main(argv: Sequence[str]) -> int:
     )
     parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
     parser.add_argument("--output", type=Path, metavar="DIR", help="write the results there")
+    add_jobs(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     chosen = parser.parse_args(argv)
@@ -42,8 +44,12 @@ def main(argv: Sequence[str]) -> int:
     options = config.diagnosis.model_copy(update={"enabled": True})
     config = replace(config, diagnosis=options)
     results = nullcontext() if chosen.output is None else ResultsFolder(chosen.output, config)
-    with results as folder, Watch(Console(stderr=True), chosen.quiet) as watch:
-        outcome = run_session(config, watch)
+    with (
+        results as folder,
+        Watch(Console(stderr=True), chosen.quiet) as watch,
+        open_executor(chosen.jobs) as executor,
+    ):
+        outcome = run_session(config, watch, executor)
         if folder is not None:
             folder.write(outcome)
     if chosen.json:

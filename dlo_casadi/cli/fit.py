@@ -9,8 +9,9 @@ from pathlib import Path
 from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, configuration, console, print_json
+from dlo_casadi.cli.options import add_jobs, command, configuration, console, print_json
 from dlo_casadi.cli.watch import Watch
+from dlo_casadi.parallel import open_executor
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.report.writer import ResultsFolder
@@ -20,6 +21,7 @@ EXAMPLES = """\
 dlo fit configs/cable.yaml                       writes results/cable/
 dlo fit rope.yaml --output results/monday        to a folder of your choice
 dlo fit rope.yaml --no-diagnosis                 only the declared model: much faster
+dlo fit rope.yaml --jobs 2                       the search for effects on two cores
 dlo fit rope.yaml --quiet --json > rope.json     report.json to a program"""
 
 
@@ -38,6 +40,7 @@ def main(argv: Sequence[str]) -> int:
         metavar="DIR",
         help="folder of the results; default results/<config name>/",
     )
+    add_jobs(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print report.json instead of tables")
     parser.add_argument(
@@ -53,8 +56,9 @@ def main(argv: Sequence[str]) -> int:
     with (
         ResultsFolder(output, config) as folder,
         Watch(Console(stderr=True), chosen.quiet) as watch,
+        open_executor(chosen.jobs) as executor,
     ):
-        outcome = run_session(config, watch)
+        outcome = run_session(config, watch, executor)
         watch.step("write the results", 0, 1)
         folder.write(outcome)
         watch.step("write the results", 1, 1)

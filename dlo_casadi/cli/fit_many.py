@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from rich.console import Console
 
 from dlo_casadi.cli.counter import Counter
 from dlo_casadi.cli.guard import BAD_INPUT, OK
-from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.cli.options import add_jobs, command, console, print_json
 from dlo_casadi.fleet import FleetResult, Options, find_sessions, fit_fleet
 from dlo_casadi.fleet.outliers import judge
 from dlo_casadi.parallel import open_executor
@@ -33,7 +32,7 @@ def main(argv: Sequence[str]) -> int:
         "2 is also a session without results: it is a row with its message, the others are done",
     )
     parser.add_argument("where", metavar="FOLDER", help="folder, or a pattern in quotes")
-    add_workers(parser)
+    add_jobs(parser)
     parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead")
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="default results/fleet-<name of the folder>/"
@@ -82,13 +81,6 @@ def main(argv: Sequence[str]) -> int:
     else:
         _summary(result, output, chosen.quiet)
     return BAD_INPUT if result.failed else OK
-
-
-def add_workers(parser: argparse.ArgumentParser) -> None:
-    """Add `--jobs`."""
-    parser.add_argument(
-        "--jobs", type=int, default=1, metavar="N", help="number of processes; default 1"
-    )
 
 
 def _summary(result: FleetResult, output: Path, quiet: bool) -> None:

@@ -35,6 +35,13 @@ def command(name: str, description: str, examples: str, codes: str = "") -> argp
     )
 
 
+def add_jobs(parser: argparse.ArgumentParser) -> None:
+    """Add `--jobs`."""
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="number of processes; default 1"
+    )
+
+
 def configuration(path: Path) -> Config:
     """Load a configuration; of a folder, say which configurations it holds."""
     if path.is_dir():

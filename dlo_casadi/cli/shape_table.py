@@ -9,9 +9,8 @@ from rich.console import Console
 
 from dlo_casadi.chain import ELEMENTS
 from dlo_casadi.cli.counter import Counter
-from dlo_casadi.cli.fit_many import add_workers
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.cli.options import add_jobs, command, console, print_json
 from dlo_casadi.cli.predict import plain_numbers
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet.store import parquet_library
@@ -59,7 +58,7 @@ def main(argv: Sequence[str]) -> int:
         choices=ELEMENTS,
         help="instead of the fit's; arcs are several times faster than quadratic elements",
     )
-    add_workers(parser)
+    add_jobs(parser)
     parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead")
     parser.add_argument("--restart", action="store_true", help="replace what lies there")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")

@@ -152,7 +152,8 @@ def diagnose(
     step : callable
         Told how far the search has come.
     executor : Executor, optional
-        Where candidates are refitted, half a second to two each; in this process by default.
+        Where candidates are refitted and places of an unknown load tried, half a second to some
+        seconds each; in this process by default.
     """
     executor = executor or InProcess()
     current, validation = fit, cross_validate(fit)
@@ -194,7 +195,7 @@ def diagnose(
     unpredicted = found and validation.rmse > max(UNSEEN * current.noise.std, before.rmse / 2)
     unexplained = structure.p_value < significance or unpredicted
     if unexplained:
-        pull, current, added = _unexplained(fit, current, added)
+        pull, current, added = _unexplained(fit, current, added, executor)
     tried = {row.name for row in ranked}
     added = [
         replace(item, untried=untried_equivalents(current, item.candidate, tried)) for item in added
@@ -350,14 +351,14 @@ def _drop(fit: Fit, candidate: Candidate) -> Fit | None:
 
 
 def _unexplained(
-    declared: Fit, current: Fit, added: list[AddedEffect]
+    declared: Fit, current: Fit, added: list[AddedEffect], executor: Executor
 ) -> tuple[Pull | None, Fit, list[AddedEffect]]:
     """Estimate the load without a cause; effects that it makes needless are withdrawn."""
-    pull = estimate_pull(current)
+    pull = estimate_pull(current, executor)
     # In one pose a force fits as well as any cause; in many, at one place, it is a cause.
     if not added or len(current.problem.used) < 2:
         return pull, current, added
-    alone = estimate_pull(declared)
+    alone = estimate_pull(declared, executor)
     if alone is None:
         return pull, current, added
     # One force per pose on the declared model against the same on top of the added effects.

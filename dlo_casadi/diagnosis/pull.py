@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,14 +13,16 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import Fit, fit_model, starting_points
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.executors import InProcess
 from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.parallel import map_in_order
 
 FloatArray = NDArray[np.floating]
 
 # Places kept from the scan for a full fit, and the rise of twice the objective that bounds the
 # interval (95 % of chi-square with one degree of freedom).
 TRIED = 3
-PULL_PLACES = np.linspace(0.1, 0.9, 9)
+PULL_PLACES = tuple(float(share) for share in np.linspace(0.1, 0.9, 9))
 COARSE = 20
 # Standard deviation of a pull about the mean of the poses, in weights of the cable.
 PULL_WEIGHTS = 1.0
@@ -51,29 +54,32 @@ class Pull:
     fit: Fit
 
 
-def estimate_pull(base: Fit) -> Pull | None:
+def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
     The fit without it may have gone far astray, so that it is no place to start from: on a
     coarse mesh, stiffnesses over decades and places along the cable are searched anew, the best
     refitted with the place along with everything else, and the best of those on the base's mesh.
+
+    Parameters
+    ----------
+    base : Fit
+        Without the load.
+    executor : Executor, optional
+        Where the places are tried, a second or two each; in this process by default.
     """
     effect = UnknownPull()
-    length = base.model.cable.length
     model = base.model.with_effect(effect)
-    name = f"{effect.label}.position"
-    unknowns = base.problem.unknowns
-    held = {key for key, free in zip(base.model.names, unknowns.free, strict=True) if not free}
-    free = [key for key in model.names if key not in held and key != name]
-    coarse = _search(base, model.with_mesh(min(COARSE, base.model.n)), free, name)
+    search = _Search(base, model.with_mesh(min(COARSE, model.n)), f"{effect.label}.position")
+    length, name = model.cable.length, search.position
     best: Fit | None = None
-    for fit in coarse:
+    for fit in search.run(executor or InProcess()):
         try:
             best = fit_model(
                 model,
                 base.problem.history,
                 base.problem.tolerances,
-                free=[*free, name],
+                free=[key for key, free in zip(model.names, search.free, strict=True) if free],
                 values=fit.p,
                 start=fit,
                 max_iterations=MOST_STEPS,
@@ -93,51 +99,85 @@ def estimate_pull(base: Fit) -> Pull | None:
     return Pull(forces, position, interval, gain, best)
 
 
-def _search(base: Fit, model: CableModel, free: list[str], name: str) -> list[Fit]:
-    """Fits on a coarse mesh from the most promising places, the best first."""
-    problem = base.problem
-    chosen = np.array([key in free for key in model.names])
-    starts: list[tuple[BatchProblem, Point]] = []
-    sweep = None
-    for share in PULL_PLACES:
-        values = base_values(base, model)
-        values[model.names.index(name)] = share * model.cable.length
-        unknowns = Unknowns(model, chosen, values, problem.unknowns.rest_free)
-        trial = BatchProblem(
-            unknowns,
-            problem.history,
-            problem.noise,
-            problem.tolerances,
-            problem.roughness_std,
-            pull_scatter(base),
-            sweep,
-        )
-        sweep = trial.sweep
-        theta = unknowns.pack(values, np.zeros(model.rest.n_coefficients))
-        points = starting_points(trial, theta)
-        starts += [(trial, point) for point in points[:1]]
-    starts = sorted(starts, key=lambda item: item[1].objective)[:TRIED]
-    fits = []
-    everything = chosen.copy()
-    everything[model.names.index(name)] = True
-    for trial, point in starts:
-        trial.refresh(point.feet)
-        held = Fit(trial, *trial.descend(point))
-        unknowns = Unknowns(model, everything, held.p, problem.unknowns.rest_free)
-        moving = BatchProblem(
-            unknowns,
-            problem.history,
-            problem.noise,
-            problem.tolerances,
-            problem.roughness_std,
-            trial.scatter,
-            sweep,
-        )
-        moving.share_metric(trial)
-        theta = unknowns.pack(held.p, held.coefficients)
+@dataclass(frozen=True)
+class _Search:
+    """Fits with the load on a coarse mesh, from places along the cable.
+
+    Parameters
+    ----------
+    base : Fit
+        Without the load.
+    model : CableModel
+        With it.
+    position : str
+        Name of the parameter that holds the place.
+    """
+
+    base: Fit
+    model: CableModel
+    position: str
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which parameters are estimated: all but those that the base keeps fixed."""
+        found = self.base.problem.unknowns
+        held = {key for key, free in zip(found.model.names, found.free, strict=True) if not free}
+        return np.array([key not in held for key in self.model.names])
+
+    def run(self, executor: Executor) -> list[Fit]:
+        """Fits from the most promising places, the best first."""
+        starts = map_in_order(executor, self.start, PULL_PLACES)
+        ways = [
+            (share, point)
+            for share, point in zip(PULL_PLACES, starts, strict=True)
+            if point is not None
+        ]
+        likely = sorted(ways, key=lambda way: way[1].objective)
+        fits = map_in_order(executor, self.fit_from, likely[:TRIED])
+        return sorted(fits, key=lambda fit: fit.point.objective)
+
+    def start(self, share: float) -> Point | None:
+        """Equilibria near the measured shapes for a load at a share of the length."""
+        problem = self.held_at(share)
+        unknowns = problem.unknowns
+        theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.rest.n_coefficients))
+        points = starting_points(problem, theta)
+        return points[0] if points else None
+
+    def fit_from(self, way: tuple[float, Point]) -> Fit:
+        """Fit with the load held at the share of the length, then with its place free."""
+        share, point = way
+        problem = self.held_at(share)
+        problem.refresh(point.feet)
+        held = Fit(problem, *problem.descend(point))
+        found = self.base.problem.unknowns
+        moving = self._problem(Unknowns(self.model, self.free, held.p, found.rest_free))
+        moving.share_metric(problem)
+        theta = moving.unknowns.pack(held.p, held.coefficients)
         start = replace(held.point, theta=theta)
-        fits.append(Fit(moving, *moving.descend(start, MOST_STEPS)))
-    return sorted(fits, key=lambda fit: fit.point.objective)
+        return Fit(moving, *moving.descend(start, MOST_STEPS))
+
+    def held_at(self, share: float) -> BatchProblem:
+        """Problem with the load at a share of the length, all else nominal."""
+        values = base_values(self.base, self.model)
+        place = self.model.names.index(self.position)
+        values[place] = share * self.model.cable.length
+        free = self.free
+        free[place] = False
+        return self._problem(
+            Unknowns(self.model, free, values, self.base.problem.unknowns.rest_free)
+        )
+
+    def _problem(self, unknowns: Unknowns) -> BatchProblem:
+        problem = self.base.problem
+        return BatchProblem(
+            unknowns,
+            problem.history,
+            problem.noise,
+            problem.tolerances,
+            problem.roughness_std,
+            pull_scatter(self.base),
+        )
 
 
 def pull_scatter(base: Fit) -> FloatArray:

@@ -28,6 +28,8 @@ FloatArray = NDArray[np.floating]
 
 # Precision in scaled units below which a direction counts as undetermined.
 NO_INFORMATION = 1e-6
+# A descent creeps where so many steps together gain no more than the last one may.
+CREEPING = 4
 
 
 @dataclass(frozen=True)
@@ -298,9 +300,10 @@ class BatchProblem:
         Returns
         -------
         Point, bool
-            The minimum and whether it converged.
+            The minimum and whether it converged: a descent that creeps, or has run out of
+            iterations, has not.
         """
-        damping = 0.0
+        damping, gains = 0.0, [np.inf] * CREEPING
         lin = self.linearize(point)
         for _ in range(max_iterations):
             normal = self.normal_equations(point, lin)
@@ -314,14 +317,16 @@ class BatchProblem:
                 damping = max(10 * damping, 1e-4)
                 if damping > 1e8:
                     return point, False
-            gain = point.objective - trial.objective
+            gains = [*gains[1:], point.objective - trial.objective]
             damping = damping / 10 if damping > 1e-6 else 0.0
             point = trial
             lin = self.linearize(point)
             # Where the residual exceeds the noise, so does a standard deviation's decrease.
             excess = max(1.0, point.data / max(self.n_points, 1))
-            if gain < tolerance * excess and damping < 1e-2:
+            if gains[-1] < tolerance * excess and damping < 1e-2:
                 return point, True
+            if sum(gains) < tolerance * excess:
+                return point, False
         return point, False
 
     def _try(

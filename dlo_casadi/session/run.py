@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from importlib.metadata import version
 
@@ -43,8 +44,15 @@ from dlo_casadi.session.stages import algorithm1_stage, fit_stage, initial_stage
 from dlo_casadi.workers import one_thread
 
 
-def run_session(config: Config, progress: Progress | None = None) -> Outcome:
+def run_session(
+    config: Config, progress: Progress | None = None, executor: Executor | None = None
+) -> Outcome:
     """Read, fit and report one session.
+
+    Parameters
+    ----------
+    executor : Executor, optional
+        Where the search for missing effects does its refits; in this process by default.
 
     Raises
     ------
@@ -60,14 +68,18 @@ def run_session(config: Config, progress: Progress | None = None) -> Outcome:
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
     try:
         with one_thread():
-            return fit_session(config, inputs, clock, progress)
+            return fit_session(config, inputs, clock, progress, executor)
     except DloError as error:
         error.poses = inputs  # for whoever tells what had been read
         raise
 
 
 def fit_session(
-    config: Config, inputs: Sequence[PoseInput], clock: Clock, progress: Progress
+    config: Config,
+    inputs: Sequence[PoseInput],
+    clock: Clock,
+    progress: Progress,
+    executor: Executor | None = None,
 ) -> Outcome:
     """Fit and report a session whose poses have been read; raises as `run_session` does."""
     inputs, odd = without_implausible(config, inputs)
@@ -105,7 +117,7 @@ def fit_session(
     )
     if not config.diagnosis.enabled:
         return replace(outcome, warnings=(*warnings, *fit_warnings(fit, error)))
-    return close_the_loop(outcome, measured, reported, _center(inputs), clock, progress)
+    return close_the_loop(outcome, measured, reported, _center(inputs), clock, progress, executor)
 
 
 def close_the_loop(
@@ -115,6 +127,7 @@ def close_the_loop(
     center: tuple[float, float] | None,
     clock: Clock,
     progress: Progress,
+    executor: Executor | None,
 ) -> Outcome:
     """Diagnose the declared model's residual and add what is missing.
 
@@ -134,6 +147,7 @@ def close_the_loop(
         significance=options.significance,
         max_effects=options.max_effects,
         step=progress.step,
+        executor=executor,
     )
     fit, stages = diagnosis.after, list(outcome.stages)
     if outcome.config.model.n:

@@ -92,7 +92,7 @@ def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
 
 def test_effects_that_do_not_predict_a_pose_left_out_are_no_explanation(monkeypatch):
     """A stretching cable, without stretch: others fit every pose, and predict none."""
-    monkeypatch.setattr(module, "estimate_pull", lambda base: None)  # half a minute, not needed
+    monkeypatch.setattr(module, "estimate_pull", lambda *_: None)  # half a minute, not needed
     config = load_config(BENCH / "stretch" / "session.yaml")
     _, measured = read_poses(config, lambda *_: None)
     fit = fit_of((declared_model(config), measured), std=config.experiment.measurement.std)

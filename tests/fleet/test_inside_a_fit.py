@@ -1,4 +1,4 @@
-"""Starts, folds and candidates of one fit give the same digits in other processes."""
+"""Starts, folds, candidates and pulls of one fit give the same digits in other processes."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.confirm import confirm
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import screen
+from dlo_casadi.diagnosis.pull import estimate_pull
 from dlo_casadi.effects import RestCurvatureDrift
 from dlo_casadi.estimation.fit import fit_model, starting_points
 from dlo_casadi.parallel import map_in_order, open_executor
@@ -62,3 +63,10 @@ def test_refits_of_candidates(fit, pool):
         assert (one is None) == (other is None)
         if one is not None:
             assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_places_of_a_pull(fit, pool):
+    here, there = estimate_pull(fit), estimate_pull(fit, pool)
+    assert here is not None
+    assert here.position == there.position
+    assert np.array_equal(here.force_per_pose, there.force_per_pose)

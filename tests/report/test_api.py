@@ -35,7 +35,7 @@ def test_a_fit_is_that_of_the_session(searched, outcome, monkeypatch):
     """Its outcome, whole; the diagnosis as asked for, else as configured."""
     listener, called = Silent(), []
 
-    def run(config, progress):
+    def run(config, progress, executor):
         called.append((config.diagnosis.enabled, progress))
         return outcome
 
