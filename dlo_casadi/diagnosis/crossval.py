@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.sweep import Shapes
 from dlo_casadi.executors import InProcess
@@ -114,7 +115,8 @@ def _inner(fit: Fit) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
 def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> FloatArray:
     """Unknowns after one step with a part of the data left out."""
     lower, upper = fit.problem.unknowns.bounds
-    ridge = 1e-9 * np.diag(np.diag(fit.normal.hessian))
+    # A direction without any information (the place of a mass of zero) must not move.
+    ridge = 1e-9 * np.diag(np.diag(fit.normal.hessian)) + NO_INFORMATION * np.eye(len(gradient))
     step = -np.linalg.solve(hessian + ridge, gradient)
     return np.clip(fit.point.theta + step, lower, upper)
 
@@ -165,7 +167,7 @@ def _stretches(fit: Fit) -> CrossValidation:
         kept = np.setdiff1d(np.arange(len(points)), rows)
         a, e = joint[kept], lin.residuals[0][kept]
         hessian = a.T @ a + prior
-        hessian += 1e-9 * np.diag(np.diag(hessian))
+        hessian += 1e-9 * np.diag(np.diag(hessian)) + NO_INFORMATION * np.eye(len(hessian))
         step = -np.linalg.solve(hessian, a.T @ e + prior @ pull)
         lower, upper = problem.unknowns.bounds
         theta = np.clip(fit.point.theta + step[:size], lower, upper)

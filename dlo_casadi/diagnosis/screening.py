@@ -26,7 +26,12 @@ from scipy.stats import chi2, f
 
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.fit import Fit, carried_shapes
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Point
+from dlo_casadi.estimation.gauss_newton import (
+    NO_INFORMATION,
+    BatchProblem,
+    Linearization,
+    Point,
+)
 from dlo_casadi.estimation.observation import normal_rows
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -196,7 +201,7 @@ class Screen:
     ) -> Screened:
         base = [i for i, name in enumerate(names) if name in self.fit.problem.unknowns.names]
         columns = [names.index(name) for name in candidate.screened]
-        h_bb = hessian[np.ix_(base, base)]
+        h_bb = hessian[np.ix_(base, base)] + NO_INFORMATION * np.eye(len(base))
         h_cb = hessian[np.ix_(columns, base)]
         h_cc = hessian[np.ix_(columns, columns)]
         u = -gradient[columns]

@@ -140,6 +140,20 @@ class Fit:
         """Root mean square normal distance of the fitted points [m]."""
         return float(np.sqrt((np.concatenate(self.linearization.raw) ** 2).mean()))
 
+    @cached_property
+    def fixture_error(self) -> float:
+        """RMS displacement of a shape [m] by what its ends differ from where they are declared.
+
+        The scatter of the poses' ends and headings, carried to the curve by the equilibrium. The
+        fit estimates each pose's own; of a pose that is only predicted nobody knows them.
+        """
+        size, std = self.problem.unknowns.size, self.problem.deviation_std
+        moved = [
+            ((directions[:, size:] * std) ** 2).sum(axis=1)
+            for directions in self.linearization.raw_directions
+        ]
+        return float(np.sqrt(np.concatenate(moved).mean()))
+
     @property
     def inflation(self) -> float:
         """Factor on standard deviations where the residual exceeds the noise."""

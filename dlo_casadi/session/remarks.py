@@ -9,9 +9,12 @@ import numpy as np
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, repeatability
 from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.session.fitting import MESH_SHARE, allowed_mesh_error
 from dlo_casadi.session.outcome import PoseInput
 
+# Fixtures that move a prediction by more than this share of the noise get a warning.
+FIXTURES = 0.5
 # Poses that repeat worse than this many times the noise get a warning.
 REPEATS = 1.5
 
@@ -48,6 +51,14 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
         lines += [
             f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
         ]
+    if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * fit.noise.std:
+        apart = float(np.hypot(fit.fixture_error, fit.noise.std))
+        lines.append(
+            f"the fixtures are not quite where they are declared, {_scatter(fit)} in each pose: a "
+            f"pose that is not fitted is measured {1e3 * apart:.2g} mm from its prediction, "
+            f"however good the model (the noise is {1e3 * fit.noise.std:.2g} mm); ends measured "
+            "pose by pose would help"
+        )
     if not fit.converged:
         lines.append("the batch fit stopped before it had converged")
     unstable = [
@@ -68,3 +79,14 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"{MESH_SHARE:.0%} of the noise: model.n larger?"
         )
     return lines
+
+
+def _scatter(fit: Fit) -> str:
+    """How far the poses' fixtures are from their declared places, one standard deviation."""
+    scatter = dict(zip(DEVIATIONS, fit.problem.scatter, strict=True))
+    parts = {
+        "end_x": f"{1e3 * scatter['end_x']:.2g} mm at the end",
+        "start_heading": f"{scatter['start_heading']:.2g} rad at the start clamp",
+        "end_heading": f"{scatter['end_heading']:.2g} rad at the end clamp",
+    }
+    return ", ".join(parts[axis] for axis in fit.model.deviations if axis in parts)

@@ -16,6 +16,7 @@ from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.equivalents import untried_equivalents
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
+from dlo_casadi.effects import LumpedMass
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -131,6 +132,18 @@ def test_leaving_a_pose_out_in_one_step_is_close_to_fitting_again(session):
     exact = float((predicted.curve.distances(measured[left].points) ** 2).mean())
     # One Gauss-Newton step, and roughness and scatter kept: a tenth of the mean square.
     assert quick.squares[0] / quick.counts[0] == pytest.approx(exact, rel=0.1)
+
+
+def test_the_place_of_a_mass_of_zero_stops_nothing(session, fit):
+    """It has no information at all: predictions are those without the mass."""
+    declared, measured = session
+    model = fit.model.with_effect(LumpedMass())
+    values = np.array([*fit.p, 0.0, 0.1])
+    held = [*fit.model.names, "lumped_mass.position"]  # the mass stays at zero
+    same = fit_model(model, measured, declared.tolerances, start=fit, values=values, free=held)
+    here, there = cross_validate(fit), cross_validate(same)
+    assert here.squares == pytest.approx(there.squares, rel=1e-3)  # two stops of the same descent
+    assert Screen(same, candidates(model, None, 6)).run(screening_degrees(same))
 
 
 def test_structure_is_seen_before_and_not_after(fit):
