@@ -10,7 +10,8 @@ from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.screening import Screened
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import Fit, fit_model
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.result import Fit
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)

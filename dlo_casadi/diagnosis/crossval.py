@@ -21,9 +21,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
 from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Shapes
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order

@@ -25,7 +25,9 @@ from dlo_casadi.diagnosis.structure import (
     structure_of,
 )
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import Fit, fit_model, noise_of, settle
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.hyperparameters import noise_of, settle
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
 

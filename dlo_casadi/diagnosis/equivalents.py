@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.result import Fit
 
 # A load so near to a held end (share of the length) bends the cable beyond it as an error of the
 # fixture does: shapes show what is transmitted, not how it is applied (Saint-Venant).

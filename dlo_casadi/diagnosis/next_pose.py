@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium import Pose
-from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
 

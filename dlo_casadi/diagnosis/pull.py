@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import Fit, fit_model, starting_points
+from dlo_casadi.estimation.fit import fit_model, starting_points
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import DEVIATIONS, CableModel

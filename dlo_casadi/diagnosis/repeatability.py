@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.observation import MeasuredPose, chord_places
+from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.estimation.fit import Fit, carried_shapes
+from dlo_casadi.estimation.fit import carried_shapes
 from dlo_casadi.estimation.gauss_newton import (
     NO_INFORMATION,
     BatchProblem,
@@ -33,6 +33,7 @@ from dlo_casadi.estimation.gauss_newton import (
     Point,
 )
 from dlo_casadi.estimation.observation import normal_rows
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from dlo_casadi.diagnosis.screening import survival
-from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
+from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
 

@@ -1,32 +1,22 @@
-"""Fit of a model to all measured poses: noise, roughness, parameters and their uncertainty."""
+"""Fit of a model to all measured poses: where to start, and from one model or mesh to another."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
-from dlo_casadi.estimation.gauss_newton import (
-    BatchProblem,
-    Linearization,
-    Normal,
-    Point,
-    Tolerances,
-)
-from dlo_casadi.estimation.noise import (
-    NoiseModel,
-    NoiseSample,
-    estimate_noise,
-    smooth_modes,
-    tell_of_noise,
-)
+from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
+from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
+from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
 from dlo_casadi.estimation.sweep import Shapes
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -41,171 +31,9 @@ DECADES = (0, -1, 1, -2, 2, -3, 3)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
 # Of many poses only so many, evenly picked, are searched for where to start with all.
 POSES_OF_A_SEARCH = 40
-# Slow displacements per pose that are kept out of the noise estimate: many while an effect may
-# be missing, few once the model is taken as complete, because noise is slow, too.
-SMOOTH_MODES = 5
-SETTLED_MODES = 2
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
-# Degrees of freedom from which the size of the noise can be estimated.
-LEAST_SPARE = 3.0
 ROUGHNESS_START = 0.3
-ROUGHNESS_FLOOR = 1e-3
-# Smallest scatter of the poses' ends, as a share of the tolerance.
-SCATTER_FLOOR = 0.05
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Parameters that explain the measured poses best, and how well they are known.
-
-    Parameters
-    ----------
-    problem : BatchProblem
-        With the noise and the roughness found.
-    point : Point
-        Unknowns, shapes and objective at the minimum.
-    converged : bool
-    """
-
-    problem: BatchProblem
-    point: Point
-    converged: bool
-
-    @property
-    def model(self) -> CableModel:
-        """The model that was fitted."""
-        return self.problem.unknowns.model
-
-    @property
-    def noise(self) -> NoiseModel:
-        """Noise of the measured lines."""
-        return self.problem.noise
-
-    @property
-    def p(self) -> FloatArray:
-        """Parameter vector, in the order of `model.names` (SI)."""
-        return self.problem.unknowns.p(self.point.theta)
-
-    @property
-    def coefficients(self) -> FloatArray:
-        """Rest-curvature coefficients [1/m]."""
-        return self.problem.unknowns.coefficients(self.point.theta)
-
-    @property
-    def rest(self) -> FloatArray:
-        """Rest curvature of the bending cells before the first pose [1/m]."""
-        return self.problem.unknowns.rest(self.point.theta)
-
-    @cached_property
-    def linearization(self) -> Linearization:
-        """Residuals and Jacobians at the minimum."""
-        return self.problem.linearize(self.point)
-
-    @cached_property
-    def normal(self) -> Normal:
-        """Normal equations at the minimum."""
-        return self.problem.normal_equations(self.point, self.linearization)
-
-    @cached_property
-    def covariance(self) -> FloatArray:
-        """Covariance (size, size) of theta: inverse of the reduced Hessian."""
-        return np.asarray(np.linalg.pinv(self.normal.hessian, hermitian=True))
-
-    @cached_property
-    def determined_unknowns(self) -> float:
-        """Effective number of unknowns that the points determine, priors being what they are."""
-        problem = self.problem
-        effective = problem.unknowns.size - float(np.trace(self.covariance @ problem.precision))
-        precision = np.diag(1 / problem.deviation_std**2)
-        for block, cross, _ in self.normal.inner:
-            inverse = np.linalg.inv(block)
-            arm = inverse @ cross
-            full = inverse + arm @ self.covariance @ arm.T
-            effective += len(block) - float(np.trace(full @ precision))
-        return effective
-
-    @property
-    def degrees_of_freedom(self) -> float:
-        """Number of points minus the effective number of unknowns that they determine."""
-        return max(self.problem.n_points - self.determined_unknowns, 1.0)
-
-    @property
-    def chi2_per_dof(self) -> float:
-        """Sum of squares of the whitened residuals per degree of freedom."""
-        return self.point.data / self.degrees_of_freedom
-
-    @cached_property
-    def residual_rms(self) -> float:
-        """Root mean square normal distance of the fitted points [m]."""
-        return float(np.sqrt((np.concatenate(self.linearization.raw) ** 2).mean()))
-
-    @cached_property
-    def fixture_error(self) -> float:
-        """RMS displacement of a shape [m] by what its ends differ from where they are declared.
-
-        The scatter of the poses' ends and headings, carried to the curve by the equilibrium. The
-        fit estimates each pose's own; of a pose that is only predicted nobody knows them.
-        """
-        size, std = self.problem.unknowns.size, self.problem.deviation_std
-        moved = [
-            ((directions[:, size:] * std) ** 2).sum(axis=1)
-            for directions in self.linearization.raw_directions
-        ]
-        return float(np.sqrt(np.concatenate(moved).mean()))
-
-    @property
-    def inflation(self) -> float:
-        """Factor on standard deviations where the residual exceeds the noise."""
-        return float(np.sqrt(max(1.0, self.chi2_per_dof)))
-
-    def std(self, name: str) -> float:
-        """Standard deviation of a parameter (SI), the residual's excess included."""
-        unknowns = self.problem.unknowns
-        if name not in unknowns.names:
-            return 0.0
-        k = unknowns.names.index(name)
-        slope = unknowns.scales[k]
-        if name in self.model.names:
-            slope = unknowns.slopes(self.point.theta)[self.model.names.index(name), k]
-        return float(abs(slope) * np.sqrt(max(self.covariance[k, k], 0.0)) * self.inflation)
-
-    def value(self, name: str) -> float:
-        """Value of a parameter (SI)."""
-        return float(self.p[self.model.names.index(name)])
-
-    @cached_property
-    def stable(self) -> NDArray[np.bool_]:
-        """Whether each pose is a stable equilibrium at the fitted parameters."""
-        return self.problem.sweep.stable(self.point.shapes, self.p, self.rest)
-
-    @cached_property
-    def log_evidence(self) -> float:
-        """Laplace's approximation of the log marginal likelihood, constants dropped.
-
-        -objective + 1/2 log|P+| - 1/2 log|H| - 1/2 sum log|block| - log|noise|
-        """
-        problem = self.problem
-        eigen = np.linalg.eigvalsh(problem.precision)
-        prior = float(np.log(eigen[eigen > 1e-12]).sum())
-        hessian = float(np.linalg.slogdet(self.normal.hessian)[1])
-        inner = sum(
-            float(np.linalg.slogdet(block)[1]) + 2 * float(np.log(problem.deviation_std).sum())
-            for block, _, _ in self.normal.inner
-        )
-        return -self.point.objective + (prior - hessian - inner) / 2
-
-
-def settle(fit: Fit) -> Fit:
-    """Estimate noise, roughness and scatter anew for a model that is taken as complete."""
-    problem, point, converged = refine(
-        fit.problem,
-        fit.point,
-        estimate=not fit.noise.declared,
-        rounds=2,
-        modes=SETTLED_MODES,
-    )
-    return Fit(problem, point, converged)
 
 
 def starting_points(
@@ -230,151 +58,6 @@ def starting_points(
     found = map_in_order(executor or InProcess(), begin, starts)
     points = [point for point in found if point is not None and np.isfinite(point.objective)]
     return sorted(points, key=lambda point: point.objective)
-
-
-def refine(
-    problem: BatchProblem,
-    point: Point,
-    *,
-    estimate: bool,
-    rounds: int = 3,
-    modes: int = SMOOTH_MODES,
-) -> tuple[BatchProblem, Point, bool]:
-    """Alternate between the fit, the noise, the roughness of the rest curvature and the scatter.
-
-    Roughness and scatter (how much the poses' ends differ from one another, within the
-    tolerances) maximise the marginal likelihood (MacKay's fixed point).
-
-    References
-    ----------
-    MacKay, Neural Computation 4 (1992).
-    """
-    point, converged = problem.descend(point, tolerance=1e-2)
-    for round_ in range(rounds):
-        lin = problem.linearize(point)
-        noise = problem.noise
-        if estimate and round_ < 2:
-            noise = noise_of(problem, point, lin, modes)
-        roughness = roughness_of(problem, point, lin)
-        scatter = scatter_of(problem, point, lin)
-        moved = max(
-            abs(np.log(roughness / problem.roughness_std)),
-            float(np.abs(np.log(scatter[:4] / problem.scatter[:4])).max()),
-        )
-        changed = abs(np.log(noise.std / problem.noise.std))
-        problem = problem.changed(noise, roughness, scatter)
-        problem.refresh(point.feet)
-        point = problem.evaluate(point.theta, point.shapes, point.feet)
-        point, converged = problem.descend(point)
-        if moved < 0.1 and changed < 0.02:
-            break
-    return problem, point, converged
-
-
-def noise_of(
-    problem: BatchProblem, point: Point, lin: Linearization, modes: int = SMOOTH_MODES
-) -> NoiseModel:
-    """Noise estimated from the residuals with all that the shape may do projected out.
-
-    Lines of few points leave nothing over then: fewer slow displacements are projected out of
-    them, and at last the noise is white, of the size that the residuals have for each degree of
-    freedom.
-
-    Raises
-    ------
-    EstimationError
-        If the points are hardly more than the unknowns that they determine.
-    """
-    for count in range(modes, -1, -1):
-        samples = _noise_samples(problem, point, lin, count)
-        if tell_of_noise(samples):
-            return estimate_noise(samples, problem.unknowns.model.cable.length)
-    return _white_noise(problem, point)
-
-
-def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
-    """White noise of the size of the residuals over their degrees of freedom."""
-    fit = Fit(problem, point, converged=True)
-    spare = problem.n_points - fit.determined_unknowns
-    if spare < LEAST_SPARE:
-        raise EstimationError(
-            f"the {problem.n_points} points of {len(problem.used)} fit poses determine "
-            f"{fit.determined_unknowns:.1f} unknowns (stiffness, rest curvature, deviations within "
-            f"the tolerances): {max(spare, 0.0):.1f} degrees of freedom are left to estimate the "
-            f"noise from, {LEAST_SPARE:g} are needed.\n"
-            "  Try: more points on each line, more poses, the noise as measurement.std, or "
-            "rest_shape: straight."
-        )
-    weight = np.concatenate([problem.measured[j].relative_std for j in problem.used])
-    raw = np.concatenate(fit.linearization.raw) / weight
-    return NoiseModel(float(np.sqrt((raw**2).sum() / spare)), slow_dof=spare)
-
-
-def _noise_samples(
-    problem: BatchProblem, point: Point, lin: Linearization, modes: int
-) -> list[NoiseSample]:
-    """Residuals of each pose beside the directions that its curve may take."""
-    model = problem.unknowns.model
-    length = model.cable.length
-    size = problem.unknowns.size
-    bases, left_over = [], []
-    scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in lin.raw_directions], axis=0)
-    for directions, s in zip(lin.raw_directions, point.feet, strict=True):
-        own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
-        slow = smooth_modes(s, length, modes, model.end == "free")
-        basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
-        basis = basis[:, values > 1e-3 * values[0]]
-        shared = directions[:, :size] / np.maximum(scale, 1e-300)
-        bases.append(basis)
-        left_over.append(shared - basis @ (basis.T @ shared))
-    # A direction that the poses' own ones hold already costs no further degree of freedom.
-    left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
-    blocks = np.split(left[:, values > 1e-6], np.cumsum([len(s) for s in point.feet])[:-1])
-    return [
-        NoiseSample(lin.raw[k], s, problem.measured[problem.used[k]].relative_std, own, block)
-        for k, (s, own, block) in enumerate(zip(point.feet, bases, blocks, strict=True))
-    ]
-
-
-def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> float:
-    """One fixed-point update of the roughness of the rest curvature."""
-    unknowns = problem.unknowns
-    if unknowns.n_rest < 3:
-        return problem.roughness_std
-    rest = slice(unknowns.n_parameters, unknowns.size)
-    rough = unknowns.model.rest.roughness
-    hessian = problem.normal_equations(point, lin).hessian
-    covariance = np.linalg.pinv(hessian, hermitian=True)[rest, rest]
-    prior = rough.T @ rough / problem.roughness_std**2
-    well_determined = len(rough) - float(np.trace(covariance @ prior))
-    energy = float(((rough @ point.theta[rest]) ** 2).sum())
-    return float(max(np.sqrt(energy / max(well_determined, 1e-2)), ROUGHNESS_FLOOR))
-
-
-def scatter_of(problem: BatchProblem, point: Point, lin: Linearization) -> FloatArray:
-    """One fixed-point update of the scatter of ends and headings, never above the tolerance."""
-    columns = problem.sweep.used_deviations
-    if not columns or len(problem.used) == 1:
-        return problem.scatter
-    normal = problem.normal_equations(point, lin)
-    covariance = np.linalg.pinv(normal.hessian, hermitian=True)
-    variance = []
-    for block, cross, _ in normal.inner:
-        inverse = np.linalg.inv(block)
-        arm = inverse @ cross
-        variance.append(np.diag(inverse + arm @ covariance @ arm.T))
-    square = (point.shapes.deviation[np.ix_(problem.used, columns)] ** 2).sum(axis=0)
-    determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
-    scatter = problem.scatter.copy()
-    limits = problem.tolerances.deviation
-    # Both coordinates of an end share one scatter, and so do both headings.
-    for group in ((0, 1), (2, 3)):
-        members = [k for k, column in enumerate(columns) if column in group]
-        if members:
-            found = np.sqrt(square[members].sum() / max(determined[members].sum(), 1e-3))
-            for column in group:
-                scatter[column] = np.clip(found, SCATTER_FLOOR * limits[column], limits[column])
-    return scatter
 
 
 def fit_model(

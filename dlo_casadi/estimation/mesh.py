@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import Fit, on_other_mesh
+from dlo_casadi.estimation.fit import on_other_mesh
 from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 
 FloatArray = NDArray[np.floating]

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 
 FloatArray = NDArray[np.floating]

@@ -21,7 +21,7 @@ from dlo_casadi.chain import ELEMENTS
 from dlo_casadi.config import Config, dump_yaml, implausible_sizes, read_yaml
 from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
 from dlo_casadi.errors import ConfigError, DloError
-from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
 from dlo_casadi.parameters import Parameter
 from dlo_casadi.report.json_report import finite

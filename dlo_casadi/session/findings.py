@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.diagnosis.diagnose import AddedEffect, Diagnosis
-from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.result import Fit
 
 
 def effect_rows(diagnosis: Diagnosis) -> tuple[dict[str, Any], ...]:

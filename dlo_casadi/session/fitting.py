@@ -10,9 +10,11 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
-from dlo_casadi.estimation.fit import SMOOTH_MODES, Fit, fit_model, refine_mesh
+from dlo_casadi.estimation.fit import fit_model, refine_mesh
+from dlo_casadi.estimation.hyperparameters import SMOOTH_MODES
 from dlo_casadi.estimation.mesh import discretization_error
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.declared import Declared
 
 # The search over decades of stiffness runs on this mesh.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
-from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]

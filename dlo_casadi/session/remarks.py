@@ -8,7 +8,7 @@ import numpy as np
 
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, repeatability
-from dlo_casadi.estimation.fit import Fit
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.session.fitting import MESH_SHARE, allowed_mesh_error
 from dlo_casadi.session.outcome import PoseInput

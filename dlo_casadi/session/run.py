@@ -14,9 +14,11 @@ from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
-from dlo_casadi.estimation.fit import SETTLED_MODES, Fit, refine_mesh
+from dlo_casadi.estimation.fit import refine_mesh
+from dlo_casadi.estimation.hyperparameters import SETTLED_MODES
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import stiffness_interval
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.checks import without_implausible

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.algorithm1 import Algorithm1Result
-from dlo_casadi.estimation.fit import Fit
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import Prediction, predict_poses, rms_distance
 from dlo_casadi.estimation.profile import Interval
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.outcome import (

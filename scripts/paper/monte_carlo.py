@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, DloError
-from dlo_casadi.estimation.fit import Fit, fit_model, settle
+from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Tolerances
+from dlo_casadi.estimation.hyperparameters import settle
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import NORMAL_95, stiffness_interval
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import DEVIATIONS

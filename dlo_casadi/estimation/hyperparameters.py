@@ -1,0 +1,186 @@
+"""Noise, roughness of the rest curvature and scatter of the fixtures, estimated from the data."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Point
+from dlo_casadi.estimation.noise import (
+    NoiseModel,
+    NoiseSample,
+    estimate_noise,
+    smooth_modes,
+    tell_of_noise,
+)
+from dlo_casadi.estimation.result import Fit
+
+FloatArray = NDArray[np.floating]
+
+# Slow displacements per pose that are kept out of the noise estimate: many while an effect may
+# be missing, few once the model is taken as complete, because noise is slow, too.
+SMOOTH_MODES = 5
+SETTLED_MODES = 2
+# Degrees of freedom from which the size of the noise can be estimated.
+LEAST_SPARE = 3.0
+ROUGHNESS_FLOOR = 1e-3
+# Smallest scatter of the poses' ends, as a share of the tolerance.
+SCATTER_FLOOR = 0.05
+
+
+def settle(fit: Fit) -> Fit:
+    """Estimate noise, roughness and scatter anew for a model that is taken as complete."""
+    problem, point, converged = refine(
+        fit.problem,
+        fit.point,
+        estimate=not fit.noise.declared,
+        rounds=2,
+        modes=SETTLED_MODES,
+    )
+    return Fit(problem, point, converged)
+
+
+def refine(
+    problem: BatchProblem,
+    point: Point,
+    *,
+    estimate: bool,
+    rounds: int = 3,
+    modes: int = SMOOTH_MODES,
+) -> tuple[BatchProblem, Point, bool]:
+    """Alternate between the fit, the noise, the roughness of the rest curvature and the scatter.
+
+    Roughness and scatter (how much the poses' ends differ from one another, within the
+    tolerances) maximise the marginal likelihood (MacKay's fixed point).
+
+    References
+    ----------
+    MacKay, Neural Computation 4 (1992).
+    """
+    point, converged = problem.descend(point, tolerance=1e-2)
+    for round_ in range(rounds):
+        lin = problem.linearize(point)
+        noise = problem.noise
+        if estimate and round_ < 2:
+            noise = noise_of(problem, point, lin, modes)
+        roughness = roughness_of(problem, point, lin)
+        scatter = scatter_of(problem, point, lin)
+        moved = max(
+            abs(np.log(roughness / problem.roughness_std)),
+            float(np.abs(np.log(scatter[:4] / problem.scatter[:4])).max()),
+        )
+        changed = abs(np.log(noise.std / problem.noise.std))
+        problem = problem.changed(noise, roughness, scatter)
+        problem.refresh(point.feet)
+        point = problem.evaluate(point.theta, point.shapes, point.feet)
+        point, converged = problem.descend(point)
+        if moved < 0.1 and changed < 0.02:
+            break
+    return problem, point, converged
+
+
+def noise_of(
+    problem: BatchProblem, point: Point, lin: Linearization, modes: int = SMOOTH_MODES
+) -> NoiseModel:
+    """Noise estimated from the residuals with all that the shape may do projected out.
+
+    Lines of few points leave nothing over then: fewer slow displacements are projected out of
+    them, and at last the noise is white, of the size that the residuals have for each degree of
+    freedom.
+
+    Raises
+    ------
+    EstimationError
+        If the points are hardly more than the unknowns that they determine.
+    """
+    for count in range(modes, -1, -1):
+        samples = _noise_samples(problem, point, lin, count)
+        if tell_of_noise(samples):
+            return estimate_noise(samples, problem.unknowns.model.cable.length)
+    return _white_noise(problem, point)
+
+
+def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
+    """White noise of the size of the residuals over their degrees of freedom."""
+    fit = Fit(problem, point, converged=True)
+    spare = problem.n_points - fit.determined_unknowns
+    if spare < LEAST_SPARE:
+        raise EstimationError(
+            f"the {problem.n_points} points of {len(problem.used)} fit poses determine "
+            f"{fit.determined_unknowns:.1f} unknowns (stiffness, rest curvature, deviations within "
+            f"the tolerances): {max(spare, 0.0):.1f} degrees of freedom are left to estimate the "
+            f"noise from, {LEAST_SPARE:g} are needed.\n"
+            "  Try: more points on each line, more poses, the noise as measurement.std, or "
+            "rest_shape: straight."
+        )
+    weight = np.concatenate([problem.measured[j].relative_std for j in problem.used])
+    raw = np.concatenate(fit.linearization.raw) / weight
+    return NoiseModel(float(np.sqrt((raw**2).sum() / spare)), slow_dof=spare)
+
+
+def _noise_samples(
+    problem: BatchProblem, point: Point, lin: Linearization, modes: int
+) -> list[NoiseSample]:
+    """Residuals of each pose beside the directions that its curve may take."""
+    model = problem.unknowns.model
+    length = model.cable.length
+    size = problem.unknowns.size
+    bases, left_over = [], []
+    scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in lin.raw_directions], axis=0)
+    for directions, s in zip(lin.raw_directions, point.feet, strict=True):
+        own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
+        slow = smooth_modes(s, length, modes, model.end == "free")
+        basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
+        basis = basis[:, values > 1e-3 * values[0]]
+        shared = directions[:, :size] / np.maximum(scale, 1e-300)
+        bases.append(basis)
+        left_over.append(shared - basis @ (basis.T @ shared))
+    # A direction that the poses' own ones hold already costs no further degree of freedom.
+    left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
+    blocks = np.split(left[:, values > 1e-6], np.cumsum([len(s) for s in point.feet])[:-1])
+    return [
+        NoiseSample(lin.raw[k], s, problem.measured[problem.used[k]].relative_std, own, block)
+        for k, (s, own, block) in enumerate(zip(point.feet, bases, blocks, strict=True))
+    ]
+
+
+def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> float:
+    """One fixed-point update of the roughness of the rest curvature."""
+    unknowns = problem.unknowns
+    if unknowns.n_rest < 3:
+        return problem.roughness_std
+    rest = slice(unknowns.n_parameters, unknowns.size)
+    rough = unknowns.model.rest.roughness
+    hessian = problem.normal_equations(point, lin).hessian
+    covariance = np.linalg.pinv(hessian, hermitian=True)[rest, rest]
+    prior = rough.T @ rough / problem.roughness_std**2
+    well_determined = len(rough) - float(np.trace(covariance @ prior))
+    energy = float(((rough @ point.theta[rest]) ** 2).sum())
+    return float(max(np.sqrt(energy / max(well_determined, 1e-2)), ROUGHNESS_FLOOR))
+
+
+def scatter_of(problem: BatchProblem, point: Point, lin: Linearization) -> FloatArray:
+    """One fixed-point update of the scatter of ends and headings, never above the tolerance."""
+    columns = problem.sweep.used_deviations
+    if not columns or len(problem.used) == 1:
+        return problem.scatter
+    normal = problem.normal_equations(point, lin)
+    covariance = np.linalg.pinv(normal.hessian, hermitian=True)
+    variance = []
+    for block, cross, _ in normal.inner:
+        inverse = np.linalg.inv(block)
+        arm = inverse @ cross
+        variance.append(np.diag(inverse + arm @ covariance @ arm.T))
+    square = (point.shapes.deviation[np.ix_(problem.used, columns)] ** 2).sum(axis=0)
+    determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
+    scatter = problem.scatter.copy()
+    limits = problem.tolerances.deviation
+    # Both coordinates of an end share one scatter, and so do both headings.
+    for group in ((0, 1), (2, 3)):
+        members = [k for k, column in enumerate(columns) if column in group]
+        if members:
+            found = np.sqrt(square[members].sum() / max(determined[members].sum(), 1e-3))
+            for column in group:
+                scatter[column] = np.clip(found, SCATTER_FLOOR * limits[column], limits[column])
+    return scatter

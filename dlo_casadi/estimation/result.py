@@ -1,0 +1,156 @@
+"""The result of a fit: parameters that explain the measured poses, and how well they are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Normal, Point
+from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters that explain the measured poses best, and how well they are known.
+
+    Parameters
+    ----------
+    problem : BatchProblem
+        With the noise and the roughness found.
+    point : Point
+        Unknowns, shapes and objective at the minimum.
+    converged : bool
+    """
+
+    problem: BatchProblem
+    point: Point
+    converged: bool
+
+    @property
+    def model(self) -> CableModel:
+        """The model that was fitted."""
+        return self.problem.unknowns.model
+
+    @property
+    def noise(self) -> NoiseModel:
+        """Noise of the measured lines."""
+        return self.problem.noise
+
+    @property
+    def p(self) -> FloatArray:
+        """Parameter vector, in the order of `model.names` (SI)."""
+        return self.problem.unknowns.p(self.point.theta)
+
+    @property
+    def coefficients(self) -> FloatArray:
+        """Rest-curvature coefficients [1/m]."""
+        return self.problem.unknowns.coefficients(self.point.theta)
+
+    @property
+    def rest(self) -> FloatArray:
+        """Rest curvature of the bending cells before the first pose [1/m]."""
+        return self.problem.unknowns.rest(self.point.theta)
+
+    @cached_property
+    def linearization(self) -> Linearization:
+        """Residuals and Jacobians at the minimum."""
+        return self.problem.linearize(self.point)
+
+    @cached_property
+    def normal(self) -> Normal:
+        """Normal equations at the minimum."""
+        return self.problem.normal_equations(self.point, self.linearization)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance (size, size) of theta: inverse of the reduced Hessian."""
+        return np.asarray(np.linalg.pinv(self.normal.hessian, hermitian=True))
+
+    @cached_property
+    def determined_unknowns(self) -> float:
+        """Effective number of unknowns that the points determine, priors being what they are."""
+        problem = self.problem
+        effective = problem.unknowns.size - float(np.trace(self.covariance @ problem.precision))
+        precision = np.diag(1 / problem.deviation_std**2)
+        for block, cross, _ in self.normal.inner:
+            inverse = np.linalg.inv(block)
+            arm = inverse @ cross
+            full = inverse + arm @ self.covariance @ arm.T
+            effective += len(block) - float(np.trace(full @ precision))
+        return effective
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Number of points minus the effective number of unknowns that they determine."""
+        return max(self.problem.n_points - self.determined_unknowns, 1.0)
+
+    @property
+    def chi2_per_dof(self) -> float:
+        """Sum of squares of the whitened residuals per degree of freedom."""
+        return self.point.data / self.degrees_of_freedom
+
+    @cached_property
+    def residual_rms(self) -> float:
+        """Root mean square normal distance of the fitted points [m]."""
+        return float(np.sqrt((np.concatenate(self.linearization.raw) ** 2).mean()))
+
+    @cached_property
+    def fixture_error(self) -> float:
+        """RMS displacement of a shape [m] by what its ends differ from where they are declared.
+
+        The scatter of the poses' ends and headings, carried to the curve by the equilibrium. The
+        fit estimates each pose's own; of a pose that is only predicted nobody knows them.
+        """
+        size, std = self.problem.unknowns.size, self.problem.deviation_std
+        moved = [
+            ((directions[:, size:] * std) ** 2).sum(axis=1)
+            for directions in self.linearization.raw_directions
+        ]
+        return float(np.sqrt(np.concatenate(moved).mean()))
+
+    @property
+    def inflation(self) -> float:
+        """Factor on standard deviations where the residual exceeds the noise."""
+        return float(np.sqrt(max(1.0, self.chi2_per_dof)))
+
+    def std(self, name: str) -> float:
+        """Standard deviation of a parameter (SI), the residual's excess included."""
+        unknowns = self.problem.unknowns
+        if name not in unknowns.names:
+            return 0.0
+        k = unknowns.names.index(name)
+        slope = unknowns.scales[k]
+        if name in self.model.names:
+            slope = unknowns.slopes(self.point.theta)[self.model.names.index(name), k]
+        return float(abs(slope) * np.sqrt(max(self.covariance[k, k], 0.0)) * self.inflation)
+
+    def value(self, name: str) -> float:
+        """Value of a parameter (SI)."""
+        return float(self.p[self.model.names.index(name)])
+
+    @cached_property
+    def stable(self) -> NDArray[np.bool_]:
+        """Whether each pose is a stable equilibrium at the fitted parameters."""
+        return self.problem.sweep.stable(self.point.shapes, self.p, self.rest)
+
+    @cached_property
+    def log_evidence(self) -> float:
+        """Laplace's approximation of the log marginal likelihood, constants dropped.
+
+        -objective + 1/2 log|P+| - 1/2 log|H| - 1/2 sum log|block| - log|noise|
+        """
+        problem = self.problem
+        eigen = np.linalg.eigvalsh(problem.precision)
+        prior = float(np.log(eigen[eigen > 1e-12]).sum())
+        hessian = float(np.linalg.slogdet(self.normal.hessian)[1])
+        inner = sum(
+            float(np.linalg.slogdet(block)[1]) + 2 * float(np.log(problem.deviation_std).sum())
+            for block, _, _ in self.normal.inner
+        )
+        return -self.point.objective + (prior - hessian - inner) / 2
