@@ -189,7 +189,7 @@ def error_table(outcome: Outcome) -> Table:
     table.add_column("stage")
     validated = cross_validated(outcome)
     columns = ["fit", "cross-validated", "held out", "chi2/dof"]
-    if not outcome.effects:
+    if not validated:
         columns.remove("cross-validated")
     for column in columns:
         table.add_column(column, justify="right")
@@ -210,7 +210,9 @@ def error_table(outcome: Outcome) -> Table:
 def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
     """Cross-validated errors [m] of the stages for which the diagnosis has computed them."""
     if not outcome.effects:
-        return {}
+        searched = outcome.diagnosis
+        known = searched is not None and searched.validation_after.complete
+        return {"batch": searched.validation_after.rmse} if known else {}
     return {
         "batch": outcome.effects[0]["rmse_cross_validated_before"],
         "closed": outcome.effects[-1]["rmse_cross_validated_after"],
