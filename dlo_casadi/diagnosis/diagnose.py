@@ -17,6 +17,7 @@ from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.equivalents import untried_equivalents
 from dlo_casadi.diagnosis.next_pose import NextPose, next_pose
 from dlo_casadi.diagnosis.pull import Pull, estimate_pull
+from dlo_casadi.diagnosis.repeatability import limiting_spread
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
 from dlo_casadi.diagnosis.structure import (
     Structure,
@@ -160,6 +161,7 @@ def diagnose(
     executor = executor or InProcess()
     current, validation = fit, cross_validate(fit)
     before, first_structure = validation, structure_of(fit, screening_degrees(fit))
+    repeats = limiting_spread(fit) is None
     added: list[AddedEffect] = []
     ranked: list[Ranked] = []
     for k in range(max_effects):
@@ -169,7 +171,7 @@ def diagnose(
         significant = [
             item for item, p in zip(screened, corrected, strict=True) if p < significance
         ]
-        confirmed = _confirmed(current, significant, validation, executor)
+        confirmed = _confirmed(current, significant, validation, executor, repeats)
         if k == 0:
             ranked = _ranking(screened, corrected, confirmed)
         # What a second effect explains may be what the first one, if wrong, has left.
@@ -261,8 +263,13 @@ def _confirmed(
     significant: Sequence[Screened],
     validation: CrossValidation,
     executor: Executor,
+    repeats: bool,
 ) -> list[Confirmed]:
-    """Refits of the leading candidates that improve the fit and what it predicts."""
+    """Refits of the leading candidates that improve the fit and what it predicts.
+
+    Where the same pose does not repeat to the noise, scores count as many points as if they were
+    independent, and are not: whole poses alone decide, and the gain must be beyond its own error.
+    """
     if not significant:
         return []
     top = max(item.score for item in significant)
@@ -273,7 +280,8 @@ def _confirmed(
         if tried is None or tried.bic <= 0 or not tried.validation.complete:
             continue
         # An effect that explains the fitted poses but predicts the others worse is none.
-        if tried.validation.rmse <= validation.rmse:
+        better = tried.validation.rmse <= validation.rmse
+        if better and (repeats or validation.clearly_worse_than(tried.validation)):
             out.append(tried)
     return out
 

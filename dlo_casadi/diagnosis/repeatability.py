@@ -12,6 +12,8 @@ from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
 
+# Poses that repeat worse than this many times the noise limit every prediction.
+REPEATS = 1.5
 # Absolute correlation of two nuisances beyond which their effects on the shapes are one.
 ALIKE = 0.9
 
@@ -35,6 +37,12 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
             if others:
                 squares.append(((curve - np.mean(others, axis=0)) ** 2).sum(axis=1).mean())
     return float(np.sqrt(np.mean(squares))) if squares else None
+
+
+def limiting_spread(fit: Fit) -> float | None:
+    """How badly the same pose repeats [m], where that is what limits a prediction, else None."""
+    spread = repeatability(fit.problem.measured, fit.model.cable.length)
+    return spread if spread is not None and spread > REPEATS * fit.noise.std else None
 
 
 def alike(fit: Fit) -> list[tuple[str, ...]]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dlo_casadi.config import SkippedPose
-from dlo_casadi.diagnosis.repeatability import alike, repeatability
+from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.session.fitting import MESH_SHARE, allowed_mesh_error
@@ -15,8 +15,6 @@ from dlo_casadi.session.outcome import PoseInput
 
 # Fixtures that move a prediction by more than this share of the noise get a warning.
 FIXTURES = 0.5
-# Poses that repeat worse than this many times the noise get a warning.
-REPEATS = 1.5
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
@@ -41,8 +39,8 @@ def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
 def fit_warnings(fit: Fit, error: float) -> list[str]:
     """What a fit cannot promise; `error` is that of its mesh [m]."""
     lines = []
-    spread = repeatability(fit.problem.measured, fit.model.cable.length)
-    if spread is not None and spread > REPEATS * fit.noise.std:
+    spread = limiting_spread(fit)
+    if spread is not None:
         lines.append(
             f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
             f"others), the noise is {1e3 * fit.noise.std:.2g} mm: repeatability limits any "

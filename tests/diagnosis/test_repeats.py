@@ -1,0 +1,62 @@
+"""One pose taken several times, each time a little different for reasons that nobody knows."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dlo_casadi.diagnosis import diagnose
+from dlo_casadi.diagnosis.confirm import Confirmed
+from dlo_casadi.diagnosis.crossval import CrossValidation
+from dlo_casadi.diagnosis.repeatability import limiting_spread
+from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.gauss_newton import Tolerances
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.executors import InProcess
+from dlo_casadi.model import CableModel
+
+MODEL = CableModel(Cable(0.8, 0.03, 0.006, 0.02), 12, start="clamped", end="clamped", n_rest=5)
+NOISE = 3e-4
+
+
+def hung_again(seed: int, scatter: float, count: int = 5) -> list[MeasuredPose]:
+    """Hangings of one pose whose rest shape differs from one to the next [1/m]."""
+    rng = np.random.default_rng(seed)
+    pose = Pose((0.0, 0.0), (0.45, -0.05), start_heading=-0.6, end_heading=0.5)
+    s = np.linspace(0.02, 0.98, 40) * MODEL.cable.length
+    out = []
+    for _ in range(count):
+        rest = MODEL.rest_basis @ (0.5 + rng.normal(scale=scatter, size=5))
+        (shape,) = predict_poses(MODEL, np.array([0.02]), rest, [pose])
+        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2))
+        out.append(MeasuredPose(pose, points))
+    return out
+
+
+@pytest.mark.parametrize(("scatter", "limited"), [(0.3, True), (0.0, False)])
+def test_hangings_that_differ_by_more_than_the_noise_limit_every_prediction(scatter, limited):
+    """Rest curvatures 0.3 1/m apart move the shapes by several times the noise."""
+    fit = fit_model(MODEL, hung_again(0, scatter), Tolerances(), NOISE)
+    spread = limiting_spread(fit)
+    assert (spread is not None and spread > 3 * NOISE) if limited else spread is None
+
+
+@pytest.mark.parametrize(
+    ("errors", "repeats", "kept"),
+    [
+        ([0.8, 1.0, 0.9, 1.1, 0.7], True, True),  # an effect worth it, were the points independent
+        ([0.8, 1.0, 0.9, 1.1, 0.7], False, False),  # but two of five hangings are no better
+        ([0.3, 0.4, 0.3, 0.5, 0.4], False, True),  # all are
+    ],
+)
+def test_only_a_clear_gain_counts_where_poses_do_not_repeat(monkeypatch, errors, repeats, kept):
+    """Mean squares of what is left out, hanging by hanging; 1 without the effect."""
+    counts = np.full(5, 40.0)
+    before = CrossValidation(counts * 1.0, counts, True)
+    tried = Confirmed(None, None, CrossValidation(counts * errors, counts, True), 100.0, 90.0)
+    monkeypatch.setattr(diagnose, "confirm", lambda *_: tried)
+    found = diagnose._confirmed(None, [SimpleNamespace(score=50.0)], before, InProcess(), repeats)
+    assert found == ([tried] if kept else [])
