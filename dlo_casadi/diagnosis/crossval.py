@@ -20,6 +20,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import ttest_1samp
 
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
 from dlo_casadi.estimation.observation import NodeCurve
@@ -63,11 +64,25 @@ class CrossValidation:
         """Whether the mean paired difference of the folds exceeds its standard error."""
         if not self.complete:
             return True
-        gap = self.squares / self.counts - other.squares / other.counts
+        gap = self._excess_over(other)
         if len(gap) < 2:
             return bool(gap.sum() > 0)
         error = float(gap.std(ddof=1)) / np.sqrt(len(gap))
         return bool(gap.mean() > factor * error)
+
+    def chance_of_gain(self, other: CrossValidation) -> float:
+        """Probability of a gain as large as that of the other, if it predicts no better.
+
+        One-sided paired t test over the folds; 1 where there is but one.
+        """
+        if not self.complete:
+            return 0.0
+        gap = self._excess_over(other)
+        return float(ttest_1samp(gap, 0.0, alternative="greater").pvalue) if len(gap) > 1 else 1.0
+
+    def _excess_over(self, other: CrossValidation) -> FloatArray:
+        """Difference of the mean squares, fold by fold [m^2]."""
+        return np.asarray(self.squares / self.counts - other.squares / other.counts)
 
 
 def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:

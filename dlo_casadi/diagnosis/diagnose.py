@@ -161,7 +161,7 @@ def diagnose(
     executor = executor or InProcess()
     current, validation = fit, cross_validate(fit)
     before, first_structure = validation, structure_of(fit, screening_degrees(fit))
-    repeats = limiting_spread(fit) is None
+    doubt = significance if limiting_spread(fit) is not None else None
     added: list[AddedEffect] = []
     ranked: list[Ranked] = []
     for k in range(max_effects):
@@ -171,7 +171,7 @@ def diagnose(
         significant = [
             item for item, p in zip(screened, corrected, strict=True) if p < significance
         ]
-        confirmed = _confirmed(current, significant, validation, executor, repeats)
+        confirmed = _confirmed(current, significant, validation, executor, doubt)
         if k == 0:
             ranked = _ranking(screened, corrected, confirmed)
         # What a second effect explains may be what the first one, if wrong, has left.
@@ -263,12 +263,13 @@ def _confirmed(
     significant: Sequence[Screened],
     validation: CrossValidation,
     executor: Executor,
-    repeats: bool,
+    doubt: float | None,
 ) -> list[Confirmed]:
     """Refits of the leading candidates that improve the fit and what it predicts.
 
-    Where the same pose does not repeat to the noise, scores count as many points as if they were
-    independent, and are not: whole poses alone decide, and the gain must be beyond its own error.
+    Where the same pose does not repeat to the noise, scores count points as if they were
+    independent, and they are not. There whole poses alone decide: a gain as large must have less
+    than the probability `doubt` if poses that are left out are predicted no better (Student's t).
     """
     if not significant:
         return []
@@ -280,8 +281,9 @@ def _confirmed(
         if tried is None or tried.bic <= 0 or not tried.validation.complete:
             continue
         # An effect that explains the fitted poses but predicts the others worse is none.
-        better = tried.validation.rmse <= validation.rmse
-        if better and (repeats or validation.clearly_worse_than(tried.validation)):
+        if tried.validation.rmse > validation.rmse:
+            continue
+        if doubt is None or validation.chance_of_gain(tried.validation) < doubt:
             out.append(tried)
     return out
 

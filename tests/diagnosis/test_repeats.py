@@ -45,18 +45,18 @@ def test_hangings_that_differ_by_more_than_the_noise_limit_every_prediction(scat
 
 
 @pytest.mark.parametrize(
-    ("errors", "repeats", "kept"),
+    ("errors", "doubt", "kept"),
     [
-        ([0.8, 1.0, 0.9, 1.1, 0.7], True, True),  # an effect worth it, were the points independent
-        ([0.8, 1.0, 0.9, 1.1, 0.7], False, False),  # but two of five hangings are no better
-        ([0.3, 0.4, 0.3, 0.5, 0.4], False, True),  # all are
+        ([0.8, 1.0, 0.9, 1.1, 0.7], None, True),  # an effect worth it, were the points independent
+        ([0.8, 1.0, 0.9, 1.1, 0.7], 0.005, False),  # but two of five hangings are no better
+        ([0.3, 0.4, 0.3, 0.5, 0.4], 0.005, True),  # all are
     ],
 )
-def test_only_a_clear_gain_counts_where_poses_do_not_repeat(monkeypatch, errors, repeats, kept):
+def test_only_a_clear_gain_counts_where_poses_do_not_repeat(monkeypatch, errors, doubt, kept):
     """Mean squares of what is left out, hanging by hanging; 1 without the effect."""
     counts = np.full(5, 40.0)
     before = CrossValidation(counts * 1.0, counts, True)
     tried = Confirmed(None, None, CrossValidation(counts * errors, counts, True), 100.0, 90.0)
     monkeypatch.setattr(diagnose, "confirm", lambda *_: tried)
-    found = diagnose._confirmed(None, [SimpleNamespace(score=50.0)], before, InProcess(), repeats)
+    found = diagnose._confirmed(None, [SimpleNamespace(score=50.0)], before, InProcess(), doubt)
     assert found == ([tried] if kept else [])
