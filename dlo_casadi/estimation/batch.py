@@ -30,7 +30,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import NodeCurve, normal_rows
 from dlo_casadi.estimation.sweep import Shapes
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import DEVIATIONS
 
 FloatArray = NDArray[np.floating]
 
@@ -95,8 +95,9 @@ def solve_batch(problem: BatchProblem, start: Point, max_solves: int = 4) -> Bat
 
 
 def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, FloatArray]]:
-    """Triangular factor (nz, nz) and target (nz,) of each fitted pose's points."""
+    """Triangular factor (n_rows, nz) and target (n_rows,) of each fitted pose's points."""
     curves = problem.curves(point.theta, point.shapes)
+    count = _n_rows(problem)
     out = []
     for j, s in zip(problem.used, point.feet, strict=True):
         curve: NodeCurve = curves[j]
@@ -106,11 +107,17 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
         target = white @ (problem.measured[j].points * normals).sum(axis=1)
         size = rows.shape[1]
         triangle = np.linalg.qr(np.column_stack([rows, target]), mode="r")
-        padded = np.zeros((size, size + 1))
-        keep = min(size, len(triangle))
+        padded = np.zeros((count, size + 1))
+        keep = min(count, len(triangle))
         padded[:keep] = triangle[:keep]
         out.append((padded[:, :size], padded[:, size]))
     return out
+
+
+def _n_rows(problem: BatchProblem) -> int:
+    """Rows of a pose's compressed points: no more than the numbers of its shape, or points."""
+    most = max(len(problem.measured[j].points) for j in problem.used)
+    return min(most, int(problem.unknowns.model.shape.size1_out(0)))
 
 
 class _BatchNlp:
@@ -183,10 +190,10 @@ class _BatchNlp:
         """NLP, gradient, Jacobian and Hessian from the poses' blocks."""
         problem, m = self.problem, len(self.poses)
         unknowns, model = problem.unknowns, problem.unknowns.model
-        size, n_z = unknowns.size, self._n_z(model)
+        size, n_z, n_rows = unknowns.size, int(model.shape.size1_out(0)), _n_rows(problem)
         x = ca.MX.sym("x", size + self.stride * m)
-        factor = ca.MX.sym("factor", n_z, n_z * len(problem.used))
-        target = ca.MX.sym("target", n_z, len(problem.used))
+        factor = ca.MX.sym("factor", n_rows, n_z * len(problem.used))
+        target = ca.MX.sym("target", n_rows, len(problem.used))
         p = ca.vertcat(ca.vec(factor), ca.vec(target))
         theta, own = x[:size], ca.reshape(x[size:], self.stride, m)
         thetas = ca.repmat(theta, 1, m)
@@ -295,10 +302,6 @@ class _BatchNlp:
         start = ca.vertcat(ca.MX(first), ca.MX(n * (m - 1), size))
         direct = ca.horzcat(-start, ca.MX(ca.diagcat(*([select] * m))))
         return gap, direct - shifted
-
-    @staticmethod
-    def _n_z(model: CableModel) -> int:
-        return int(model.shape.size1_out(0))
 
     def _split(self, own: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         a, b, c = self.n_phi, self.n_phi + self.n_lam, self.n_phi + self.n_lam + self.n_dev
