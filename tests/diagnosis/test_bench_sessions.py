@@ -46,7 +46,6 @@ def test_a_stiffness_that_gravity_cannot_show_is_called_so(report):
     ("session", "name", "parameter", "true"),
     [
         ("overhang", "bending_softening", "curvature_scale", 6.0),
-        ("long", "length_error", "length_difference", 0.0025),
         ("connector", "lumped_mass", "mass", 0.07),
         ("connector", "lumped_mass", "position", 0.52),
     ],
