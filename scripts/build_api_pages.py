@@ -1,4 +1,4 @@
-"""Write the pages of the Python API: python scripts/build_api_pages.py (docs/api/index.html)."""
+"""Write the pages of the Python API: python scripts/build_api_pages.py (results/api/index.html)."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pdoc
 import dlo_casadi
 
 MODULES = ("dlo_casadi", "dlo_casadi.effects", "dlo_casadi.vision", "dlo_casadi.parallel")
-FOLDER = Path(__file__).parents[1] / "docs/api"
+FOLDER = Path(__file__).parents[1] / "results/api"
 
 
 def main() -> None:
