@@ -21,6 +21,7 @@ import numpy as np
 import yaml
 
 from dlo_casadi.config import load_config
+from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.parallel import map_as_completed, open_executor
 from dlo_casadi.session import run_session
 from dlo_casadi.session.outcome import Outcome
@@ -87,6 +88,7 @@ def compare(name: str, outcome: Outcome) -> dict:
         "held_out_batch_mm": _mm(batch.rmse_held_out),
         "held_out_mm": _mm(last.rmse_held_out),
         "held_out_over_noise": (last.rmse_held_out or np.nan) / outcome.measurement.std,
+        "fixtures_mm": _fixtures(name, outcome),
         "chi2_per_dof": last.chi2_per_dof,
         "seconds": outcome.timing["total"],
         "diagnosis_seconds": outcome.timing["diagnosis"],
@@ -109,6 +111,23 @@ def compare(name: str, outcome: Outcome) -> dict:
 
 def _mm(value: float | None) -> float | None:
     return None if value is None else 1e3 * value
+
+
+def _fixtures(name: str, outcome: Outcome) -> float | None:
+    """RMS distance [mm] between held-out shapes predicted from the declared and the true ends."""
+    fit, shapes = outcome.fit, np.load(TRUTH / name / "truth_shapes.npz")
+    poses = [item.pose for item in fit.problem.history]
+    if any(pose.end is None for pose in poses):
+        return None
+    true = [replace(pose, end=tuple(map(float, shapes[pose.name][-1]))) for pose in poses]
+    declared, moved = (predict_poses(fit.model, fit.p, fit.rest, ends) for ends in (poses, true))
+    places = np.linspace(0.0, fit.model.cable.length, 200)
+    square = [
+        (one.curve.distances(other.curve.at(places)) ** 2).mean()
+        for one, other, item in zip(declared, moved, fit.problem.history, strict=True)
+        if item.held_out and one is not None and other is not None
+    ]
+    return 1e3 * float(np.sqrt(np.mean(square))) if square else None
 
 
 def _pull(name: str, tether: list[float], outcome: Outcome) -> dict:
@@ -181,7 +200,8 @@ def show(row: dict, seconds: float) -> None:
     print(
         f"    EI {row['EI']:.4g} [{bounds[0]}, {bounds[1]}] true {row['EI_true']:.4g}   noise "
         f"{row['noise_mm']:.3f} mm  held out {row['held_out_batch_mm'] or np.nan:.3f} -> "
-        f"{row['held_out_mm'] or np.nan:.3f} mm = {row['held_out_over_noise']:.2f} noise   "
+        f"{row['held_out_mm'] or np.nan:.3f} mm = {row['held_out_over_noise']:.2f} noise, of which "
+        f"fixtures {row['fixtures_mm'] or np.nan:.3f} mm   "
         f"chi2/dof {row['chi2_per_dof']:.2f}   {seconds:.0f} s "
         f"(diagnosis {row['diagnosis_seconds']:.0f} s)"
     )
