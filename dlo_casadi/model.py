@@ -1,17 +1,16 @@
 """CableModel: a chain and its effects, composed slot by slot into one Lagrangian.
 
-Every stage differentiates the same expression
+Every stage differentiates the same expressions: the Lagrangian
 
-    Lagrangian(phi, lam) = V(phi) + lam^T c(phi) - sum_e h C N_e^2 / 2
+    L(x, lam) = sum_e L_e(x_e, x_(e+1), lam) + L_ends(x_0, x_N, lam)
 
-with the energy V of bending, weight and loads, the end conditions c = 0, and, for a cable of axial
-compliance C, the tension N_e = -(1/h) dL/d(length ratio of element e), which is exact for dead
-loads. An equilibrium is a stationary point; the chain's coordinates stay the headings alone.
+with the energy of bending, weight and loads and the end conditions times their multipliers. An
+equilibrium is a stationary point. All that a slot or an end adds is one CasADi function each,
+mapped over the cable, see `assembly`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -20,7 +19,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.chain import Chain, Curve, Element
 from dlo_casadi.effects import (
     BoundaryEffect,
     Cable,
@@ -29,17 +27,21 @@ from dlo_casadi.effects import (
     Kinematics,
     Load,
     MeasurementEffect,
+    PointForceAt,
     SectionLaw,
     StateEffect,
 )
 from dlo_casadi.errors import DloError
 from dlo_casadi.parameters import Parameter
 from dlo_casadi.rest import RestCurvature
+from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
+from dlo_casadi.rod.element import Cell, Slot
 
 StartKind = Literal["pinned", "clamped"]
 EndKind = Literal["pinned", "clamped", "free"]
 FloatArray = NDArray[np.floating]
 
+BENDING_STIFFNESS = "bending_stiffness"
 # ln(1000): a prior of the stiffness may be off by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
 # What may be different in every pose, in the order of `deviation`: where the ends deviate from
@@ -47,15 +49,45 @@ STIFFNESS_PRIOR_STD = float(np.log(1e3))
 DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading", "pull_x", "pull_y")
 
 
-def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Stiffness 1 + x of a bow under tension and its slope; compressed, x < 0, it stays above 1/4.
+@dataclass(frozen=True)
+class _Law:
+    """A section law with its parameters, as elements ask for it."""
 
-    Elements of a limp cable would buckle one by one on the way to an equilibrium. Twice
-    differentiable, and 1 + x + O(x^3) everywhere.
+    effect: SectionLaw
+    cable: Cable
+    params: dict[str, ca.SX]
+
+    @property
+    def even(self) -> bool:
+        return self.effect.even
+
+    def factor(self, bend: ca.SX, cell: Cell) -> ca.SX:
+        return self.effect.factor(bend, cell, self.cable, self.params)
+
+    def tangent(self, bend: ca.SX, cell: Cell) -> ca.SX:
+        return self.effect.tangent(bend, cell, self.cable, self.params)
+
+
+@dataclass(frozen=True)
+class Potential:
+    """A minimisation over one pose: symbols (coordinates, parameters), energy [J], conditions.
+
+    The parameters stack p, rest curvature of the cells, ends, deviation.
     """
-    a = 4 / 3 * ca.fmin(x, 0)
-    pressed = 1 - a + a**2
-    return ca.fmax(x, 0) + 0.25 + 0.75 / pressed, (1 - 2 * a) / pressed**2
+
+    coordinates: ca.SX
+    parameters: ca.SX
+    energy: ca.SX
+    conditions: ca.SX
+
+
+@dataclass(frozen=True)
+class _SlotTerms:
+    """Expressions of one slot: its Lagrangian and its share of the stretched, bowed curve."""
+
+    lagrangian: ca.SX
+    advance: ca.SX
+    ratio: ca.SX
 
 
 @dataclass(frozen=True)
@@ -67,7 +99,8 @@ class CableModel:
     cable : Cable
     n : int
         Number of elements.
-    element : "quadratic", "arc" or "link"
+    element : str
+        A name of `rod.chain.ELEMENTS`.
     start : "pinned" or "clamped"
     end : "pinned", "clamped" or "free"
     gravity : (float, float) [m/s^2]
@@ -87,7 +120,7 @@ class CableModel:
 
     cable: Cable
     n: int = 40
-    element: Element = "quadratic"
+    element: str = DEFAULT_ELEMENT
     start: StartKind = "pinned"
     end: EndKind = "pinned"
     gravity: tuple[float, float] = (0.0, -9.81)
@@ -113,9 +146,8 @@ class CableModel:
     @cached_property
     def chain(self) -> Chain:
         """The chain of n elements."""
-        return Chain(
-            self.cable.length, self.n, self.element, self.start == "clamped", self.end == "clamped"
-        )
+        held = (self.start == "clamped", self.end == "clamped")
+        return Chain(self.cable.length, self.n, self.element, *held)
 
     @cached_property
     def rest(self) -> RestCurvature:
@@ -131,7 +163,7 @@ class CableModel:
     def parameters(self) -> tuple[Parameter, ...]:
         """Bending stiffness, then the parameters of the effects with qualified names."""
         stiffness = Parameter(
-            "bending_stiffness",
+            BENDING_STIFFNESS,
             "N m^2",
             nominal=self.cable.bending_stiffness,
             lower=1e-12,
@@ -169,12 +201,12 @@ class CableModel:
         priors = {k: v for k, v in self.priors.items() if not k.startswith(f"{label}.")}
         return replace(self, effects=kept, priors=priors)
 
-    def with_mesh(self, n: int, element: Element | None = None) -> CableModel:
+    def with_mesh(self, n: int, element: str | None = None) -> CableModel:
         """Return the same model on another mesh."""
         return replace(self, n=n, element=element or self.element)
 
-    def _slot(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
-        """Effects of one slot with their own parameters."""
+    def _filling(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
+        """Effects of one slot of the model with their own parameters."""
         picked = []
         for effect in self.effects:
             if isinstance(effect, base):
@@ -190,16 +222,8 @@ class CableModel:
     # ---- symbols -----------------------------------------------------------------------------
 
     @cached_property
-    def _phi(self) -> ca.SX:
-        return ca.SX.sym("phi", self.chain.n_headings)
-
-    @cached_property
     def _p(self) -> ca.SX:
         return ca.SX.sym("p", len(self.parameters))
-
-    @cached_property
-    def _rest(self) -> ca.SX:
-        return ca.SX.sym("kappa_0", self.chain.n_cells)
 
     @cached_property
     def _ends(self) -> ca.SX:
@@ -216,21 +240,32 @@ class CableModel:
         return ca.SX.sym("lam", self.n_conditions)
 
     @cached_property
+    def _nodes(self) -> tuple[ca.SX, ca.SX]:
+        """Coordinates of the two nodes of a slot, and their increments."""
+        node = self.chain.kind.node
+        return ca.SX.sym("x", 2 * node.coordinates), ca.SX.sym("delta", 2 * node.increment)
+
+    @cached_property
+    def _rest(self) -> ca.SX:
+        """Rest curvature inside a slot, see `Chain.rest_of_slots`."""
+        return ca.SX.sym("rest", 3)
+
+    @cached_property
+    def _place(self) -> ca.SX:
+        """A row of `Layout.slots`."""
+        return ca.SX.sym("place", self.chain.layout.slots.shape[1])
+
+    @cached_property
     def n_conditions(self) -> int:
-        """Number of end conditions: end position, then headings of clamped arcs."""
-        position = 0 if self.end == "free" else 2
-        headings = 0
-        if self.chain.nodal:
-            headings = (self.start == "clamped") + (self.end == "clamped")
-        return position + headings
+        """Number of end conditions."""
+        return len(self.condition_names)
 
     @cached_property
     def condition_names(self) -> tuple[str, ...]:
-        """Names of the end conditions, for messages."""
+        """Names of the end conditions: end position, then headings of clamps."""
         names = [] if self.end == "free" else ["end_position_x", "end_position_y"]
-        if self.chain.nodal:
-            names += ["start_heading"] if self.start == "clamped" else []
-            names += ["end_heading"] if self.end == "clamped" else []
+        names += ["start_heading"] if self.start == "clamped" else []
+        names += ["end_heading"] if self.end == "clamped" else []
         return tuple(names)
 
     @cached_property
@@ -253,257 +288,267 @@ class CableModel:
             start_heading=self._ends[4] + self._deviation[2],
             end_heading=self._ends[5] + self._deviation[3],
         )
-        for effect, local in self._slot(BoundaryEffect):
+        for effect, local in self._filling(BoundaryEffect):
             ends = effect.conditions(ends, local)
         return ends
 
     @cached_property
     def _stretch(self) -> ca.SX:
         factor = ca.SX(1)
-        for effect, local in self._slot(Kinematics):
+        for effect, local in self._filling(Kinematics):
             factor = factor * effect.stretch(self.cable, local)
         return factor
 
     @cached_property
     def _compliance(self) -> ca.SX:
         return sum(
-            (effect.compliance(local) for effect, local in self._slot(Kinematics)), start=ca.SX(0)
+            (effect.compliance(local) for effect, local in self._filling(Kinematics)),
+            start=ca.SX(0),
         )
 
     @property
     def extensible(self) -> bool:
         """Whether some effect lets the cable stretch under tension."""
-        return any(effect.extensible for effect, _ in self._slot(Kinematics))
-
-    def _curve(
-        self,
-        ratio: ca.SX | None = None,
-        bow: ca.SX | None = None,
-        square: ca.SX | None = None,
-    ) -> Curve:
-        held = self._held
-        return self.chain.curve(
-            self._phi,
-            held.start,
-            held.start_heading,
-            held.end_heading,
-            self._stretch,
-            ratio,
-            self._rest,
-            bow,
-            square,
-        )
-
-    @property
-    def bowed(self) -> bool:
-        """Whether the elements bow."""
-        return self.element == "quadratic"
+        return any(effect.extensible for effect, _ in self._filling(Kinematics))
 
     @property
     def yields(self) -> bool:
-        """Whether the end moves with the force on it while the headings stay."""
-        return self.extensible or self.bowed
+        """Whether the end moves with the force on it while the nodes stay."""
+        return self.extensible or self.chain.kind.n_inner > 0
 
-    def _bending_energy(self, curve: Curve) -> ca.SX:
-        """Bending energy [J]: of each cell's mean bend, and of its bow to second order."""
-        cells = self.chain.cells
-        width, bend = ca.DM(np.diff(cells, axis=1).ravel()), curve.strain - self._rest
-        density, tangent, uneven = self._p[0] / 2 * bend**2, ca.SX(1), ca.SX(0)
-        middle = cells.mean(axis=1)
-        halves = [np.stack(p, axis=1) for p in ((cells[:, 0], middle), (middle, cells[:, 1]))]
-        for effect, local in self._slot(SectionLaw):
-            if not self.bowed or effect.even:
-                density = density * effect.factor(bend, cells, self.cable, local)
-                tangent = tangent * effect.tangent(bend, cells, self.cable, local)
-                continue
-            first, second = (effect.factor(bend, c, self.cable, local) for c in halves)
-            density = density * (first + second) / 2
-            tangent = tangent * (first + second) / 2
-            uneven += (first - second) / (first + second)
-        if self.bowed:
-            # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
-            bowed = 4 / np.sqrt(3) * curve.bow / (width * self._stretch)
-            # Where the halves resist differently, a mean bend bows the cell.
-            density += self._p[0] / 2 * tangent * (bowed**2 + 2 * uneven * bend * bowed)
-        return ca.dot(width, density) * self._stretch
-
-    def _energy(self, curve: Curve) -> ca.SX:
-        """Energy of bending, weight, loads and holders [J], without stretching."""
-        energy = self._bending_energy(curve)
+    @cached_property
+    def _gravity(self) -> ca.SX:
+        """Gravity [m/s^2] as every weight feels it."""
         gravity = ca.SX(ca.DM(self.gravity))
-        loads = self._slot(Load)
-        for effect, local in loads:
+        for effect, local in self._filling(Load):
             gravity = effect.gravity(gravity, local)
-        energy -= self.cable.mass / self.cable.length * ca.dot(gravity, curve.first_moment)
-        for effect, local in loads:
-            energy += effect.energy(curve, gravity, local)
-        for effect, local in self._slot(BoundaryEffect):
-            energy += effect.energy(curve, local)
+        return gravity
+
+    def _resultant(self, s: ca.SX | float) -> ca.SX:
+        """Force [N] of all that is spread along the cable on its part beyond s."""
+        weight = self.cable.mass / self.cable.length * self._gravity
+        total = weight * (self.cable.length - s)
+        for effect, local in self._filling(Load):
+            total += effect.resultant(ca.SX(s), self._gravity, self.cable, local)
+        return total
+
+    @cached_property
+    def _forces(self) -> list[PointForceAt]:
+        """Dead forces on single places of the cable."""
+        return [
+            force
+            for effect, local in self._filling(Load)
+            for force in effect.forces(self._gravity, local)
+        ]
+
+    @cached_property
+    def _total_load(self) -> ca.SX:
+        """Sum of all dead loads [N]."""
+        return sum((force.force for force in self._forces), start=self._resultant(0.0))
+
+    def _slot(self, ratio: ca.SX, inner: ca.SX, square: ca.SX) -> Slot:
+        """The slot's symbols; numbers that all slots share are written in."""
+        kind, table = self.chain.kind, self.chain.layout.slots
+        x, delta = self._nodes
+        c, b = kind.node.coordinates, kind.node.increment
+        place = ca.vertcat(
+            *(
+                ca.SX(column[0]) if np.all(column == column[0]) else self._place[i]
+                for i, column in enumerate(table.T)
+            )
+        )
+        return Slot(
+            first=kind.node.retract(x[:c], delta[:b]),
+            last=kind.node.retract(x[c:], delta[b:]),
+            rest=self._rest,
+            place=place,
+            mesh=self.chain.h,
+            stretch=self._stretch,
+            ratio=ratio,
+            inner=inner,
+            square=square,
+        )
+
+    def _bending_energy(self, slot: Slot) -> ca.SX:
+        laws = [_Law(effect, self.cable, local) for effect, local in self._filling(SectionLaw)]
+        return self.chain.kind.bending(slot, self._bending_stiffness, laws)
+
+    @property
+    def _bending_stiffness(self) -> ca.SX:
+        return self._p[self.names.index(BENDING_STIFFNESS)]
+
+    def _slot_energy(self, slot: Slot) -> ca.SX:
+        """Energy of bending and loads of one slot [J]: of the loads, minus their work along it."""
+        kind = self.chain.kind
+        energy = self._bending_energy(slot)
+        for u, weight in zip(*kind.rule, strict=True):
+            resultant = self._resultant(slot.start + u * slot.length)
+            energy -= weight * slot.length * ca.dot(resultant, kind.tangent(slot, u))
+        for force in self._forces:
+            # Up to where it acts; a slot without length has nothing to advance along.
+            u = ca.fmin(ca.fmax((force.position - slot.start) / self.chain.h, 0), 1)
+            energy -= ca.dot(force.force, kind.advance(slot, u))
         return energy
 
-    def _conditions(self, curve: Curve) -> ca.SX:
-        """End conditions c(phi) = 0: [m], [rad]."""
-        held = self._held
-        rows = []
-        if self.end != "free":
-            rows.append(curve.nodes[self.n, :].T - held.end)
-        if self.chain.nodal:
-            if self.start == "clamped":
-                rows.append(curve.start_direction - held.start_heading)
-            if self.end == "clamped":
-                rows.append(curve.end_direction - held.end_heading)
-        return ca.vertcat(*rows) if rows else ca.SX.zeros(0)
+    def _pull(self, advance: ca.SX) -> ca.SX:
+        """Work of the end's multipliers along a slot [J]."""
+        return ca.SX(0) if self.end == "free" else ca.dot(self._lam[:2], advance)
 
     @cached_property
-    def _lagrangian(self) -> tuple[ca.SX, Curve]:
-        """Lagrangian and the stretched, bowed curve, functions of headings and multipliers."""
-        ratio, bow = ca.SX.sym("ratio", self.n), ca.SX.sym("bow", self.n)
-        uniform, none = ca.SX.ones(self.n) * self._stretch, ca.SX.zeros(self.n)
-        curve = self._curve(ratio if self.extensible else uniform, bow if self.bowed else none)
-        plain = self._energy(curve) + ca.dot(self._lam, self._conditions(curve))
+    def _terms(self) -> _SlotTerms:
+        """A slot's Lagrangian, and its curve, stretched by the tension and bowed.
 
-        def rigid(*expressions: ca.SX) -> list[ca.SX]:
-            """Without stretching and bowing."""
-            found: list[ca.SX] = ca.substitute([*expressions], [ratio, bow], [uniform, none])
-            return found
+            L_e = V_e + lam^T advance_e - h C N_e^2 / 2,   N_e = -(1/h) dL_e/d(ratio)
 
-        (lagrangian,) = rigid(plain)
-        stretched = uniform
-        if self.extensible:
-            (tension,) = rigid(-ca.gradient(plain, ratio) / self.chain.h)
-            lagrangian -= self._compliance * self.chain.h * ca.sumsqr(tension) / 2
-            stretched = uniform + self._compliance * tension
-        if self.bowed:
-            torque, ones = ca.gradient(plain, bow), ca.SX.ones(self.n)
-            elastic = ca.jtimes(ca.gradient(self._bending_energy(curve), bow), bow, ones)
-            torque, stiffness, elastic = rigid(torque, ca.jtimes(torque, bow, ones), elastic)
-            factor, slope = _stiffening(stiffness / elastic - 1)
-            bowed = -torque / (elastic * factor)
-            lagrangian += ca.dot(torque, bowed) / 2
-            # The curve whose end the Lagrangian's derivative by the multipliers holds.
-            return lagrangian, self._curve(stretched, bowed, bowed**2 * slope)
-        return lagrangian, self._curve(stretched)
-
-    @property
-    def n_inner(self) -> int:
-        """Number of coordinates of `potential` beside the headings."""
-        return self.n * (self.extensible + self.bowed)
-
-    @cached_property
-    def potential(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Symbols (coordinates, parameters), energy [J] and end conditions of the minimisation.
-
-        min V(coordinates) s.t. conditions = 0. The coordinates are the headings, for an
-        extensible cable one a_e per element with the axial strain sqrt(C) a_e and the energy
-        h a_e^2 / 2, and for quadratic elements their bows. The parameters stack p, rest, ends,
-        deviation.
+        which is exact for dead loads; the inner unknowns are eliminated.
         """
-        parameters = ca.vertcat(self._p, self._rest, self._ends, self._deviation)
-        axial = ca.SX.sym("axial", self.n if self.extensible else 0)
-        bow = ca.SX.sym("bow", self.n if self.bowed else 0)
-        ratio = self._stretch + ca.sqrt(self._compliance) * axial if self.extensible else None
-        curve = self._curve(ratio, bow if self.bowed else None)
-        energy, conditions = self._energy(curve), self._conditions(curve)
-        if self.bowed:
-            # To second order in the bows, as in the Lagrangian.
-            torque = ca.gradient(energy, bow)
-            stiffness = ca.jtimes(torque, bow, ca.SX.ones(self.n))
-            straight = ca.substitute([energy, torque, stiffness], [bow], [ca.SX.zeros(self.n)])
-            energy = straight[0] + ca.dot(straight[1], bow) + ca.dot(straight[2], bow**2) / 2
-        energy += self.chain.h * ca.sumsqr(axial) / 2
-        return ca.vertcat(self._phi, axial, bow), parameters, energy, conditions
+        kind, h = self.chain.kind, self.chain.h
+        ratio, inner = ca.SX.sym("ratio"), ca.SX.sym("inner", kind.n_inner)
+        slot = self._slot(ratio, inner, inner**2)
+        plain = self._slot_energy(slot) + self._pull(kind.advance(slot))
 
-    # ---- numerical functions -----------------------------------------------------------------
+        def rigid(expression: ca.SX) -> ca.SX:
+            return ca.substitute(expression, ratio, self._stretch)
+
+        condensed = kind.condensed(slot, rigid(plain), self._bending_energy)
+        lagrangian, stretched = condensed.lagrangian, self._stretch
+        if self.extensible:
+            (tension,) = ca.substitute(
+                [-ca.gradient(plain, ratio) / h],
+                [ratio, inner],
+                [self._stretch, ca.SX.zeros(kind.n_inner)],
+            )
+            lagrangian -= self._compliance * h * tension**2 / 2
+            stretched = self._stretch + self._compliance * tension
+        true = self._slot(stretched, condensed.inner, condensed.square)
+        # The curve whose end the Lagrangian's derivative by the multipliers holds.
+        return _SlotTerms(lagrangian, kind.advance(true), stretched)
+
+    @cached_property
+    def _at_ends(self) -> ca.SX:
+        """Lagrangian of the ends: holders, end conditions, and the loads' work at the start."""
+        node = self.chain.kind.node
+        x, delta = self._nodes
+        first = node.retract(x[: node.coordinates], delta[: node.increment])
+        last = node.retract(x[node.coordinates :], delta[node.increment :])
+        held = self._held
+        gaps = [] if self.end == "free" else [held.start - held.end]
+        gaps += [first - held.start_heading] if self.start == "clamped" else []
+        gaps += [last - held.end_heading] if self.end == "clamped" else []
+        total = ca.dot(self._lam, ca.vertcat(*gaps)) if gaps else ca.SX(0)
+        for effect, local in self._filling(BoundaryEffect):
+            total += effect.energy(first, last, local)
+        return total - ca.dot(self._total_load, held.start)
+
+    # ---- functions of a slot, an end, a node ---------------------------------------------------
 
     @property
-    def _arguments(self) -> list[ca.SX]:
-        return [self._phi, self._lam, self._p, self._rest, self._ends, self._deviation]
+    def _slot_arguments(self) -> list[ca.SX]:
+        x, _ = self._nodes
+        return [x, self._lam, self._p, self._rest, self._place, self._deviation]
+
+    @property
+    def _end_arguments(self) -> list[ca.SX]:
+        x, _ = self._nodes
+        return [x, self._lam, self._p, self._ends, self._deviation]
+
+    @property
+    def _moving(self) -> ca.SX:
+        """What the Lagrangian of a slot is differentiated by: increments, then multipliers."""
+        return ca.vertcat(self._nodes[1], self._lam)
+
+    def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
+        """A function at increments of zero, its outputs dense."""
+        _, delta = self._nodes
+        found = ca.substitute(outputs, [delta], [ca.SX.zeros(delta.shape)])
+        return ca.Function(name, arguments, [ca.densify(one) for one in ca.cse(found)])
+
+    def _derivatives(self, name: str, value: ca.SX, arguments: list[ca.SX]) -> ca.Function:
+        hessian, gradient = ca.hessian(value, self._moving)
+        return self._here(name, arguments, [value, gradient, hessian])
 
     @cached_property
-    def _stationarity(self) -> ca.SX:
-        """Gradient of the Lagrangian by (phi, lam): force balance, then end conditions."""
-        lagrangian, _ = self._lagrangian
-        return ca.gradient(lagrangian, ca.vertcat(self._phi, self._lam))
+    def slot(self) -> ca.Function:
+        """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
+        return self._derivatives("slot", self._terms.lagrangian, self._slot_arguments)
 
     @cached_property
-    def kkt(self) -> ca.Function:
-        """(phi, lam, p, rest, ends, deviation) -> stationarity (N,), its Jacobian (N, N)."""
-        unknowns = ca.vertcat(self._phi, self._lam)
-        matrix = ca.jacobian(self._stationarity, unknowns)
-        return ca.Function(
-            "kkt", self._arguments, [ca.densify(self._stationarity), ca.densify(matrix)]
-        )
+    def at_ends(self) -> ca.Function:
+        """(x, lam, p, ends, deviation) of the first and last node -> as `slot`."""
+        return self._derivatives("at_ends", self._at_ends, self._end_arguments)
+
+    def _mixed(self, name: str, value: ca.SX, arguments: list[ca.SX], by: ca.SX) -> ca.Function:
+        mixed = ca.jacobian(ca.gradient(value, self._moving), by)
+        return self._here(name, arguments, [mixed])
 
     @cached_property
-    def balance(self) -> ca.Function:
-        """Same arguments -> stationarity (N,) only."""
-        return ca.Function("balance", self._arguments, [self._stationarity])
+    def slot_sensitivity(self) -> ca.Function:
+        """As `slot` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
+        by = ca.vertcat(self._p, self._rest, self._deviation)
+        return self._mixed("slot_sensitivity", self._terms.lagrangian, self._slot_arguments, by)
 
     @cached_property
-    def sensitivity(self) -> ca.Function:
-        """Same arguments -> derivatives of the stationarity by p, rest and deviation."""
-        blocks = [
-            ca.densify(ca.jacobian(self._stationarity, symbol))
-            for symbol in (self._p, self._rest, self._deviation)
+    def end_sensitivity(self) -> ca.Function:
+        """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
+        by = ca.vertcat(self._p, self._deviation)
+        return self._mixed("end_sensitivity", self._at_ends, self._end_arguments, by)
+
+    @cached_property
+    def _advanced(self) -> ca.SX:
+        """True advance of a slot and its length ratio (dimension + 1,)."""
+        return ca.vertcat(self._terms.advance, self._terms.ratio)
+
+    @cached_property
+    def slot_curve(self) -> ca.Function:
+        """As `slot` -> advance [m] and length ratio (3,)."""
+        return self._here("slot_curve", self._slot_arguments, [self._advanced])
+
+    @cached_property
+    def slot_curve_slopes(self) -> ca.Function:
+        """As `slot` -> the same, its derivatives by increments and lam, and by p, rest, deviation."""
+        others = ca.vertcat(self._p, self._rest, self._deviation)
+        blocks = [ca.jacobian(self._advanced, symbols) for symbols in (self._moving, others)]
+        return self._here("slot_curve_slopes", self._slot_arguments, [self._advanced, *blocks])
+
+    @cached_property
+    def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
+        """Arguments, place (and slope) in the measurement of one station, and what moves it."""
+        kind = self.chain.kind
+        x, delta = self._nodes
+        point, ratio = ca.SX.sym("point", 2), ca.SX.sym("ratio")
+        halves = [
+            kind.node.retract(x[i : i + 1], delta[i : i + 1]) for i in range(kind.node.coordinates * 2)
         ]
-        return ca.Function("sensitivity", self._arguments, blocks)
-
-    @cached_property
-    def _observed(self) -> ca.SX:
-        """Measured image of the curve: see `observation`."""
-        _, curve = self._lagrangian
-        nodes = curve.nodes
-        maps = self._slot(MeasurementEffect)
-        rows = []
-        point, slope, heading = ca.SX.sym("point", 2), ca.SX.sym("slope", 2), ca.SX.sym("heading")
+        heading = (halves[0] + halves[1]) / 2
+        slope = ratio * kind.node.tangent(heading)
         image = point
+        maps = self._filling(MeasurementEffect)
         for effect, local in maps:
             image = effect.observe(image, heading, self._ends[:2], local)
-        pushed = ca.jtimes(image, point, slope) if maps else slope
-        move = ca.Function("move", [point, slope, heading, self._p, self._ends], [image, pushed])
-        headings = curve.node_headings
-        slopes = curve.node_slopes if self.chain.nodal else ca.SX.zeros(self.n + 1, 2)
-        for i in range(self.n + 1):
-            position, direction = move(
-                nodes[i, :].T, slopes[i, :].T, headings[i], self._p, self._ends
-            )
-            rows.append(ca.horzcat(position.T, direction.T))
-        table = ca.vertcat(*rows)
-        return ca.densify(ca.vec(table if self.chain.nodal else table[:, :2]))
+        rows = image
+        if kind.smooth:
+            rows = ca.vertcat(image, ca.jtimes(image, point, slope) if maps else slope)
+        arguments = [point, ratio, x, self._p, self._ends]
+        return arguments, rows, ca.vertcat(point, ratio, delta)
 
     @cached_property
-    def observation(self) -> ca.Function:
-        """Same arguments -> measured curve z, its derivatives by phi+lam, p, rest, deviation.
-
-        z stacks the columns x, y of the nodes and, for arcs, dx/ds, dy/ds: with cubic Hermite
-        interpolation every measured point is a fixed linear function of z.
-        """
-        z = self._observed
-        unknowns = ca.vertcat(self._phi, self._lam)
-        blocks = [
-            ca.densify(ca.jacobian(z, symbol))
-            for symbol in (unknowns, self._p, self._rest, self._deviation)
-        ]
-        return ca.Function("observation", self._arguments, [z, *blocks])
-
-    def slopes_by(self, names: Sequence[str]) -> ca.Function:
-        """Same arguments -> derivatives of the stationarity and of z by the named parameters."""
-        chosen = ca.vertcat(*(self._p[self.names.index(name)] for name in names))
-        blocks = [ca.densify(ca.jacobian(e, chosen)) for e in (self._stationarity, self._observed)]
-        return ca.Function("slopes_by", self._arguments, blocks)
+    def station(self) -> ca.Function:
+        """(point, ratio, x, p, ends) of an element boundary -> its image: place, and slope dr/ds."""
+        arguments, rows, _ = self._seen
+        return self._here("station", arguments, [rows])
 
     @cached_property
-    def shape(self) -> ca.Function:
-        """Same arguments -> measured curve z only."""
-        return ca.Function("shape", self._arguments, [self._observed])
+    def station_slopes(self) -> ca.Function:
+        """As `station` -> the same, derivatives by (point, ratio, increments) and by p."""
+        arguments, rows, moving = self._seen
+        blocks = [ca.jacobian(rows, symbols) for symbols in (moving, self._p)]
+        return self._here("station_slopes", arguments, [rows, *blocks])
 
     @cached_property
-    def strain(self) -> ca.Function:
-        """(phi, ends, deviation, p) -> curvature per cell (n_cells,) [1/m]."""
-        curve = self._curve()
-        return ca.Function(
-            "strain", [self._phi, self._ends, self._deviation, self._p], [curve.strain]
-        )
+    def slot_strain(self) -> ca.Function:
+        """As `slot` -> mean curvature of the cell [1/m]."""
+        slot = self._slot(self._stretch, ca.SX.zeros(self.chain.kind.n_inner), ca.SX(0))
+        return self._here("strain", self._slot_arguments, [self.chain.kind.strain(slot)])
 
     @property
     def has_state(self) -> bool:
@@ -511,30 +556,83 @@ class CableModel:
         return any(isinstance(effect, StateEffect) for effect in self.effects)
 
     @cached_property
-    def next_rest(self) -> ca.Function:
-        """Same arguments -> rest curvature after the pose, its derivatives by phi, rest, p."""
-        curvature = self._curve().strain
-        rest = self._rest
-        for effect, local in self._slot(StateEffect):
-            rest = effect.next_rest(rest, curvature, local)
-        blocks = [
-            ca.densify(ca.jacobian(rest, symbol)) for symbol in (self._phi, self._rest, self._p)
-        ]
-        return ca.Function("next_rest", self._arguments, [ca.densify(rest), *blocks])
-
-    @cached_property
-    def energy(self) -> ca.Function:
-        """Same arguments -> potential energy [J], stretching included, and true nodes (n+1, 2)."""
-        lagrangian, curve = self._lagrangian
-        work = ca.dot(self._lam, self._conditions(curve))
-        return ca.Function("energy", self._arguments, [lagrangian - work, curve.nodes])
+    def slot_state(self) -> ca.Function:
+        """As `slot` -> rest curvature of the cell after the pose; by increments, rest and p."""
+        kind = self.chain.kind
+        slot = self._slot(self._stretch, ca.SX.zeros(kind.n_inner), ca.SX(0))
+        curvature, mean = kind.strain(slot), self._rest[0]
+        for effect, local in self._filling(StateEffect):
+            mean = effect.next_rest(mean, curvature, local)
+        by = (self._nodes[1], self._rest[0], self._p)
+        blocks = [ca.jacobian(mean, symbols) for symbols in by]
+        return self._here("slot_state", self._slot_arguments, [mean, *blocks])
 
     @cached_property
     def dead_load(self) -> ca.Function:
-        """P -> sum of the dead loads on the cable (2,) [N]: minus the energy's slope by a shift."""
-        shift = ca.SX.sym("shift", 2)
-        curve = replace(self._curve(), start=shift)
-        slope = ca.gradient(self._energy(curve), shift)
-        unused = [symbol for symbol in ca.symvar(slope) if not ca.depends_on(self._p, symbol)]
-        zeros = [ca.SX(0)] * len(unused)
-        return ca.Function("dead_load", [self._p], ca.substitute([-slope], unused, zeros))
+        """P -> sum of the dead loads on the cable (2,) [N], without those of single poses."""
+        still = ca.SX.zeros(len(DEVIATIONS))
+        load = ca.substitute(self._total_load, self._deviation, still)
+        return ca.Function("dead_load", [self._p], [ca.densify(load)])
+
+    # ---- one pose as a whole, for IPOPT ---------------------------------------------------------
+
+    @property
+    def n_inner(self) -> int:
+        """Number of coordinates of `potential` beside the nodes."""
+        return self.chain.n_slots * (self.extensible + self.chain.kind.n_inner)
+
+    @cached_property
+    def potential(self) -> Potential:
+        """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
+
+        The coordinates are the nodes', for an extensible cable one a_e per slot with the axial
+        strain sqrt(C) a_e and the energy h a_e^2 / 2, and the elements' inner unknowns.
+        """
+        kind, chain = self.chain.kind, self.chain
+        a, inner = ca.SX.sym("a", int(self.extensible)), ca.SX.sym("inner", kind.n_inner)
+        ratio = self._stretch
+        if self.extensible:
+            ratio = ratio + ca.sqrt(self._compliance) * a
+        slot = self._slot(ratio, inner, inner**2)
+        energy = kind.expanded(slot, self._slot_energy(slot)) + chain.h * ca.sumsqr(a) / 2
+        one = self._here(
+            "potential_slot",
+            [*self._slot_arguments, a, inner],
+            [energy, kind.advance(slot)],
+        )
+        count = chain.n_nodes * kind.node.coordinates
+        x = ca.SX.sym("x", count)
+        axial = ca.SX.sym("axial", chain.n_slots if self.extensible else 0)
+        bow = ca.SX.sym("inner", chain.n_slots * kind.n_inner)
+        rest = ca.SX.sym("kappa_0", chain.n_cells)
+        lam = ca.SX.zeros(self.n_conditions)
+        total, advance = ca.SX(0), ca.SX.zeros(kind.node.dimension)
+        for j, arguments in enumerate(self._slots_of(x, lam, rest)):
+            extra = [axial[j : j + 1] if self.extensible else axial, bow[j : j + kind.n_inner]]
+            one_energy, one_advance = one(*arguments, *extra)
+            total, advance = total + one_energy, advance + one_advance
+        ends, gradient, _ = self.at_ends(
+            self._both_ends(x), lam, self._p, self._ends, self._deviation
+        )
+        conditions = gradient[2 * kind.node.increment :]
+        if self.end != "free":
+            conditions[:2] += advance
+        parameters = ca.vertcat(self._p, rest, self._ends, self._deviation)
+        return Potential(ca.vertcat(x, axial, bow), parameters, total + ends, conditions)
+
+    def _both_ends(self, x: ca.SX) -> ca.SX:
+        c = self.chain.kind.node.coordinates
+        return ca.vertcat(x[:c], x[x.numel() - c :])
+
+    def _slots_of(self, x: ca.SX, lam: ca.SX, rest: ca.SX) -> list[list[ca.SX]]:
+        """Arguments of the functions of a slot, for every slot of a pose."""
+        chain = self.chain
+        c, last = chain.kind.node.coordinates, chain.n_nodes - 1
+        rows = []
+        for j in range(chain.n_slots):
+            k = min(j + 1, last)
+            both = ca.vertcat(x[j * c : (j + 1) * c], x[k * c : (k + 1) * c])
+            own = ca.DM(chain.rest_of_slots[j]) @ rest
+            place = ca.DM(chain.layout.slots[j])
+            rows.append([both, lam, self._p, own, place, self._deviation])
+        return rows

@@ -12,6 +12,7 @@ from dlo_casadi.effects.effect import (
     Kinematics,
     Load,
     MeasurementEffect,
+    PointForceAt,
     SectionLaw,
     StateEffect,
 )
@@ -72,6 +73,7 @@ __all__ = [
     "LumpedMass",
     "MeasurementEffect",
     "PointForce",
+    "PointForceAt",
     "RestCurvatureDrift",
     "SectionLaw",
     "SideLoad",

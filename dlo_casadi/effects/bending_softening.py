@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from dlo_casadi.effects.effect import Cable, Params, SectionLaw
 from dlo_casadi.parameters import Parameter
+from dlo_casadi.rod.element import Cell
 
 # Gauss-Legendre on [0, 1]; ten points integrate the law to 1e-9 for |k|/c up to 5.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
@@ -41,17 +41,13 @@ class BendingSoftening(SectionLaw):
         """Declare the softness."""
         return (Parameter("softness", "m", scale=0.1 * cable.length, lower=0.0, upper=1e3),)
 
-    def factor(
-        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
-    ) -> ca.SX:
+    def factor(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
         """Energy over EI k^2 / 2: 2 int_0^1 t / (1 + t |k|/c) dt, by quadrature in t."""
         ratio = self._ratio(bend, cable, params)
         terms = [2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)]
-        return sum(terms, start=ca.SX.zeros(bend.shape))
+        return sum(terms, start=ca.SX(0))
 
-    def tangent(
-        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
-    ) -> ca.SX:
+    def tangent(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
         """dM/dk over EI: (1 + |k|/c)^-2."""
         return 1 / (1 + self._ratio(bend, cable, params)) ** 2
 

@@ -12,11 +12,9 @@ from math import pi
 from typing import ClassVar
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
-from dlo_casadi.chain import Curve
 from dlo_casadi.parameters import Parameter
+from dlo_casadi.rod.element import Cell
 
 Params = Mapping[str, ca.SX]
 
@@ -70,6 +68,14 @@ class EndConditions:
 
 
 @dataclass(frozen=True)
+class PointForceAt:
+    """A dead force (dimension,) [N] on the cable at the arc length `position` [m]."""
+
+    force: ca.SX
+    position: ca.SX
+
+
+@dataclass(frozen=True)
 class Effect:
     """Something that acts on a cable. Subclasses fill the slot that gives them their base.
 
@@ -102,33 +108,25 @@ class SectionLaw(Effect):
     # Whether the law is the same all along the cable.
     even: ClassVar[bool] = False
 
-    def factor(
-        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
-    ) -> ca.SX:
-        """Factor on the bending energy EI/2 (curvature - rest curvature)^2 of each cell.
+    def factor(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+        """Factor on the bending energy EI/2 (curvature - rest curvature)^2 of a cell.
 
         Parameters
         ----------
-        bend : (n_cells,) [1/m]
+        bend : scalar [1/m]
             Curvature minus rest curvature.
-        cells : (n_cells, 2) [m]
-            From where to where each cell reaches.
-
-        Returns
-        -------
-        (n_cells,) [1]
+        cell : Cell
+            From where to where it reaches.
         """
         raise TypeError(f"{self.name} has no section law")
 
-    def tangent(
-        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
-    ) -> ca.SX:
-        """Factor on the stiffness against a small change of the bend, shaped as `factor`.
+    def tangent(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+        """Factor on the stiffness against a small change of the bend.
 
-        Only the bow of quadratic elements asks for it, of laws that are the same all along the
+        Only the inner unknowns of elements ask for it, of laws that are the same all along the
         cable, so that it may be approximate.
         """
-        return self.factor(bend, cells, cable, params)
+        return self.factor(bend, cell, cable, params)
 
 
 class Kinematics(Effect):
@@ -155,9 +153,17 @@ class Load(Effect):
         """Return the direction and size of gravity (2,) [m/s^2] that every weight feels."""
         return gravity
 
-    def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX | float:
-        """Potential energy of the load [J]."""
+    def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX | float:
+        """Force (dimension,) [N] of what is spread along the cable, on its part beyond s [m].
+
+        A dead load has the energy V = - int resultant . dr/ds ds, up to the start's place: a sum
+        over elements, whatever the load.
+        """
         return 0.0
+
+    def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
+        """Forces of the load on single places of the cable."""
+        return ()
 
 
 class BoundaryEffect(Effect):
@@ -169,8 +175,8 @@ class BoundaryEffect(Effect):
         """Change the end conditions. Changes are applied in the order of the model's effects."""
         return ends
 
-    def energy(self, curve: Curve, params: Params) -> ca.SX | float:
-        """Energy stored in the holders [J]. Energies add."""
+    def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX | float:
+        """Energy stored in the holders [J], by the cable's directions there. Energies add."""
         return 0.0
 
 
@@ -198,5 +204,5 @@ class StateEffect(Effect):
     slot: ClassVar[str] = "state"
 
     def next_rest(self, rest: ca.SX, curvature: ca.SX, params: Params) -> ca.SX:
-        """Rest curvature (n_cells,) [1/m] after a pose of this curvature has been held."""
+        """Rest curvature [1/m] of a cell after a pose of this curvature has been held."""
         raise TypeError(f"{self.name} has no law of the state")

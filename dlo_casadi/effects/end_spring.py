@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.chain import Curve
 from dlo_casadi.effects.effect import BoundaryEffect, Cable, Params
 from dlo_casadi.parameters import Parameter
 
@@ -39,9 +38,9 @@ class StartSpring(_PinSpring):
 
     name = "start_spring"
 
-    def energy(self, curve: Curve, params: Params) -> ca.SX:
+    def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX:
         """Energy of the spring [J]."""
-        return self._spring(curve.start_direction, params)
+        return self._spring(start_heading, params)
 
 
 class EndSpring(_PinSpring):
@@ -49,6 +48,6 @@ class EndSpring(_PinSpring):
 
     name = "end_spring"
 
-    def energy(self, curve: Curve, params: Params) -> ca.SX:
+    def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX:
         """Energy of the spring [J]."""
-        return self._spring(curve.end_direction, params)
+        return self._spring(end_heading, params)

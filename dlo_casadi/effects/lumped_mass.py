@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.chain import Curve
-from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.effects.effect import Cable, Load, Params, PointForceAt
 from dlo_casadi.parameters import Parameter
 
 
@@ -45,6 +44,6 @@ class LumpedMass(Load):
             ),
         )
 
-    def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
-        """Potential energy of the mass [J]."""
-        return -params["mass"] * ca.dot(gravity, curve.position(params["position"]))
+    def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
+        """Weight of the mass."""
+        return (PointForceAt(params["mass"] * gravity, params["position"]),)

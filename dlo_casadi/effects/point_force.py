@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.chain import Curve
-from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.effects.effect import Cable, Load, Params, PointForceAt
 from dlo_casadi.parameters import Parameter
 
 
@@ -41,7 +40,6 @@ class PointForce(Load):
             ),
         )
 
-    def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
-        """Potential energy of the force [J]."""
-        force = ca.vertcat(params["fx"], params["fy"])
-        return -ca.dot(force, curve.position(params["position"]))
+    def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
+        """The force."""
+        return (PointForceAt(ca.vertcat(params["fx"], params["fy"]), params["position"]),)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.chain import Curve
 from dlo_casadi.effects.effect import Cable, Load, Params
 from dlo_casadi.parameters import Parameter
 
@@ -35,6 +34,6 @@ class SideLoad(Load):
             ),
         )
 
-    def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
-        """Potential energy of the load [J]."""
-        return -params["force_per_length"] * curve.first_moment[0]
+    def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Force on the part beyond s."""
+        return params["force_per_length"] * (cable.length - s) * ca.vertcat(1, 0)

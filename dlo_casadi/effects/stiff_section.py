@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from dlo_casadi.effects.effect import Cable, Params, SectionLaw
 from dlo_casadi.parameters import Parameter
+from dlo_casadi.rod.element import Cell
 
 
 class StiffSection(SectionLaw):
@@ -37,17 +36,14 @@ class StiffSection(SectionLaw):
             Parameter("factor", nominal=1.0, scale=0.5, lower=0.02, upper=100.0),
         )
 
-    def factor(
-        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
-    ) -> ca.SX:
-        """Harmonic mean of the stiffness over each cell."""
-        low, high = ca.DM(cells[:, 0]), ca.DM(cells[:, 1])
-        rounding = 0.25 * float((cells[:, 1] - cells[:, 0]).max())
+    def factor(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+        """Harmonic mean of the stiffness over the cell."""
+        low, high, rounding = cell.low, cell.high, 0.25 * cell.mesh
 
         def ramp(x: ca.SX) -> ca.SX:
             return (x + ca.sqrt(x * x + rounding**2)) / 2
 
         start, end = params["start"], params["end"]
         covered = ramp(high - start) - ramp(low - start) - ramp(high - end) + ramp(low - end)
-        share = covered / (high - low)
+        share = covered / cell.width
         return 1 / (1 + share * (1 / params["factor"] - 1))

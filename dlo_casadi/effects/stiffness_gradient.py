@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
 from dlo_casadi.effects.effect import Cable, Params, SectionLaw
 from dlo_casadi.parameters import Parameter
+from dlo_casadi.rod.element import Cell
 
 
 class StiffnessGradient(SectionLaw):
@@ -27,8 +26,6 @@ class StiffnessGradient(SectionLaw):
         """Declare the slope."""
         return (Parameter("slope", scale=0.2, lower=-0.95, upper=0.95),)
 
-    def factor(
-        self, bend: ca.SX, cells: NDArray[np.floating], cable: Cable, params: Params
-    ) -> ca.SX:
-        """Mean of the linear stiffness over each cell."""
-        return 1 + params["slope"] * ca.DM(cells.mean(axis=1) * 2 / cable.length - 1)
+    def factor(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+        """Mean of the linear stiffness over the cell."""
+        return 1 + params["slope"] * (cell.middle * 2 / cable.length - 1)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.chain import Curve
-from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.effects.effect import Cable, Load, Params, PointForceAt
 from dlo_casadi.parameters import Parameter
 
 
@@ -40,7 +39,7 @@ class UnknownPull(Load):
             ),
         )
 
-    def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX:
-        """Potential energy of the force [J]."""
+    def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
+        """The force of this pose."""
         force = ca.vertcat(params["fx"] + params["pull_x"], params["fy"] + params["pull_y"])
-        return -ca.dot(force, curve.position(params["position"]))
+        return (PointForceAt(force, params["position"]),)

@@ -1,0 +1,277 @@
+"""Symmetric block-tridiagonal matrices with a border, of many poses at once.
+
+    [ A    B ] [ x ]   [ f ]
+    [ B^T  C ] [ y ] = [ g ]
+
+A couples neighbouring nodes, B and C belong to the unknowns of the whole pose: multipliers of the
+end conditions. Block cyclic reduction eliminates every other node, log2(n) times, so that the work
+grows linearly with the nodes and all poses and nodes of a level are one array operation. It is a
+congruence of A: the signs of the pivots give the inertia (Sylvester, Haynsworth).
+
+References
+----------
+Heller, SIAM J. Numer. Anal. 13 (1976); Haynsworth, Linear Algebra Appl. 1 (1968).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.floating]
+BoolArray = NDArray[np.bool_]
+
+# A pivot below this share of the largest entry is moved by this share: the square root of
+# rounding loses half of the digits, which one step of refinement wins back.
+LEAST_PIVOT = 1e-8
+# Steps of iterative refinement at most, and the relative residual at which they end.
+REFINEMENTS = 3
+RESIDUAL = 1e-13
+# Pivots within this share of their row's largest entry are zero: rounding of the elimination.
+ZERO_PIVOT = 1e-13
+
+
+@dataclass(frozen=True)
+class Vector:
+    """Right-hand sides or solutions: `x` (m, n, b, q) of the nodes, `y` (m, k, q) of the border."""
+
+    x: FloatArray
+    y: FloatArray
+
+    def __add__(self, other: Vector) -> Vector:
+        return Vector(self.x + other.x, self.y + other.y)
+
+    def __sub__(self, other: Vector) -> Vector:
+        return Vector(self.x - other.x, self.y - other.y)
+
+    @property
+    def size(self) -> FloatArray:
+        """Largest entry of each pose and column (m, q)."""
+        inner = np.abs(self.x).max(axis=(1, 2))
+        return np.maximum(inner, np.abs(self.y).max(axis=1, initial=0.0))
+
+    @classmethod
+    def of(cls, rows: FloatArray, n: int, b: int) -> Vector:
+        """Rows (m, n b + k, q): those of the nodes, then those of the border."""
+        m, _, q = rows.shape
+        return cls(rows[:, : n * b].reshape((m, n, b, q)), rows[:, n * b :])
+
+    @property
+    def rows(self) -> FloatArray:
+        """All rows (m, n b + k, q), as given to `of`."""
+        m, n, b, q = self.x.shape
+        return np.concatenate([self.x.reshape((m, n * b, q)), self.y], axis=1)
+
+
+def _product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Product of stacks of small blocks; blocks of one number are plain factors."""
+    return a * b if a.shape[-2:] == (1, 1) else a @ b
+
+
+def _transposed(a: FloatArray) -> FloatArray:
+    return np.swapaxes(a, -1, -2)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """One reduction: inverse pivots of the odd nodes and their couplings to both sides."""
+
+    inverse: FloatArray
+    left: FloatArray  # (m, odd, b, b): rows of the node before, columns of the odd node
+    right: FloatArray  # (m, odd or one less, b, b): rows of the odd node, columns of the next
+
+
+@dataclass(frozen=True)
+class BandMatrix:
+    """Matrices of m poses.
+
+    Parameters
+    ----------
+    diagonal : (m, n, b, b)
+    upper : (m, n - 1, b, b)
+        Rows of a node, columns of the next one.
+    border : (m, n, b, k)
+    corner : (m, k, k)
+    """
+
+    diagonal: FloatArray
+    upper: FloatArray
+    border: FloatArray
+    corner: FloatArray
+
+    def subset(self, index: NDArray[np.intp] | BoolArray) -> BandMatrix:
+        """Matrices of some of the poses."""
+        return BandMatrix(
+            self.diagonal[index], self.upper[index], self.border[index], self.corner[index]
+        )
+
+    def with_border(self, columns: FloatArray) -> BandMatrix:
+        """Return the matrices with more conditions, columns (m, n, b, k'), in the border."""
+        m, _, _, k = self.border.shape
+        more = columns.shape[3]
+        corner = np.zeros((m, k + more, k + more))
+        corner[:, :k, :k] = self.corner
+        return BandMatrix(
+            self.diagonal, self.upper, np.concatenate([self.border, columns], axis=3), corner
+        )
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """Largest entry of the diagonal blocks (m,)."""
+        return np.maximum(np.abs(self.diagonal).max(axis=(1, 2, 3)), 1e-300)
+
+    def apply(self, vector: Vector) -> Vector:
+        """Products of the matrices with (m, n, b, q), (m, k, q)."""
+        x = _product(self.diagonal, vector.x)
+        x[:, :-1] += _product(self.upper, vector.x[:, 1:])
+        x[:, 1:] += _product(_transposed(self.upper), vector.x[:, :-1])
+        if not self.corner.shape[1]:
+            return Vector(x, vector.y)
+        x += self.border @ vector.y[:, None]
+        m, n, b, k = self.border.shape
+        flat = self.border.reshape((m, n * b, k))
+        across = _transposed(flat) @ vector.x.reshape((m, n * b, -1))
+        return Vector(x, across + self.corner @ vector.y)
+
+    def dense(self) -> FloatArray:
+        """Full matrices (m, n b + k, n b + k)."""
+        m, n, b, k = self.border.shape
+        full = np.zeros((m, n * b + k, n * b + k))
+        for i in range(n):
+            here, after = slice(i * b, (i + 1) * b), slice((i + 1) * b, (i + 2) * b)
+            full[:, here, here] = self.diagonal[:, i]
+            if i + 1 < n:
+                full[:, here, after] = self.upper[:, i]
+                full[:, after, here] = _transposed(self.upper[:, i])
+        full[:, : n * b, n * b :] = self.border.reshape((m, n * b, k))
+        full[:, n * b :, : n * b] = _transposed(full[:, : n * b, n * b :])
+        full[:, n * b :, n * b :] = self.corner
+        return full
+
+    def factor(self) -> BandFactor:
+        """Eliminate the nodes."""
+        return BandFactor(self)
+
+
+class BandFactor:
+    """The elimination of a `BandMatrix`, to solve with and to read the inertia from."""
+
+    def __init__(self, matrix: BandMatrix) -> None:
+        self.matrix = matrix
+        self._least = LEAST_PIVOT * matrix.scale[:, None, None, None]
+        self._levels: list[_Level] = []
+        self._pivots: list[FloatArray] = []
+        diagonal, upper = matrix.diagonal, matrix.upper
+        while diagonal.shape[1] > 1:
+            level = self._eliminate(diagonal[:, 1::2], upper)
+            diagonal, upper = self._reduced(diagonal, level)
+        self._top = self._inverse(diagonal)
+        # Border columns eliminated once: their solution serves every right-hand side.
+        self._arm = self._nodes(matrix.border)
+        m, n, b, k = matrix.border.shape
+        flat = matrix.border.reshape((m, n * b, k))
+        self.schur = matrix.corner - _transposed(flat) @ self._arm.reshape((m, n * b, k))
+
+    def _inverse(self, pivots: FloatArray) -> FloatArray:
+        """Inverses of pivots (m, h, b, b); those that are all but singular are moved a little."""
+        self._pivots.append(pivots)
+        b = pivots.shape[-1]
+        if b == 1:
+            small = np.abs(pivots) < self._least
+            return 1 / np.where(small, np.where(pivots < 0, -1, 1) * self._least, pivots)
+        values, vectors = np.linalg.eigh(pivots)
+        least = self._least[..., 0]
+        small = np.abs(values) < least
+        values = np.where(small, np.where(values < 0, -1, 1) * least, values)
+        return np.asarray((vectors / values[..., None, :]) @ _transposed(vectors))
+
+    def _eliminate(self, pivots: FloatArray, upper: FloatArray) -> _Level:
+        level = _Level(self._inverse(pivots), upper[:, 0::2], upper[:, 1::2])
+        self._levels.append(level)
+        return level
+
+    @staticmethod
+    def _reduced(diagonal: FloatArray, level: _Level) -> tuple[FloatArray, FloatArray]:
+        """Diagonal and couplings of the even nodes without the odd ones."""
+        even = diagonal[:, 0::2].copy()
+        odd, inner = level.left.shape[1], level.right.shape[1]
+        to_left = _product(level.left, level.inverse)
+        even[:, :odd] -= _product(to_left, _transposed(level.left))
+        to_right = _product(_transposed(level.right), level.inverse[:, :inner])
+        even[:, 1 : inner + 1] -= _product(to_right, level.right)
+        return even, -_product(to_left[:, :inner], level.right)
+
+    def _nodes(self, f: FloatArray) -> FloatArray:
+        """Solve A x = f for columns (m, n, b, q)."""
+        halves: list[tuple[FloatArray, FloatArray]] = []
+        for level in self._levels:
+            even, odd = f[:, 0::2].copy(), f[:, 1::2]
+            count, inner = level.left.shape[1], level.right.shape[1]
+            taken = _product(level.inverse, odd)
+            even[:, :count] -= _product(level.left, taken)
+            even[:, 1 : inner + 1] -= _product(_transposed(level.right), taken[:, :inner])
+            halves.append((taken, even))
+            f = even
+        x = _product(self._top, f)
+        for level, (taken, even) in zip(self._levels[::-1], halves[::-1], strict=True):
+            count, inner = level.left.shape[1], level.right.shape[1]
+            pull = _product(_transposed(level.left), x[:, :count])
+            pull[:, :inner] += _product(level.right, x[:, 1 : inner + 1])
+            out = np.empty((*even.shape[:1], even.shape[1] + count, *even.shape[2:]))
+            out[:, 0::2], out[:, 1::2] = x, taken - _product(level.inverse, pull)
+            x = out
+        return x
+
+    def _once(self, right: Vector) -> Vector:
+        x = self._nodes(right.x)
+        m, n, b, k = self.matrix.border.shape
+        if not k:
+            return Vector(x, right.y)
+        flat = self.matrix.border.reshape((m, n * b, k))
+        gap = right.y - _transposed(flat) @ x.reshape((m, n * b, -1))
+        y = np.linalg.solve(self._held, gap)
+        return Vector(x - self._arm @ y[:, None], y)
+
+    @cached_property
+    def _held(self) -> FloatArray:
+        """The Schur complement, kept away from singular."""
+        size = np.maximum(np.abs(np.diagonal(self.schur, axis1=1, axis2=2)), 1e-300)
+        return self.schur - 1e-16 * size[:, None, :] * np.eye(self.schur.shape[1])
+
+    def solve(self, right: Vector) -> Vector:
+        """Solution of each pose for columns (m, n, b, q), (m, k, q), refined to rounding.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If a matrix is singular.
+        """
+        found = self._once(right)
+        size = right.size
+        before = np.inf
+        for _ in range(REFINEMENTS):
+            left = right - self.matrix.apply(found)
+            worst = float((left.size / np.maximum(size, 1e-300)).max(initial=0.0))
+            if not RESIDUAL < worst < before:
+                break
+            before = worst
+            found = found + self._once(left)
+        return found
+
+    @cached_property
+    def negative(self) -> NDArray[np.intp]:
+        """Number of negative eigenvalues of each matrix (m,), border included; -1 if singular."""
+        total = np.zeros(len(self.schur), dtype=np.intp)
+        singular = np.zeros(len(self.schur), dtype=bool)
+        for pivots in self._pivots:
+            values = pivots[..., 0, 0] if pivots.shape[-1] == 1 else np.linalg.eigvalsh(pivots)
+            total += (values.reshape((len(total), -1)) < 0).sum(axis=1)
+        if self.schur.shape[1]:
+            size = np.sqrt(np.maximum(np.abs(np.diagonal(self.schur, axis1=1, axis2=2)), 1e-300))
+            values = np.linalg.eigvalsh(self.schur / (size[:, :, None] * size[:, None, :]))
+            total += (values < 0).sum(axis=1)
+            singular = np.abs(values).min(axis=1) < ZERO_PIVOT
+        return np.where(singular, -1, total)

@@ -1,0 +1,114 @@
+"""A cable cut into elements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.errors import DloError
+from dlo_casadi.rod.arc import Arc
+from dlo_casadi.rod.element import Element, Layout
+from dlo_casadi.rod.link import Link
+from dlo_casadi.rod.quadratic import Quadratic
+
+FloatArray = NDArray[np.floating]
+
+ELEMENTS: dict[str, Element] = {element.name: element for element in (Quadratic(), Arc(), Link())}
+DEFAULT_ELEMENT = "quadratic"
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A cable cut into n equal elements.
+
+    Parameters
+    ----------
+    length : float [m]
+        Declared length along the cable.
+    n : int
+        Number of elements, >= 2.
+    element : str
+        A name of ELEMENTS.
+    start_clamped, end_clamped : bool
+    """
+
+    length: float
+    n: int
+    element: str = DEFAULT_ELEMENT
+    start_clamped: bool = False
+    end_clamped: bool = False
+
+    def __post_init__(self) -> None:
+        if self.n < 2:
+            raise DloError(f"a chain needs at least 2 elements, got n = {self.n}")
+        if self.element not in ELEMENTS:
+            raise DloError(f"element {self.element!r} is not known; use one of {tuple(ELEMENTS)}")
+
+    @property
+    def kind(self) -> Element:
+        """What the chain is made of."""
+        return ELEMENTS[self.element]
+
+    @property
+    def h(self) -> float:
+        """Length of one element [m]."""
+        return self.length / self.n
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Nodes, slots and stations."""
+        return self.kind.layout(self.length, self.n, (self.start_clamped, self.end_clamped))
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes."""
+        return len(self.layout.nodes)
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots: the nodes, or one less."""
+        return len(self.layout.slots)
+
+    @property
+    def places(self) -> FloatArray:
+        """Arc lengths (n_nodes,) [m] of the nodes."""
+        return self.layout.nodes
+
+    @property
+    def cells(self) -> FloatArray:
+        """Bending cells (n_cells, 2) [m]: where each discrete strain acts, from s0 to s1."""
+        return self.layout.cells
+
+    @property
+    def n_cells(self) -> int:
+        """Number of bending cells."""
+        return len(self.cells)
+
+    @cached_property
+    def rest_of_slots(self) -> FloatArray:
+        """Rest curvature inside each slot (n_slots, 3, n_cells) from the means over the cells.
+
+        From the means m over a cell and its neighbours, for x from -1/2 to 1/2,
+
+            kappa_0(x) = m_e + a x + c (x^2 - 1/12),
+            a = (m_(e+1) - m_(e-1)) / 2,   c = (m_(e+1) - 2 m_e + m_(e-1)) / 2
+
+        which is exact for parabolas on equal cells. The first and last cell continue their
+        neighbour's.
+        """
+        count = self.n_cells
+        out = np.zeros((self.n_slots, 3, count))
+        for e, j in enumerate(self.layout.bends):
+            out[j, 0, e] = 1.0
+            if count < 3:
+                out[j, 1] = [-1.0, 1.0] if count == 2 else 0.0
+                continue
+            middle = min(max(e, 1), count - 2)
+            around = slice(middle - 1, middle + 2)
+            out[j, 2, around] = [0.5, -1.0, 0.5]
+            out[j, 1, around] = [-0.5, 0.0, 0.5]
+            out[j, 1] += 2 * (e - middle) * out[j, 2]
+        return out

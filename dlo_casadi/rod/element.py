@@ -1,0 +1,230 @@
+"""The contract of an element: what a slot of the chain, between two nodes, adds to the Lagrangian.
+
+A chain of N nodes has S slots, N - 1 or N; slot j joins the nodes j and j + 1. Everything that
+the rod's energy and its shape are made of is a sum over slots, so that derivatives couple
+neighbouring nodes only.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.rod.node import Node
+
+FloatArray = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The stretch of cable that one strain stands for: `width` [m] from `low` [m] on.
+
+    `mesh` [m] is the largest width of such a cell, by which kinks are rounded.
+    """
+
+    low: ca.SX
+    width: ca.SX
+    mesh: float
+
+    @property
+    def middle(self) -> ca.SX:
+        """Arc length of its middle [m]."""
+        return self.low + self.width / 2
+
+    @property
+    def high(self) -> ca.SX:
+        """Arc length of its end [m]."""
+        return self.low + self.width
+
+    @property
+    def halves(self) -> tuple[Cell, Cell]:
+        """The two halves."""
+        half = self.width / 2
+        return Cell(self.low, half, self.mesh / 2), Cell(self.middle, half, self.mesh / 2)
+
+
+class Law(Protocol):
+    """A section law with its parameters: factors on the bending energy, see `SectionLaw`."""
+
+    even: bool
+
+    def factor(self, bend: ca.SX, cell: Cell) -> ca.SX:
+        """Factor on EI/2 bend^2."""
+
+    def tangent(self, bend: ca.SX, cell: Cell) -> ca.SX:
+        """Factor on the stiffness against a small change of the bend."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the nodes and slots of a chain are.
+
+    Parameters
+    ----------
+    nodes : (N,) [m]
+        Arc lengths of the nodes.
+    slots : (S, 5) [m, m, m, m, 1]
+        Of each slot: start and length of the cable that it advances along, start and width of
+        its bending cell, and whether it has one (1 or 0).
+    stations : (n + 1, 2) int
+        Nodes whose mean direction is the cable's at each element boundary.
+    """
+
+    nodes: FloatArray
+    slots: FloatArray
+    stations: NDArray[np.intp]
+
+    @property
+    def bends(self) -> NDArray[np.intp]:
+        """Slots that have a bending cell, in order."""
+        return np.flatnonzero(self.slots[:, 4])
+
+    @property
+    def cells(self) -> FloatArray:
+        """Bending cells (n_cells, 2) [m]."""
+        low, width = self.slots[self.bends, 2:4].T
+        return np.stack([low, low + width], axis=1)
+
+    @property
+    def advancing(self) -> NDArray[np.intp]:
+        """Slots whose ends are element boundaries, in order (n,)."""
+        return np.flatnonzero(self.slots[:, 1])
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Symbols of one slot.
+
+    Parameters
+    ----------
+    first, last : (coordinates,)
+        Its nodes.
+    rest : (3,) [1/m]
+        Rest curvature of the cell: mean, and linear and quadratic variation inside.
+    place : (5,)
+        A row of `Layout.slots`.
+    mesh : float [m]
+        Declared length of an element.
+    stretch : scalar
+        True length over declared length, the same everywhere.
+    ratio : scalar
+        Of this slot, stretching under tension included.
+    inner : (n_inner,)
+        Unknowns inside the element.
+    square : scalar
+        What stands for the square of the inner unknown.
+    """
+
+    first: ca.SX
+    last: ca.SX
+    rest: ca.SX
+    place: ca.SX
+    mesh: float
+    stretch: ca.SX
+    ratio: ca.SX
+    inner: ca.SX
+    square: ca.SX
+
+    @property
+    def start(self) -> ca.SX:
+        """Arc length at which it starts [m]."""
+        return self.place[0]
+
+    @property
+    def length(self) -> ca.SX:
+        """Declared length of the cable that it advances along [m]."""
+        return self.place[1]
+
+    @property
+    def cell(self) -> Cell:
+        """Its bending cell."""
+        return Cell(self.place[2], self.place[3], self.mesh)
+
+    @property
+    def has_cell(self) -> ca.SX:
+        """1 with a bending cell, 0 without."""
+        return self.place[4]
+
+
+@dataclass(frozen=True)
+class Condensed:
+    """A Lagrangian with the inner unknowns eliminated, and what they are."""
+
+    lagrangian: ca.SX
+    inner: ca.SX
+    square: ca.SX
+
+
+class Element(ABC):
+    """One way to interpolate the rod between nodes.
+
+    Attributes
+    ----------
+    name : str
+    node : Node
+        What its nodes carry.
+    order : int
+        Order of the shape's error in the element's length, measured.
+    smooth : bool
+        Whether the cable has a tangent at element boundaries: its curve is then interpolated with
+        it, else by chords.
+    n_inner : int
+        Number of unknowns inside an element that are eliminated from it.
+    rule : (nodes, weights)
+        Quadrature on [0, 1] along the element.
+    """
+
+    name: ClassVar[str]
+    node: ClassVar[type[Node]]
+    order: ClassVar[int]
+    smooth: ClassVar[bool]
+    n_inner: ClassVar[int] = 0
+    rule: ClassVar[tuple[FloatArray, FloatArray]]
+
+    @abstractmethod
+    def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
+        """Nodes and slots of a cable of n elements; `clamped`: its start, its end."""
+
+    @abstractmethod
+    def strain(self, slot: Slot) -> ca.SX:
+        """Mean curvature of the cell [1/m]; 0 without one."""
+
+    @abstractmethod
+    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+        """Derivative of position by s (dimension,) [1] at the fraction u of the element."""
+
+    def advance(self, slot: Slot, u: ca.SX | float = 1.0) -> ca.SX:
+        """Vector (dimension,) [m] from the start of the element to the fraction u of it."""
+        parts = [
+            weight * self.tangent(slot, u * node)
+            for node, weight in zip(*self.rule, strict=True)
+        ]
+        return slot.length * u * sum(parts[1:], start=parts[0])
+
+    def bending(self, slot: Slot, stiffness: ca.SX, laws: Sequence[Law]) -> ca.SX:
+        """Bending energy [J]: of the cell's mean bend, EI/2 (curvature - rest curvature)^2."""
+        bend = self.bend(slot)
+        density = stiffness / 2 * bend**2
+        for law in laws:
+            density = density * law.factor(bend, slot.cell)
+        return slot.has_cell * slot.cell.width * density * slot.stretch
+
+    def bend(self, slot: Slot) -> ca.SX:
+        """Curvature minus rest curvature of the cell [1/m]."""
+        return self.strain(slot) - slot.rest[0]
+
+    def condensed(
+        self, slot: Slot, lagrangian: ca.SX, bending: Callable[[Slot], ca.SX]
+    ) -> Condensed:
+        """Eliminate the inner unknowns from the slot's Lagrangian, which is given with them."""
+        return Condensed(lagrangian, slot.inner, slot.square)
+
+    def expanded(self, slot: Slot, energy: ca.SX) -> ca.SX:
+        """Energy that is minimised over the inner unknowns; the same minimum as `condensed`."""
+        return energy

@@ -1,0 +1,85 @@
+"""Arcs that bow: elements of fourth order whose bow is eliminated inside the element."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from dlo_casadi.rod.arc import Arc
+from dlo_casadi.rod.element import Condensed, Law, Slot
+from dlo_casadi.rod.node import Heading
+
+
+class Quadratic(Arc):
+    """An arc whose heading in the middle lies by the angle `bow` beyond the mean of its ends.
+
+    Positions and energy are taken to second order in the bow, which leaves out what is of fourth
+    order in the element's length. The bow is the minimum for given nodes and multipliers.
+    """
+
+    name = "quadratic"
+    order = 4
+    n_inner = 1
+
+    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+        """The arc's, turned by the bow to second order."""
+        c, s = ca.vertsplit(Heading.tangent(self.heading(slot, u)))
+        form = 4 * u * (1 - u)
+        across, back = form * slot.inner, form**2 * slot.square / 2
+        bowed = ca.vertcat(-across * s - back * c, across * c - back * s)
+        return slot.ratio * ca.vertcat(c, s) + slot.stretch * bowed
+
+    def bending(self, slot: Slot, stiffness: ca.SX, laws: Sequence[Law]) -> ca.SX:
+        """Energy of the mean bend and of the bow; uneven section laws by halves of the cell."""
+        bend, cell = self.bend(slot), slot.cell
+        density, tangent, uneven = stiffness / 2 * bend**2, ca.SX(1), ca.SX(0)
+        for law in laws:
+            if law.even:
+                density = density * law.factor(bend, cell)
+                tangent = tangent * law.tangent(bend, cell)
+                continue
+            first, second = (law.factor(bend, half) for half in cell.halves)
+            density = density * (first + second) / 2
+            tangent = tangent * (first + second) / 2
+            uneven += (first - second) / (first + second)
+        # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
+        bowed = 4 / np.sqrt(3) * slot.inner / (slot.length * slot.stretch)
+        # Where the halves resist differently, a mean bend bows the cell.
+        density += stiffness / 2 * tangent * (bowed**2 + 2 * uneven * bend * bowed)
+        return cell.width * density * slot.stretch
+
+    def condensed(
+        self, slot: Slot, lagrangian: ca.SX, bending: Callable[[Slot], ca.SX]
+    ) -> Condensed:
+        """Second-order minimum over the bow, its stiffness kept positive under compression."""
+        torque = ca.gradient(lagrangian, slot.inner)
+        elastic = ca.jacobian(ca.gradient(bending(slot), slot.inner), slot.inner)
+        whole = [lagrangian, torque, ca.jacobian(torque, slot.inner), elastic]
+        given, torque, stiffness, elastic = ca.substitute(whole, [slot.inner], [ca.SX(0)])
+        factor, slope = _stiffening(stiffness / elastic - 1)
+        bow = -torque / (elastic * factor)
+        return Condensed(given + torque * bow / 2, bow, bow**2 * slope)
+
+    def expanded(self, slot: Slot, energy: ca.SX) -> ca.SX:
+        """To second order in the bow, as in `condensed`."""
+        torque = ca.gradient(energy, slot.inner)
+        stiffness = ca.jacobian(torque, slot.inner)
+        zero = ca.SX(0)
+        given, torque, stiffness = ca.substitute(
+            [energy, torque, stiffness], [slot.inner], [zero]
+        )
+        return given + torque * slot.inner + stiffness * slot.inner**2 / 2
+
+
+def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Stiffness 1 + x of a bow under tension and its slope; compressed, x < 0, it stays above 1/4.
+
+    Elements of a limp cable would buckle one by one on the way to an equilibrium. Twice
+    differentiable, and 1 + x + O(x^3) everywhere.
+    """
+    a = 4 / 3 * ca.fmin(x, 0)
+    pressed = 1 - a + a**2
+    return ca.fmax(x, 0) + 0.25 + 0.75 / pressed, (1 - 2 * a) / pressed**2
