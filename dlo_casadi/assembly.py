@@ -8,14 +8,16 @@ the derivatives of both and of the measured curve.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.model import DEVIATIONS, CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
+
+if TYPE_CHECKING:
+    from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -29,7 +31,7 @@ class Shapes:
     x : (m, n_nodes, coordinates)
         States of the nodes: of a planar cable, headings [rad].
     lam : (m, n_conditions)
-    deviation : (m, len(DEVIATIONS))
+    deviation : (m, n_deviations)
         What is different in every pose, see `model.DEVIATIONS`.
     """
 
@@ -68,7 +70,7 @@ class Directions:
     """Directions of all that shapes depend on, q of them, of m poses.
 
     `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q), `rest`
-    (m, n_cells, q), `deviation` (m, len(DEVIATIONS), q).
+    (m, n_cells, q), `deviation` (m, n_deviations, q).
     """
 
     x: FloatArray

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
 from typing import Any, Literal
@@ -11,9 +11,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, clamped_headings
 from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.rod.band import BandMatrix, Vector
+from dlo_casadi.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
@@ -69,8 +72,8 @@ class Equilibrium:
 
     Parameters
     ----------
-    phi : (n_headings,) [rad]
-        Absolute headings.
+    x : (n_nodes, coordinates)
+        States of the nodes: of a planar cable, absolute headings [rad].
     points : (n + 1, 2) [m]
         Nodes from start to end.
     energy : float [J]
@@ -79,10 +82,10 @@ class Equilibrium:
     lam_start : (2,) [N]
         Force of the cable on whatever holds its start.
     moments : (2,) [N m]
-        Multipliers of clamped headings (start, end); zero at pins and for links.
+        Of the cable on its clamps (start, end); zero at pins.
     multipliers : (n_conditions,)
         All multipliers, in the order of `model.condition_names`.
-    bound_multipliers : (n_headings - 1,) [N m]
+    bound_multipliers : (n_nodes - 1,) [N m]
         Of the joint bounds; zero where a joint bends freely.
     curvature : (n_cells,) [1/m]
         Mean curvature of each bending cell.
@@ -95,7 +98,7 @@ class Equilibrium:
     iterations : int
     """
 
-    phi: FloatArray
+    x: FloatArray
     points: FloatArray
     energy: float
     lam: FloatArray
@@ -108,6 +111,16 @@ class Equilibrium:
     residual: float
     status: Status
     iterations: int
+
+    @property
+    def shapes(self) -> Shapes:
+        """As stacked unknowns of one pose, its ends where they are declared."""
+        return Shapes(self.x[None], self.multipliers[None], np.zeros((1, len(DEVIATIONS))))
+
+    @property
+    def phi(self) -> FloatArray:
+        """Absolute headings (n_nodes,) [rad] of a planar cable."""
+        return self.x[:, 0]
 
     @property
     def theta(self) -> FloatArray:
@@ -132,34 +145,6 @@ def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
     return 1 / max(largest, 1e-300)
 
 
-def is_stable(matrix: FloatArray, n_conditions: int) -> bool:
-    """Whether the reduced Hessian is positive definite, read off the KKT matrix's inertia.
-
-    A KKT matrix of full rank has as many negative eigenvalues as conditions if, and only if,
-    its Hessian is positive definite on the conditions' null space.
-
-    References
-    ----------
-    Gould, Mathematical Programming 32 (1985).
-    """
-    # Scaling by congruence leaves the inertia; forces and lengths differ by powers of ten.
-    inner = len(matrix) - n_conditions
-    scale = np.ones(len(matrix))
-    scale[:inner] = np.sqrt(_inverse_of_largest(matrix[:inner, :inner]))
-    give = np.sqrt(np.abs(np.diag(matrix)[inner:]))
-    conditions = np.column_stack([matrix[inner:, :inner] * scale[:inner], give])
-    scale[inner:] = _inverse_of_largest(conditions)
-    eigenvalues = np.linalg.eigvalsh((matrix + matrix.T) / 2 * np.outer(scale, scale))
-    floor = 1e-13 * np.abs(eigenvalues).max()
-    return int((eigenvalues < floor).sum()) == n_conditions
-
-
-def _inverse_of_largest(rows: FloatArray) -> FloatArray:
-    """1 / max|.| of each row, 1 for a row of zeros."""
-    largest = np.abs(rows).max(axis=1)
-    return 1 / np.where(largest > 0, largest, 1.0)
-
-
 # Minima of the potential and of the Lagrangian that lie within this are the same one [rad].
 NEARBY = 0.05
 NEWTON_STEPS = 8
@@ -170,12 +155,18 @@ AT_BOUND = 1e-6
 @lru_cache(maxsize=32)
 def _solver(key: int, holder: _Held) -> ca.Function:
     model = holder.model
-    x, parameters, energy, conditions = model.potential
-    bends = x[1 : model.chain.n_headings] - x[: model.chain.n_headings - 1]
+    problem, count = potential(model), model.chain.n_nodes
+    x = problem.coordinates
+    bends = x[1:count] - x[: count - 1]
     return ca.nlpsol(
         "equilibrium",
         "ipopt",
-        {"x": x, "p": parameters, "f": energy, "g": ca.vertcat(conditions, bends)},
+        {
+            "x": x,
+            "p": problem.parameters,
+            "f": problem.energy,
+            "g": ca.vertcat(problem.conditions, bends),
+        },
         {
             "print_time": False,
             "ipopt.print_level": 0,
@@ -222,7 +213,7 @@ def guesses(model: CableModel, pose: Pose, rest: FloatArray) -> list[FloatArray]
     three bows. A free end: along the start's direction, and hanging down.
     """
     chain = model.chain
-    places = chain.heading_places
+    places = chain.places
     start = np.array(pose.start)
     cells = chain.cells
     turn = np.concatenate([[0.0], np.cumsum(rest * np.diff(cells, axis=1).ravel())])
@@ -290,7 +281,7 @@ def solve_equilibrium(
     rest : (n_cells,) [1/m]
         Rest curvature of the bending cells: `model.rest_basis @ coefficients`.
     pose : Pose
-    phi_init : (n_headings,) [rad], optional
+    phi_init : (n_nodes,) [rad], optional
 
     Raises
     ------
@@ -336,35 +327,38 @@ def _from_start(
     """One IPOPT solve from one first guess, and Newton's method on the Lagrangian."""
     chain = model.chain
     solver = _solver(id(model), _Held(model))
-    ends = pose.vector
     deviation = np.zeros(len(DEVIATIONS))
-    n_bends = chain.n_headings - 1
-    x0 = np.concatenate([phi, np.zeros(model.n_inner)])
-    bounds = np.concatenate([np.zeros(model.n_conditions), np.full(n_bends, JOINT_BOUND)])
-    out = solver(x0=x0, p=np.concatenate([p, rest, ends, deviation]), lbg=-bounds, ubg=bounds)
+    given = Given.of(p, rest, pose.vector[None])
+    x0 = np.concatenate([phi, np.zeros(model.n_inner * chain.n_slots)])
+    bounds = np.zeros(model.n_conditions + chain.n_nodes - 1)
+    bounds[model.n_conditions :] = JOINT_BOUND
+    parameters = np.concatenate([p, rest, pose.vector, deviation])
+    out = solver(x0=x0, p=parameters, lbg=-bounds, ubg=bounds)
     stats = stats_of(solver)
-    phi = np.array(out["x"]).ravel()[: chain.n_headings]
     multipliers = np.array(out["lam_g"]).ravel()
-    given = (p, rest, ends, deviation)
+    start = Shapes(
+        np.array(out["x"]).ravel()[None, : chain.n_nodes, None],
+        multipliers[None, : model.n_conditions],
+        deviation[None],
+    )
     # Whatever IPOPT says of its end (on fine meshes of stiff cables its tolerance lies below
     # rounding), what counts is whether the shape that is returned balances.
-    found = _balanced(model, phi, multipliers, given)
-    phi, lam = found.phi, found.lam
-    energy, nodes = model.energy(phi, lam, *given)
-    if not found.holds or not np.isfinite(float(energy)):
+    found = _balanced(model, start, multipliers[model.n_conditions :], given)
+    energy = float(model.assembly.energy(found.shapes, given)[0])
+    if not found.holds or not np.isfinite(energy):
         status = Status.FAILED
     else:
         status = Status.STABLE if found.stable else Status.UNSTABLE
-    curvature = np.array(model.strain(phi, ends, deviation, p)).ravel()
-    end_force, moments = split_multipliers(model, lam)
+    curvature = model.assembly.strain(found.shapes, given)[0]
+    end_force, moments = split_multipliers(model, found.shapes.lam[0])
     return Equilibrium(
-        phi=phi,
-        points=np.array(nodes),
-        energy=float(energy),
+        x=found.shapes.x[0],
+        points=model.assembly.nodes(found.shapes, given)[0],
+        energy=energy,
         lam=end_force,
         lam_start=total_dead_load(model, p) - end_force,
         moments=moments,
-        multipliers=lam,
+        multipliers=found.shapes.lam[0],
         bound_multipliers=found.bound_lam,
         curvature=curvature,
         min_bend_radius=smallest_radius(curvature, chain.cells),
@@ -376,10 +370,9 @@ def _from_start(
 
 @dataclass(frozen=True)
 class _Balance:
-    """Where Newton's method has led: headings, multipliers, and whether it is an equilibrium."""
+    """Where Newton's method has led: the shape of one pose, and whether it is an equilibrium."""
 
-    phi: FloatArray
-    lam: FloatArray
+    shapes: Shapes
     bound_lam: FloatArray
     residual: float
     holds: bool
@@ -387,59 +380,69 @@ class _Balance:
 
 
 def _balanced(
-    model: CableModel, phi: FloatArray, multipliers: FloatArray, given: tuple[FloatArray, ...]
+    model: CableModel, shapes: Shapes, bound_multipliers: FloatArray, given: Given
 ) -> _Balance:
     """Newton's method from the potential's minimum, whose bows are stiff under compression too.
 
     Joints at their bound are held there; one whose multiplier pulls it back is let go.
     """
-    n, m = len(phi), model.n_conditions
-    lam, bound_lam = multipliers[:m], multipliers[m:]
-    bends = np.diff(phi)
+    bends = _bends(model, shapes)
     held = np.flatnonzero(np.abs(bends) > JOINT_BOUND - AT_BOUND)
     while True:
-        bound = np.copysign(JOINT_BOUND, bends[held])
-        arms = np.zeros((len(held), n + m))
-        arms[np.arange(len(held)), held] = -1.0
-        arms[np.arange(len(held)), held + 1] = 1.0
-        x = np.concatenate([phi, lam, bound_lam[held]])
+        bound, pulls = np.copysign(JOINT_BOUND, bends[held]), bound_multipliers[held]
+        now = shapes
         for _ in range(NEWTON_STEPS):
-            force, matrix = _bordered(model, x, arms, bound, given)
-            step = np.linalg.lstsq(matrix, -force, rcond=1e-14)[0]
-            if not np.abs(step[:n]).max() < NEARBY:
+            force, matrix = _bordered(model, now, held, bound, pulls, given)
+            step = matrix.factor().solve(Vector(-force.x, -force.y))
+            size = float(np.abs(step.x).max())
+            if not size < NEARBY:
                 break
-            x = x + step
-            if np.abs(step[:n]).max() < 1e-12:
+            now = replace(
+                now,
+                x=model.chain.kind.node.moved(now.x, step.x[..., 0]),
+                lam=now.lam + step.y[:, : model.n_conditions, 0],
+            )
+            pulls = pulls + step.y[0, model.n_conditions :, 0]
+            if size < 1e-12:
                 break
-        pulls = x[n + m :] * np.sign(bound)
-        if not np.any(pulls < 0):
+        if not np.any(pulls * np.sign(bound) < 0):
             break
-        held = held[pulls >= 0]
-    force, matrix = _bordered(model, x, arms, bound, given)
-    residual = float(np.abs(force[n:]).max(initial=0.0))
-    imbalance = float(np.abs(force[:n]).max())
-    bound_lam = np.zeros(n - 1)
-    bound_lam[held] = x[n + m :]
-    inside = bool(np.abs(np.diff(x[:n])).max() < JOINT_BOUND + AT_BOUND)
-    holds = imbalance <= BALANCE * np.abs(matrix[:n, :n]).max() and residual <= END_TOLERANCE
-    stable = bool(np.all(np.isfinite(matrix))) and is_stable(matrix, m + len(held))
-    return _Balance(x[:n], x[n : n + m], bound_lam, residual, holds and inside, stable)
+        held = held[pulls * np.sign(bound) >= 0]
+    force, matrix = _bordered(model, now, held, bound, pulls, given)
+    residual = float(np.abs(force.y).max(initial=0.0))
+    imbalance = float(np.abs(force.x).max())
+    bound_lam = np.zeros(len(bends))
+    bound_lam[held] = pulls
+    inside = bool(np.abs(_bends(model, now)).max() < JOINT_BOUND + AT_BOUND)
+    holds = imbalance <= BALANCE * float(matrix.scale[0]) and residual <= END_TOLERANCE
+    stable = np.isfinite(matrix.scale[0]) and (
+        int(matrix.factor().negative[0]) == model.n_conditions + len(held)
+    )
+    return _Balance(now, bound_lam, residual, holds and inside, bool(stable))
+
+
+def _bends(model: CableModel, shapes: Shapes) -> FloatArray:
+    """Angles (n_nodes - 1,) [rad] between neighbouring nodes of one pose."""
+    node = model.chain.kind.node
+    return node.difference(shapes.x[0, :-1], shapes.x[0, 1:])[:, 0]
 
 
 def _bordered(
     model: CableModel,
-    x: FloatArray,
-    arms: FloatArray,
+    shapes: Shapes,
+    held: NDArray[np.intp],
     bound: FloatArray,
-    given: tuple[FloatArray, ...],
-) -> tuple[FloatArray, FloatArray]:
-    """Stationarity and its Jacobian by (phi, lam, multipliers of the joints that are held)."""
-    size = arms.shape[1]
-    n = size - model.n_conditions
-    force, matrix = (np.array(block) for block in model.kkt(x[:n], x[n:size], *given))
-    whole = np.zeros((len(x), len(x)))
-    whole[:size, :size], whole[size:, :size], whole[:size, size:] = matrix, arms, arms.T
-    return np.concatenate([force.ravel() + arms.T @ x[size:], arms @ x[:size] - bound]), whole
+    pulls: FloatArray,
+    given: Given,
+) -> tuple[Vector, BandMatrix]:
+    """Imbalance and tangent with the joints that are held as further conditions."""
+    _, force, matrix = model.assembly.balance(shapes, given)
+    arms = np.zeros((1, model.chain.n_nodes, 1, len(held)))
+    arms[0, held, 0, np.arange(len(held))] = -1.0
+    arms[0, held + 1, 0, np.arange(len(held))] = 1.0
+    gap = (_bends(model, shapes)[held] - bound)[None, :, None]
+    whole = Vector(force.x + (arms @ pulls)[..., None], np.concatenate([force.y, gap], axis=1))
+    return whole, matrix.with_border(arms)
 
 
 def split_multipliers(model: CableModel, lam: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import Assembly
 from dlo_casadi.effects import (
     BoundaryEffect,
     Cable,
@@ -66,19 +67,6 @@ class _Law:
 
     def tangent(self, bend: ca.SX, cell: Cell) -> ca.SX:
         return self.effect.tangent(bend, cell, self.cable, self.params)
-
-
-@dataclass(frozen=True)
-class Potential:
-    """A minimisation over one pose: symbols (coordinates, parameters), energy [J], conditions.
-
-    The parameters stack p, rest curvature of the cells, ends, deviation.
-    """
-
-    coordinates: ca.SX
-    parameters: ca.SX
-    energy: ca.SX
-    conditions: ca.SX
 
 
 @dataclass(frozen=True)
@@ -440,6 +428,30 @@ class CableModel:
             total += effect.energy(first, last, local)
         return total - ca.dot(self._total_load, held.start)
 
+    @property
+    def n_inner(self) -> int:
+        """Number of unknowns of a slot in `slot_potential` beside its nodes."""
+        return int(self.extensible) + self.chain.kind.n_inner
+
+    @cached_property
+    def slot_potential(self) -> ca.Function:
+        """(x, lam, p, rest, place, deviation, inner) -> energy [J] to minimise, advance [m].
+
+        The unknowns inside are, for an extensible cable, a_e with the axial strain sqrt(C) a_e and
+        the energy h a_e^2 / 2, and the element's own.
+        """
+        kind, unknowns = self.chain.kind, ca.SX.sym("unknowns", self.n_inner)
+        ratio, axial = self._stretch, ca.SX(0)
+        if self.extensible:
+            axial = unknowns[0]
+            ratio = ratio + ca.sqrt(self._compliance) * axial
+        inner = ca.SX.sym("inner", kind.n_inner)
+        slot = self._slot(ratio, inner, inner**2)
+        energy = kind.expanded(slot, self._slot_energy(slot)) + self.chain.h * axial**2 / 2
+        own = unknowns[self.n_inner - kind.n_inner :]
+        outputs = ca.substitute([energy, kind.advance(slot)], [inner], [own])
+        return self._here("slot_potential", [*self._slot_arguments, unknowns], outputs)
+
     # ---- functions of a slot, an end, a node ---------------------------------------------------
 
     @property
@@ -574,65 +586,7 @@ class CableModel:
         load = ca.substitute(self._total_load, self._deviation, still)
         return ca.Function("dead_load", [self._p], [ca.densify(load)])
 
-    # ---- one pose as a whole, for IPOPT ---------------------------------------------------------
-
-    @property
-    def n_inner(self) -> int:
-        """Number of coordinates of `potential` beside the nodes."""
-        return self.chain.n_slots * (self.extensible + self.chain.kind.n_inner)
-
     @cached_property
-    def potential(self) -> Potential:
-        """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
-
-        The coordinates are the nodes', for an extensible cable one a_e per slot with the axial
-        strain sqrt(C) a_e and the energy h a_e^2 / 2, and the elements' inner unknowns.
-        """
-        kind, chain = self.chain.kind, self.chain
-        a, inner = ca.SX.sym("a", int(self.extensible)), ca.SX.sym("inner", kind.n_inner)
-        ratio = self._stretch
-        if self.extensible:
-            ratio = ratio + ca.sqrt(self._compliance) * a
-        slot = self._slot(ratio, inner, inner**2)
-        energy = kind.expanded(slot, self._slot_energy(slot)) + chain.h * ca.sumsqr(a) / 2
-        one = self._here(
-            "potential_slot",
-            [*self._slot_arguments, a, inner],
-            [energy, kind.advance(slot)],
-        )
-        count = chain.n_nodes * kind.node.coordinates
-        x = ca.SX.sym("x", count)
-        axial = ca.SX.sym("axial", chain.n_slots if self.extensible else 0)
-        bow = ca.SX.sym("inner", chain.n_slots * kind.n_inner)
-        rest = ca.SX.sym("kappa_0", chain.n_cells)
-        lam = ca.SX.zeros(self.n_conditions)
-        total, advance = ca.SX(0), ca.SX.zeros(kind.node.dimension)
-        for j, arguments in enumerate(self._slots_of(x, lam, rest)):
-            extra = [axial[j : j + 1] if self.extensible else axial, bow[j : j + kind.n_inner]]
-            one_energy, one_advance = one(*arguments, *extra)
-            total, advance = total + one_energy, advance + one_advance
-        ends, gradient, _ = self.at_ends(
-            self._both_ends(x), lam, self._p, self._ends, self._deviation
-        )
-        conditions = gradient[2 * kind.node.increment :]
-        if self.end != "free":
-            conditions[:2] += advance
-        parameters = ca.vertcat(self._p, rest, self._ends, self._deviation)
-        return Potential(ca.vertcat(x, axial, bow), parameters, total + ends, conditions)
-
-    def _both_ends(self, x: ca.SX) -> ca.SX:
-        c = self.chain.kind.node.coordinates
-        return ca.vertcat(x[:c], x[x.numel() - c :])
-
-    def _slots_of(self, x: ca.SX, lam: ca.SX, rest: ca.SX) -> list[list[ca.SX]]:
-        """Arguments of the functions of a slot, for every slot of a pose."""
-        chain = self.chain
-        c, last = chain.kind.node.coordinates, chain.n_nodes - 1
-        rows = []
-        for j in range(chain.n_slots):
-            k = min(j + 1, last)
-            both = ca.vertcat(x[j * c : (j + 1) * c], x[k * c : (k + 1) * c])
-            own = ca.DM(chain.rest_of_slots[j]) @ rest
-            place = ca.DM(chain.layout.slots[j])
-            rows.append([both, lam, self._p, own, place, self._deviation])
-        return rows
+    def assembly(self) -> Assembly:
+        """These functions evaluated for many poses."""
+        return Assembly(self)

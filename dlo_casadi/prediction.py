@@ -12,11 +12,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from dlo_casadi.assembly import Given
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium import Branch, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.observation import NodeCurve
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.report.drawing import prediction_figure
 from dlo_casadi.report.notebook import shape_html, shape_text
 from dlo_casadi.report.parameters_file import Parameters, load_parameters
@@ -249,9 +250,8 @@ def _curve(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, eq: Equilibrium
 ) -> CableCurve:
     """The curve as the session's camera would measure it."""
-    none = np.zeros(len(DEVIATIONS))
-    z = model.shape(eq.phi, eq.multipliers, p, rest, pose.vector, none)
-    return CableCurve.of(model.chain, np.array(z).ravel())
+    z = model.assembly.curve(eq.shapes, Given.of(p, rest, pose.vector[None]))[0]
+    return CableCurve.of(model.cable.length, z)
 
 
 def _true_curve(

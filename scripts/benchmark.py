@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from benchmarks import fleet, memory, peers, random_cables, speed
 
-from dlo_casadi.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS
 
 PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory", "peers", "fleet")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from dlo_casadi.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, print_json
 from dlo_casadi.codegen import generate

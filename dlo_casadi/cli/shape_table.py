@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from dlo_casadi.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.cli.counter import Counter
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import add_jobs, command, console, print_json

@@ -15,17 +15,17 @@ Beirami et al., On optimal generalizability in parametric learning, NeurIPS 2017
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import ttest_1samp
 
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sweep import Shapes
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
 
@@ -141,7 +141,7 @@ def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[N
     problem, sweep = fit.problem, fit.problem.sweep
     unknowns, model = problem.unknowns, fit.model
     shapes = fit.point.shapes
-    plain = Shapes(shapes.phi, shapes.lam, np.zeros_like(shapes.deviation))
+    plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
     if model.has_state:
         folds = map_in_order(executor, partial(_predict_all, fit, plain), thetas)
         return [curves[j] for j, curves in zip(problem.used, folds, strict=True)]
@@ -150,8 +150,8 @@ def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[N
     for j, theta in zip(problem.used, thetas, strict=True):
         p[j], rest[j] = unknowns.p(theta), unknowns.rest(theta)
     solved, converged = sweep.solve(plain, p, rest)
-    z = sweep.shapes_seen(solved, p, rest)
-    return [NodeCurve.of(model.chain, z[j]) if converged[j] else None for j in problem.used]
+    z = sweep.seen(solved, p, rest)
+    return [problem.curve_of(z[j]) if converged[j] else None for j in problem.used]
 
 
 def _predict_all(fit: Fit, plain: Shapes, theta: FloatArray) -> list[NodeCurve | None]:
@@ -161,7 +161,7 @@ def _predict_all(fit: Fit, plain: Shapes, theta: FloatArray) -> list[NodeCurve |
     solved, converged = sweep.solve(plain, p, rest)
     if not converged.all():
         return [None] * sweep.m
-    return [NodeCurve.of(fit.model.chain, z) for z in sweep.shapes_seen(solved, p, rest)]
+    return [fit.problem.curve_of(z) for z in sweep.seen(solved, p, rest)]
 
 
 def _stretches(fit: Fit) -> CrossValidation:
@@ -186,9 +186,8 @@ def _stretches(fit: Fit) -> CrossValidation:
         step = -np.linalg.solve(hessian, a.T @ e + prior @ pull)
         lower, upper = problem.unknowns.bounds
         theta = np.clip(fit.point.theta + step[:size], lower, upper)
-        plain = Shapes(
-            fit.point.shapes.phi, fit.point.shapes.lam, np.zeros_like(fit.point.shapes.deviation)
-        )
+        shapes = fit.point.shapes
+        plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
         p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
         solved, converged = sweep.solve(plain, p, rest)
         counts.append(len(rows))
@@ -196,6 +195,6 @@ def _stretches(fit: Fit) -> CrossValidation:
             squares.append(np.inf)
             complete = False
             continue
-        curve = NodeCurve.of(fit.model.chain, sweep.shapes_seen(solved, p, rest)[j])
+        curve = problem.curve_of(sweep.seen(solved, p, rest)[j])
         squares.append(float((curve.distances(points[rows]) ** 2).sum()))
     return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)

@@ -223,7 +223,7 @@ def diagnose(
 
 def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]) -> list[Screened]:
     """Score tests of all candidates at a fit, best first."""
-    phi = fit.point.shapes.phi
+    phi = fit.point.shapes.x[..., 0]
     directions = (float(phi[:, 0].mean()), float(phi[:, -1].mean()))
     listed = candidates(fit.model, center, len(fit.problem.history), exclude, directions)
     return Screen(fit, listed).run(screening_degrees(fit)) if listed else []

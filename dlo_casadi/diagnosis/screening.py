@@ -18,12 +18,13 @@ function theorem, exact from CasADi.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.fit import carried_shapes
 from dlo_casadi.estimation.gauss_newton import (
@@ -32,9 +33,8 @@ from dlo_casadi.estimation.gauss_newton import (
     Linearization,
     Point,
 )
-from dlo_casadi.estimation.observation import normal_rows
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sweep import Shapes, Sweep
+from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 
@@ -86,26 +86,21 @@ class _Linearized:
     problem: BatchProblem
     point: Point
     lin: Linearization
-    _reach: FloatArray | None = None
-    _rows: list[FloatArray] = field(default_factory=list)
 
     def move(self, names: tuple[str, ...], p: FloatArray) -> None:
         """Take the derivatives by the named parameters again, at p."""
         problem, point = self.problem, self.point
-        rest, shapes = problem.unknowns.rest(point.theta), point.shapes
-        if self._reach is None:
-            self._reach = problem.sweep.reach(shapes, p, rest)
-            curves = problem.curves(point.theta, shapes)
-            for j, s in zip(problem.used, point.feet, strict=True):
-                rows = normal_rows(curves[j], s, curves[j].normals(s))
-                self._rows.append(problem.whitening(j, s) @ rows)
-        balance, z = problem.sweep.slopes_by(names, shapes, p, rest)
-        moved = self._reach @ balance + z
-        own = [problem.unknowns.model.names.index(name) for name in names]
-        columns = [problem.unknowns.names.index(name) for name in names]
-        scale = problem.unknowns.slopes(point.theta)[own, columns]
-        for k, (j, rows) in enumerate(zip(problem.used, self._rows, strict=True)):
-            self.lin.by_theta[k][:, columns] = -(rows @ moved[j]) * scale
+        unknowns = problem.unknowns
+        rest = unknowns.rest(point.theta)
+        columns = [unknowns.names.index(name) for name in names]
+        slopes = unknowns.slopes(point.theta)[:, columns]
+        still = np.zeros((len(rest), len(columns)))
+        along = problem.sweep.directions(point.shapes, p, rest, slopes, still)
+        seen = problem.sweep.observe(point.shapes, p, rest, along)
+        for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
+            curve = problem.curve_of(seen.z[j])
+            moved = problem.measured[j].line.residual_along(curve, s, seen.slopes[j])
+            self.lin.by_theta[k][:, columns] = problem.whitening(j, s) @ moved[:, : len(columns)]
 
 
 class Screen:

@@ -27,13 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
-from dlo_casadi.chain import Chain
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose, check_reach, stats_of
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.initial import arc_headings
 from dlo_casadi.model import CableModel
+from dlo_casadi.rod.chain import Chain
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
@@ -260,11 +260,12 @@ class InnerProblem:
         k_theta, theta_0 = ca.SX.sym("k_theta"), ca.SX.sym("theta_0", n - 1)
         end, points = ca.SX.sym("end", 2), ca.SX.sym("points", n - 1, 2)
         seen = ca.SX.sym("seen", n - 1)
-        curve = self.chain.curve(phi, ca.SX.zeros(2))
-        nodes = curve.nodes
+        steps = h * ca.horzcat(ca.cos(phi), ca.sin(phi))
+        nodes = ca.vertcat(ca.SX.zeros(1, 2), ca.cumsum(steps, 0))
         joints = phi[1:] - phi[:-1]
         bending = k_theta / 2 * ca.sumsqr(joints - theta_0)
-        hanging = -ca.dot(ca.DM(self.weight), curve.first_moment) / h
+        middles = (nodes[1:, :] + nodes[:-1, :]) / 2
+        hanging = -ca.dot(ca.DM(self.weight), ca.sum1(middles).T)
         gaps = ca.sum2((nodes[1:n, :] - points) ** 2)
         parameters = ca.vertcat(k_theta, theta_0, end, seen, ca.vec(points))
         problem = {
@@ -302,7 +303,7 @@ class InnerProblem:
         sides = {"ccw": (1,), "cw": (-1,), None: (1, -1)}[pose.branch]
         arcs = [
             arc_headings(
-                self.chain.heading_places, self.chain.length, np.zeros(2), target.end, side
+                self.chain.places, self.chain.length, np.zeros(2), target.end, side
             )
             for side in sides
         ]

@@ -25,12 +25,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import stats_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
-from dlo_casadi.estimation.observation import NodeCurve, normal_rows
-from dlo_casadi.estimation.sweep import Shapes
+from dlo_casadi.estimation.observation import normal_rows
 from dlo_casadi.model import DEVIATIONS
+from dlo_casadi.whole_pose import PoseSymbols, balance, curve, rest_after
 
 FloatArray = NDArray[np.floating]
 
@@ -100,10 +101,10 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
     count = _n_rows(problem)
     out = []
     for j, s in zip(problem.used, point.feet, strict=True):
-        curve: NodeCurve = curves[j]
-        normals = curve.normals(s)
+        line = curves[j]
+        normals = line.normals(s)
         white = problem.whitening(j, s)
-        rows = white @ normal_rows(curve, s, normals)
+        rows = white @ normal_rows(line, s, normals)
         target = white @ (problem.measured[j].points * normals).sum(axis=1)
         size = rows.shape[1]
         triangle = np.linalg.qr(np.column_stack([rows, target]), mode="r")
@@ -117,7 +118,7 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
 def _n_rows(problem: BatchProblem) -> int:
     """Rows of a pose's compressed points: no more than the numbers of its shape, or points."""
     most = max(len(problem.measured[j].points) for j in problem.used)
-    return min(most, int(problem.unknowns.model.shape.size1_out(0)))
+    return min(most, problem.curve_size)
 
 
 class _BatchNlp:
@@ -132,11 +133,11 @@ class _BatchNlp:
         self.problem = problem
         unknowns, model = problem.unknowns, problem.unknowns.model
         self.poses = list(range(problem.sweep.m)) if model.has_state else list(problem.used)
-        self.n_phi, self.n_lam = model.chain.n_headings, model.n_conditions
+        self.n_x, self.n_lam = problem.sweep.assembly.n, model.n_conditions
         self.columns = problem.sweep.used_deviations
         self.n_dev = len(self.columns)
         self.n_rest = model.chain.n_cells if model.has_state else 0
-        self.stride = self.n_phi + self.n_lam + self.n_dev + self.n_rest
+        self.stride = self.n_x + self.n_lam + self.n_dev + self.n_rest
         # Multipliers and balance in units of a typical force: EI turns^2.
         self.force = model.cable.bending_stiffness * model.cable.curvature_scale**2
         self._differentiate()
@@ -152,34 +153,35 @@ class _BatchNlp:
         theta = ca.SX.sym("theta", unknowns.size)
         own = ca.SX.sym("own", self.stride)
         ends = ca.SX.sym("ends", 6)
-        phi, lam, dev, rest = self._split(own)
+        x, lam, dev, rest = self._split(own)
         deviation = ca.SX.zeros(len(DEVIATIONS))
         for k, column in enumerate(self.columns):
             deviation[column] = dev[k] * problem.deviation_std[k]
         if not model.has_state:
             rest = unknowns.symbolic_rest(theta)
-        arguments = [phi, lam * self.force, unknowns.symbolic_p(theta), rest, ends, deviation]
+        p = unknowns.symbolic_p(theta)
+        pose = PoseSymbols(x, lam * self.force, p, rest, ends, deviation)
         scale = np.concatenate(
             [
-                np.full(self.n_phi, 1 / (self.force * model.cable.length)),
+                np.full(self.n_x, 1 / (self.force * model.cable.length)),
                 np.full(self.n_lam, 1 / model.cable.length),
             ]
         )
-        balance = model.balance(*arguments) * scale
-        z = model.shape(*arguments)
+        imbalance = balance(model, pose) * scale
+        z = curve(model, pose)
         after = ca.SX.zeros(0)
         if model.has_state:
-            after = model.next_rest(*arguments)[0] / model.cable.curvature_scale
+            after = rest_after(model, pose) / model.cable.curvature_scale
         both = ca.vertcat(own, theta)
         given = [own, theta, ends]
-        self.value = ca.Function("value", given, [balance, z, after])
-        blocks = [ca.densify(ca.jacobian(block, both)) for block in (balance, z, after)]
+        self.value = ca.Function("value", given, [imbalance, z, after])
+        blocks = [ca.densify(ca.jacobian(block, both)) for block in (imbalance, z, after)]
         self.slope = ca.Function("slope", given, blocks)
-        weights = [ca.SX.sym("w", block.numel()) for block in (balance, z, after)]
+        weights = [ca.SX.sym("w", block.numel()) for block in (imbalance, z, after)]
         weighted = sum(
             (
                 ca.dot(weight, block)
-                for weight, block in zip(weights, (balance, z, after), strict=True)
+                for weight, block in zip(weights, (imbalance, z, after), strict=True)
             ),
             start=ca.SX(0),
         )
@@ -190,7 +192,7 @@ class _BatchNlp:
         """NLP, gradient, Jacobian and Hessian from the poses' blocks."""
         problem, m = self.problem, len(self.poses)
         unknowns, model = problem.unknowns, problem.unknowns.model
-        size, n_z, n_rows = unknowns.size, int(model.shape.size1_out(0)), _n_rows(problem)
+        size, n_z, n_rows = unknowns.size, problem.curve_size, _n_rows(problem)
         x = ca.MX.sym("x", size + self.stride * m)
         factor = ca.MX.sym("factor", n_rows, n_z * len(problem.used))
         target = ca.MX.sym("target", n_rows, len(problem.used))
@@ -203,7 +205,7 @@ class _BatchNlp:
         width = self.stride + size
         gap = theta - ca.DM(problem.mean)
         precision = ca.DM(problem.precision)
-        at = self.n_phi + self.n_lam
+        at = self.n_x + self.n_lam
         pick = ca.DM.zeros(self.stride)
         pick[at : at + self.n_dev] = 1.0
 
@@ -233,7 +235,7 @@ class _BatchNlp:
         g = ca.vertcat(*constraints)
 
         lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
-        n_balance = self.n_phi + self.n_lam
+        n_balance = self.n_x + self.n_lam
         of_balance = ca.reshape(lam_g[: n_balance * m], n_balance, m)
         of_after = ca.MX.zeros(self.n_rest, m)
         if model.has_state:
@@ -304,7 +306,7 @@ class _BatchNlp:
         return gap, direct - shifted
 
     def _split(self, own: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        a, b, c = self.n_phi, self.n_phi + self.n_lam, self.n_phi + self.n_lam + self.n_dev
+        a, b, c = self.n_x, self.n_x + self.n_lam, self.n_x + self.n_lam + self.n_dev
         return own[:a], own[a:b], own[b:c], own[c:]
 
     def solve(
@@ -318,7 +320,7 @@ class _BatchNlp:
         own = []
         for j in self.poses:
             scaled = point.shapes.deviation[j, self.columns] / problem.deviation_std
-            parts = [point.shapes.phi[j], point.shapes.lam[j] / self.force, scaled]
+            parts = [point.shapes.x[j, :, 0], point.shapes.lam[j] / self.force, scaled]
             if problem.unknowns.model.has_state:
                 parts.append(rests[j])
             own.append(np.concatenate(parts))
@@ -337,10 +339,10 @@ class _BatchNlp:
         """Unknowns and shapes of the solution."""
         size = self.problem.unknowns.size
         theta, own = vector[:size], vector[size:].reshape((len(self.poses), self.stride))
-        phi, lam, deviation = shapes.phi.copy(), shapes.lam.copy(), shapes.deviation.copy()
-        at = self.n_phi + self.n_lam
+        x, lam, deviation = shapes.x.copy(), shapes.lam.copy(), shapes.deviation.copy()
+        at = self.n_x + self.n_lam
         for j, row in zip(self.poses, own, strict=True):
-            phi[j], lam[j] = row[: self.n_phi], row[self.n_phi : at] * self.force
+            x[j, :, 0], lam[j] = row[: self.n_x], row[self.n_x : at] * self.force
             scaled = row[at : at + len(self.columns)]
             deviation[j, self.columns] = scaled * self.problem.deviation_std
-        return theta, Shapes(phi, lam, deviation)
+        return theta, Shapes(x, lam, deviation)

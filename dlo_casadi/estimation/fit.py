@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
@@ -18,7 +19,6 @@ from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
-from dlo_casadi.estimation.sweep import Shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import DEVIATIONS, CableModel
@@ -195,27 +195,23 @@ def carried_shapes(problem: BatchProblem, start: Fit) -> Shapes:
     for index in problem.indices:
         if index in known:
             k = known[index]
-            rows.append((own.phi[k], own.lam[k], own.deviation[k]))
+            rows.append((own.x[k], own.lam[k], own.deviation[k]))
             continue
         try:
             found = solve_equilibrium(start.model, start.p, start.rest, problem.history[index].pose)
         except EquilibriumError as error:
             raise EstimationError(error.message) from error
-        rows.append((found.phi, found.multipliers, np.zeros(len(DEVIATIONS))))
-    phi, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
-    return on_other_mesh(Shapes(phi, lam, deviation), start.model, problem.unknowns.model)
+        rows.append((found.x, found.multipliers, np.zeros(len(DEVIATIONS))))
+    x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
+    return on_other_mesh(Shapes(x, lam, deviation), start.model, problem.unknowns.model)
 
 
 def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
-    """Headings interpolated from one model's mesh to another's."""
+    """Nodes interpolated from one model's mesh to another's."""
     if model.chain == other.chain:
         return shapes
-    coarse, fine = model.chain.heading_places, other.chain.heading_places
-    phi = np.array([np.interp(fine, coarse, row) for row in shapes.phi])
-    lam = shapes.lam
-    if lam.shape[1] != other.n_conditions:
-        lam = np.zeros((len(phi), other.n_conditions))
-    return Shapes(phi, lam, shapes.deviation)
+    coarse, fine = model.chain.places, other.chain.places
+    return replace(shapes, x=other.chain.kind.node.interpolated(fine, coarse, shapes.x))
 
 
 def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:

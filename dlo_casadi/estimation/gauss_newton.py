@@ -13,21 +13,25 @@ deviations of a pose are eliminated by a Schur complement.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve, normal_rows
-from dlo_casadi.estimation.sweep import Sensitivities, Shapes, Sweep
+from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.rod.band import Vector
 
 FloatArray = NDArray[np.floating]
 
 # Precision in scaled units below which a direction counts as undetermined.
 NO_INFORMATION = 1e-6
+# Farther than so [rad] no node is moved along its derivative: equilibria are not that linear.
+LONGEST_MOVE = 1.5
 # A descent creeps where so many steps together gain no more than the last one may.
 CREEPING = 4
 
@@ -84,8 +88,8 @@ class Linearization:
         Normal distances.
     raw_directions : list of (K_j, size + n_deviations)
         Their derivatives, not whitened.
-    shapes : Sensitivities
-        Derivatives of the equilibria.
+    shapes : Directions
+        Derivatives of the equilibria, by the unknowns and by each pose's deviations.
     """
 
     residuals: list[FloatArray]
@@ -93,7 +97,7 @@ class Linearization:
     by_deviation: list[FloatArray]
     raw: list[FloatArray]
     raw_directions: list[FloatArray]
-    shapes: Sensitivities
+    shapes: Directions
 
 
 @dataclass(frozen=True)
@@ -162,8 +166,18 @@ class BatchProblem:
 
     def curves(self, theta: FloatArray, shapes: Shapes) -> list[NodeCurve]:
         """Curves of all poses as the camera sees them."""
-        z = self.sweep.shapes_seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
-        return [NodeCurve.of(self.unknowns.model.chain, row) for row in z]
+        z = self.sweep.seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
+        return [self.curve_of(row) for row in z]
+
+    @property
+    def curve_size(self) -> int:
+        """Numbers that a measured curve is made of."""
+        model = self.unknowns.model
+        return (model.chain.n + 1) * int(model.station.size1_out(0))
+
+    def curve_of(self, z: FloatArray) -> NodeCurve:
+        """Curve of what the model says of its nodes."""
+        return NodeCurve.of(self.unknowns.model.cable.length, z)
 
     def whitening(self, j: int, feet: FloatArray) -> FloatArray:
         """Whitening matrix (K_j, K_j) of pose j [1/m], computed for the feet at `refresh`."""
@@ -190,10 +204,9 @@ class BatchProblem:
         """Normal distances [m] of the fitted poses and the feet they belong to."""
         distances, moved = [], []
         for j, guess in zip(self.used, feet, strict=True):
-            points = self.measured[j].points
-            s = curves[j].feet(points, guess)
-            normals = curves[j].normals(s)
-            distances.append(((points - curves[j].at(s)) * normals).sum(axis=1))
+            line = self.measured[j].line
+            s = curves[j].feet(line.points, guess)
+            distances.append(line.residual(curves[j], s))
             moved.append(s)
         return distances, moved
 
@@ -211,37 +224,44 @@ class BatchProblem:
 
     def linearize(self, point: Point) -> Linearization:
         """Whitened residuals and their exact first derivatives."""
-        slopes = self.unknowns.slopes(point.theta)
-        sens = self.sweep.sensitivities(
+        along = self.sweep.directions(
             point.shapes,
             self.unknowns.p(point.theta),
             self.unknowns.rest(point.theta),
-            slopes,
+            self.unknowns.slopes(point.theta),
             self.unknowns.rest_slopes,
         )
-        return self.linearize_along(point, sens, slopes)
+        return self.linearize_along(point, along)
 
     def linearize_along(
-        self, point: Point, sens: Sensitivities, slopes: FloatArray
+        self, point: Point, along: Directions, correction: Directions | None = None
     ) -> Linearization:
-        """Residuals and derivatives for given derivatives of the shapes and parameters."""
+        """Residuals and derivatives for given derivatives of the shapes and parameters.
+
+        Parameters
+        ----------
+        correction : Directions, optional
+            One column: how the shapes are about to move; the residuals are those afterwards, to
+            first order.
+        """
         p, rest = self.unknowns.p(point.theta), self.unknowns.rest(point.theta)
-        seen = self.sweep.observe(point.shapes, p, rest)
-        columns = self.sweep.used_deviations
-        out = Linearization([], [], [], [], [], sens)
+        seen = self.sweep.observe(point.shapes, p, rest, along)
+        moved = None
+        if correction is not None:
+            moved = self.sweep.observe(point.shapes, p, rest, correction).slopes
+        out = Linearization([], [], [], [], [], along)
+        size = self.unknowns.size
         for j, s in zip(self.used, point.feet, strict=True):
-            curve = NodeCurve.of(self.unknowns.model.chain, seen.z[j])
-            normals = curve.normals(s)
-            rows = normal_rows(curve, s, normals)
+            curve, line = self.curve_of(seen.z[j]), self.measured[j].line
             white = self.whitening(j, s)
-            d = ((self.measured[j].points - curve.at(s)) * normals).sum(axis=1)
-            theta_z = seen.by_theta(j, sens, slopes)
-            deviation_z = seen.by_own(j, sens)[:, columns]
-            out.residuals.append(white @ d)
-            directions = -rows @ np.concatenate([theta_z, deviation_z], axis=1)
+            d = line.residual(curve, s)
+            if moved is not None:
+                d = d + line.residual_along(curve, s, moved[j])[:, 0]
+            directions = line.residual_along(curve, s, seen.slopes[j])
             whitened = white @ directions
-            out.by_theta.append(whitened[:, : slopes.shape[1]])
-            out.by_deviation.append(whitened[:, slopes.shape[1] :])
+            out.residuals.append(white @ d)
+            out.by_theta.append(whitened[:, :size])
+            out.by_deviation.append(whitened[:, size:])
             out.raw.append(d)
             out.raw_directions.append(directions)
         return out
@@ -334,24 +354,22 @@ class BatchProblem:
     ) -> Point | None:
         """Equilibria and objective after a step; None if some pose loses its equilibrium."""
         theta = point.theta + step
-        sens = lin.shapes
-        change = (
-            sens.theta @ step
-            + (sens.deviation @ (deviation - point.shapes.deviation)[:, :, None])[:, :, 0]
-        )
-        size = float(np.abs(change[:, : self.sweep.n_phi]).max())
-        if size > 1.5:
+        change = self.shape_step(lin.shapes, step, deviation - point.shapes.deviation)
+        if float(np.abs(change.x).max()) > LONGEST_MOVE:
             return None
-        n_phi = self.sweep.n_phi
-        guess = Shapes(
-            point.shapes.phi + change[:, :n_phi], point.shapes.lam + change[:, n_phi:], deviation
-        )
+        guess = replace(self.sweep.moved(point.shapes, change), deviation=deviation)
         shapes, converged = self.sweep.solve(
             guess, self.unknowns.p(theta), self.unknowns.rest(theta), reach=1.0
         )
         if not converged.all():
             return None
         return self.evaluate(theta, shapes, point.feet)
+
+    def shape_step(self, along: Directions, step: FloatArray, deviation: FloatArray) -> Vector:
+        """How the shapes move with a step of theta and of the deviations, one column."""
+        own = deviation[:, self.sweep.used_deviations]
+        both = np.concatenate([np.broadcast_to(step, (len(own), len(step))), own], axis=1)
+        return Vector(along.x @ both[:, None, :, None], along.lam @ both[:, :, None])
 
     def thinned(self, most: int) -> BatchProblem:
         """Return the problem of at most so many of the fitted poses, evenly picked.

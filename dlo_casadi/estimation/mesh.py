@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import on_other_mesh
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sweep import Shapes, Sweep
+from dlo_casadi.estimation.sweep import Sweep
 
 FloatArray = NDArray[np.floating]
 
@@ -47,11 +48,11 @@ def discretization_error(fit: Fit) -> float:
             f"the fitted shapes are no equilibria on a mesh of {2 * fit.model.n} elements: the "
             f"mesh of {fit.model.n} is far too coarse.\n  Try: model.n larger."
         )
-    fine = sweep.shapes_seen(shapes, fit.p, rest)
+    fine = sweep.seen(shapes, fit.p, rest)
     coarse = fit.problem.curves(fit.point.theta, fit.point.shapes)
     places = np.linspace(0.0, fit.model.cable.length, 101)
     worst = 0.0
     for row, curve in zip(fine, coarse, strict=True):
-        gap = NodeCurve.of(sweep.model.chain, row).at(places) - curve.at(places)
+        gap = NodeCurve.of(fit.model.cable.length, row).at(places) - curve.at(places)
         worst = max(worst, float(np.sqrt((gap**2).sum(axis=1).mean())))
     return 4 / 3 * worst

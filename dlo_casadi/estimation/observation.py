@@ -9,7 +9,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.chain import Chain
 from dlo_casadi.equilibrium import Pose
 
 FloatArray = NDArray[np.floating]
@@ -46,6 +45,38 @@ class MeasuredPose:
         """Whether there are points to compare with."""
         return len(self.points) > 0
 
+    @property
+    def line(self) -> Centerline:
+        """The sensor of the pose."""
+        return Centerline(self.points, self.relative_std)
+
+
+@dataclass(frozen=True)
+class Centerline:
+    """A sensor: points somewhere along the cable, compared across its tangent.
+
+    The arc lengths s of their closest points on the curve are its own unknowns. There the normal
+    distance does not change to first order with s, so that derivatives at fixed s are exact.
+
+    Parameters
+    ----------
+    points : (K, 2) [m]
+    weight : (K,)
+        Relative standard deviations.
+    """
+
+    points: FloatArray
+    weight: FloatArray
+
+    def residual(self, curve: NodeCurve, s: FloatArray) -> FloatArray:
+        """Normal distances (K,) [m], measured minus curve."""
+        return np.asarray(((self.points - curve.at(s)) * curve.normals(s)).sum(axis=1))
+
+    def residual_along(self, curve: NodeCurve, s: FloatArray, slopes: FloatArray) -> FloatArray:
+        """Change (K, q) of the residual along directions of the curve (n + 1, 2 or 4, q)."""
+        moved = curve.moved(s, slopes)
+        return -np.einsum("kd,kdq->kq", curve.normals(s), moved)
+
 
 # Polynomial coefficients (powers of u, weights) of the interpolants' derivatives by u.
 _HERMITE = np.array(
@@ -68,10 +99,10 @@ _LINEAR = np.array(
 
 @dataclass(frozen=True)
 class NodeCurve:
-    """A curve given by the model's observation vector z: nodes and, for arcs, slopes dr/ds.
+    """A curve given by its nodes and, of smooth elements, the slopes dr/ds there.
 
-    Between the nodes of a chain of arcs the curve is the cubic Hermite interpolant, which
-    differs from an arc of curvature k by less than h^4 k^3 / 384; links are straight.
+    Between nodes with slopes the curve is the cubic Hermite interpolant, which
+    differs from an arc of curvature k by less than h^4 k^3 / 384; others are joined by chords.
     """
 
     length: float
@@ -79,10 +110,9 @@ class NodeCurve:
     slopes: FloatArray | None
 
     @classmethod
-    def of(cls, chain: Chain, z: FloatArray) -> Self:
-        """Unpack the observation vector z of a chain."""
-        table = z.reshape((-1, chain.n + 1)).T
-        return cls(chain.length, table[:, :2], table[:, 2:4] if table.shape[1] == 4 else None)
+    def of(cls, length: float, z: FloatArray) -> Self:
+        """Curve of places, and slopes where there are any, (n + 1, 2 or 4)."""
+        return cls(length, z[:, :2], z[:, 2:4] if z.shape[1] == 4 else None)
 
     @property
     def n(self) -> int:
@@ -128,6 +158,16 @@ class NodeCurve:
         """Positions (K, 2) [m] at arc lengths s, or derivatives by s."""
         return self.frame(s, derivative)[derivative]
 
+    def moved(self, s: FloatArray, slopes: FloatArray) -> FloatArray:
+        """Change (K, 2, q) [m] of the positions at fixed s for one (n + 1, 2 or 4, q) of the curve."""
+        e, w = self.weights(s)
+        w = w[:, :, None, None]
+        out = w[:, 0] * slopes[e, :2] + w[:, 1] * slopes[e + 1, :2]
+        if self.slopes is not None:
+            h = self.length / self.n
+            out += h * (w[:, 2] * slopes[e, 2:] + w[:, 3] * slopes[e + 1, 2:])
+        return np.asarray(out)
+
     def feet(self, points: FloatArray, guess: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] of the points' feet, by Newton steps from a guess.
 
@@ -167,19 +207,10 @@ class NodeCurve:
 
 
 def normal_rows(curve: NodeCurve, s: FloatArray, normals: FloatArray) -> FloatArray:
-    """Matrix (K, len(z)) of d(n . r(s))/dz at fixed places and normals."""
-    e, w = curve.weights(s)
-    size = curve.n + 1
-    k = np.arange(len(s))
-    rows = np.zeros((len(s), size * (2 if curve.slopes is None else 4)))
-    h = curve.length / curve.n
-    for axis in (0, 1):
-        rows[k, axis * size + e] = w[:, 0] * normals[:, axis]
-        rows[k, axis * size + e + 1] = w[:, 1] * normals[:, axis]
-        if curve.slopes is not None:
-            rows[k, (2 + axis) * size + e] = h * w[:, 2] * normals[:, axis]
-            rows[k, (2 + axis) * size + e + 1] = h * w[:, 3] * normals[:, axis]
-    return rows
+    """Matrix (K, (n + 1) 2 or 4) of d(n . r(s)) by the curve's numbers, places and normals fixed."""
+    width = 2 if curve.slopes is None else 4
+    unit = np.eye((curve.n + 1) * width).reshape((curve.n + 1, width, -1))
+    return np.einsum("kd,kdq->kq", normals, curve.moved(s, unit))
 
 
 def chord_places(measured: MeasuredPose, length: float) -> FloatArray:

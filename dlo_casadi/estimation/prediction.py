@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import Given
 from dlo_casadi.equilibrium import Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -54,11 +55,11 @@ def predict_poses(
         except EquilibriumError:
             out.append(None)
             continue
-        arguments = (eq.phi, eq.multipliers, p, rest, pose.vector, np.zeros(len(DEVIATIONS)))
-        z = np.array(model.shape(*arguments)).ravel()
-        out.append(Prediction(eq, NodeCurve.of(model.chain, z), rest))
+        shapes, given = eq.shapes, Given.of(p, rest, pose.vector[None])
+        z = model.assembly.curve(shapes, given)[0]
+        out.append(Prediction(eq, NodeCurve.of(model.cable.length, z), rest))
         if model.has_state:
-            rest = np.array(model.next_rest(*arguments)[0]).ravel()
+            rest = model.assembly.state_after(shapes, given)[0][0]
     return out
 
 

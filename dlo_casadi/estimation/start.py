@@ -7,16 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.equilibrium import guesses
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
-from dlo_casadi.estimation.observation import (
-    MeasuredPose,
-    NodeCurve,
-    chord_places,
-    normal_rows,
-)
-from dlo_casadi.estimation.sweep import Sensitivities, Shapes, Sweep
+from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve, chord_places
+from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.rod.band import Vector
 
 FloatArray = NDArray[np.floating]
 
@@ -36,33 +33,41 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     """
     model, used = problem.unknowns.model, problem.used
     chain = model.chain
-    m = len(problem.measured)
-    # Without forces an element does not know its bow.
-    sweep = (
-        problem.sweep
-        if chain.element != "quadratic"
-        else Sweep(model.with_mesh(chain.n, "arc"), problem.sweep.poses)
-    )
+    # Without forces an element does not know its inner unknowns.
+    plain = chain.kind.plain
+    sweep = problem.sweep
+    if plain != chain.element:
+        sweep = Sweep(model.with_mesh(chain.n, plain), problem.sweep.poses)
     flat = np.zeros(chain.n_cells)
-    phi = np.array([guesses(model, item.pose, flat)[0] for item in problem.measured])
+    x = np.array([guesses(model, item.pose, flat)[0] for item in problem.measured])[..., None]
     feet: list[FloatArray] = []
     for j in used:
         places = chord_places(problem.measured[j], chain.length)
-        phi[j] = _polyline_headings(problem.measured[j], model, places)
+        x[j, :, 0] = _polyline_headings(problem.measured[j], model, places)
         feet.append(places)
-    shapes = Shapes(phi, np.zeros((m, model.n_conditions)), np.zeros((m, len(DEVIATIONS))))
+    shapes = problem.sweep.start_shapes(x)
+    each = _each_node(sweep)
     for iteration in range(_KINEMATIC_STEPS + 1):
-        seen = sweep.observe(shapes, model.nominal, flat)
+        seen = sweep.observe(shapes, model.nominal, flat, each)
         for k, j in enumerate(used):
-            curve = NodeCurve.of(chain, seen.z[j])
+            curve = problem.curve_of(seen.z[j])
             if iteration > 1:
                 feet[k] = curve.feet(problem.measured[j].points, feet[k])
             if iteration < _KINEMATIC_STEPS:
-                slopes = seen.by_x[j][:, : chain.n_headings]
-                phi[j] += _kinematic_step(
-                    problem.measured[j], model, curve, slopes, phi[j], feet[k]
+                x[j, :, 0] += _kinematic_step(
+                    problem.measured[j], model, curve, seen.slopes[j], x[j, :, 0], feet[k]
                 )
     return shapes, feet
+
+
+def _each_node(sweep: Sweep) -> Directions:
+    """Every node moved on its own."""
+    a, m = sweep.assembly, sweep.m
+    q = a.n * a.b
+    x = np.broadcast_to(np.eye(q).reshape((a.n, a.b, q)), (m, a.n, a.b, q))
+    model = sweep.model
+    counts = (a.k, len(model.parameters), model.chain.n_cells, len(DEVIATIONS))
+    return Directions(x, *(np.zeros((m, count, q)) for count in counts))
 
 
 def _kinematic_step(
@@ -79,11 +84,11 @@ def _kinematic_step(
     penalty = np.diff(np.eye(len(phi)), n=2, axis=0)
     # 3 mm of noise a point against bends that change by 0.3 turns per length from cell to cell.
     rough = penalty * 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
-    axes = [np.tile(axis, (len(s), 1)) for axis in ([1.0, 0.0], [0.0, 1.0])]
-    system: list[FloatArray] = [*(normal_rows(curve, s, axis) @ slopes for axis in axes), rough]
+    moved = curve.moved(s, slopes)
+    system: list[FloatArray] = [moved[:, 0], moved[:, 1], rough]
     target: list[FloatArray] = [gap[:, 0], gap[:, 1], -rough @ phi]
     if item.pose.end is not None:
-        system.append(10 * slopes[[chain.n, 2 * chain.n + 1]])
+        system.append(10 * slopes[-1, :2])
         target.append(10 * (np.array(item.pose.end) - curve.nodes[-1]))
     for held, index, heading in (
         (model.start == "clamped", 0, item.pose.start_heading),
@@ -115,7 +120,7 @@ def _polyline_headings(measured: MeasuredPose, model: CableModel, places: FloatA
     if measured.pose.start_heading is not None:
         turns = np.round((measured.pose.start_heading - headings[0]) / (2 * np.pi))
         headings = headings + 2 * np.pi * turns
-    return np.interp(chain.heading_places, (grid[1:] + grid[:-1]) / 2, headings)
+    return np.interp(chain.places, (grid[1:] + grid[:-1]) / 2, headings)
 
 
 def all_at_once(
@@ -142,7 +147,6 @@ def all_at_once(
         An equilibrium near the measured shapes, or None if there is none.
     """
     unknowns, sweep = problem.unknowns, problem.sweep
-    n_phi = sweep.n_phi
     lower, upper = unknowns.bounds
     moving = ~held
     columns = sweep.used_deviations
@@ -151,17 +155,18 @@ def all_at_once(
         p, rest = unknowns.p(theta), unknowns.rest(theta)
         slopes = unknowns.slopes(theta)
         try:
-            sens = sweep.sensitivities(shapes, p, rest, slopes, unknowns.rest_slopes)
-            force, matrix = sweep.kkt(shapes, p, rest)
-            correction = -np.linalg.solve(matrix, force[:, :, None])[:, :, 0]
+            along = sweep.directions(shapes, p, rest, slopes, unknowns.rest_slopes)
+            force, matrix = sweep.balance(shapes, p, rest)
+            correction = matrix.factor().solve(Vector(-force.x, -force.y))
         except np.linalg.LinAlgError:
             return None
         point = problem.evaluate(theta, shapes, feet)
-        ahead = _predicted(problem, point, correction, sens, slopes)
+        ahead = problem.linearize_along(point, along, _only(along, correction))
         gap = theta - problem.mean
         hessian, gradient = problem.precision.copy(), problem.precision @ gap
         inner = []
-        for j, (e, a, b) in zip(problem.used, ahead, strict=True):
+        rows = zip(problem.used, ahead.residuals, ahead.by_theta, ahead.by_deviation, strict=True)
+        for j, e, a, b in rows:
             block = b.T @ b + own
             cross, slope = b.T @ a, b.T @ e + own @ shapes.deviation[j, columns]
             solved = np.linalg.solve(block, np.column_stack([cross, slope]))
@@ -176,19 +181,15 @@ def all_at_once(
         deviation = shapes.deviation.copy()
         for j, solved in zip(problem.used, inner, strict=True):
             deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
-        moved = (deviation - shapes.deviation)[:, :, None]
-        change = correction + sens.theta @ step + (sens.deviation @ moved)[:, :, 0]
-        size = float(np.abs(change[:, :n_phi]).max())
+        change = correction + problem.shape_step(along, step, deviation - shapes.deviation)
+        size = float(np.abs(change.x).max())
         damp = min(1.0, 0.7 / max(size, 1e-12))
         shapes = replace(
-            shapes,
-            phi=shapes.phi + damp * change[:, :n_phi],
-            lam=shapes.lam + change[:, n_phi:],
-            deviation=deviation,
+            sweep.moved(shapes, Vector(damp * change.x, change.y)), deviation=deviation
         )
         theta = theta + step
         feet = point.feet
-        if not np.all(np.isfinite(shapes.phi)):
+        if not np.all(np.isfinite(shapes.x)):
             return None
     final, converged = sweep.solve(shapes, unknowns.p(theta), unknowns.rest(theta), 40)
     if not converged.all():
@@ -196,26 +197,8 @@ def all_at_once(
     return problem.evaluate(theta, final, feet)
 
 
-def _predicted(
-    problem: BatchProblem,
-    point: Point,
-    correction: FloatArray,
-    sens: Sensitivities,
-    slopes: FloatArray,
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Whitened residuals after the correction, and their Jacobians by theta and deviations."""
-    unknowns, sweep = problem.unknowns, problem.sweep
-    p, rest = unknowns.p(point.theta), unknowns.rest(point.theta)
-    seen = sweep.observe(point.shapes, p, rest)
-    out: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-    for j, s in zip(problem.used, point.feet, strict=True):
-        curve = NodeCurve.of(unknowns.model.chain, seen.z[j])
-        normals = curve.normals(s)
-        rows = normal_rows(curve, s, normals)
-        d = ((problem.measured[j].points - curve.at(s)) * normals).sum(axis=1)
-        d = d - rows @ (seen.by_x[j] @ correction[j])
-        white = problem.whitening(j, s)
-        theta_z = seen.by_theta(j, sens, slopes)
-        deviation_z = seen.by_own(j, sens)[:, sweep.used_deviations]
-        out.append((white @ d, -white @ (rows @ theta_z), -white @ (rows @ deviation_z)))
-    return out
+def _only(along: Directions, step: Vector) -> Directions:
+    """A step of the shapes as one direction, all else still."""
+    return Directions(
+        step.x, step.y, *(0 * part[..., :1] for part in (along.p, along.rest, along.deviation))
+    )

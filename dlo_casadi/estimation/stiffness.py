@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.sweep import Shapes, Sweep
+from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import DEVIATIONS, CableModel
 
 FloatArray = NDArray[np.floating]
@@ -49,7 +50,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         # Where bending dominates the weight, the shape stays and the forces grow with EI.
         grown = replace(shapes, lam=shapes.lam * np.exp(log_ei - from_log_ei))
         start = min(
-            shapes, grown, key=lambda x: float(np.linalg.norm(sweep.kkt(x, at(log_ei), rest)[0]))
+            shapes, grown, key=lambda x: float(np.linalg.norm(sweep.balance(x, at(log_ei), rest)[0].rows))
         )
         moved, converged = sweep.solve(start, at(log_ei), rest)
         if not converged.all() or not sweep.stable(moved, at(log_ei), rest).all():
@@ -57,9 +58,9 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
             if cold is None:
                 return shapes, np.inf
             moved = cold
-        z = sweep.shapes_seen(moved, at(log_ei), rest)
+        z = sweep.seen(moved, at(log_ei), rest)
         total = sum(
-            float((NodeCurve.of(model.chain, row).distances(item.points) ** 2).sum())
+            float((NodeCurve.of(model.cable.length, row).distances(item.points) ** 2).sum())
             for row, item in zip(z, used, strict=True)
         )
         return moved, total
@@ -68,11 +69,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     grid: dict[float, tuple[Shapes, float]] = {}
     first = _cold(model, at(prior), rest, used)
     if first is None:
-        first = Shapes(
-            np.zeros((len(used), model.chain.n_headings)),
-            np.zeros((len(used), model.n_conditions)),
-            np.zeros((len(used), len(DEVIATIONS))),
-        )
+        first = sweep.start_shapes(np.zeros((len(used), model.chain.n_nodes, 1)))
     step = np.log(10) / _PER_DECADE
     for direction in (1, -1):
         shapes = first
@@ -101,10 +98,10 @@ def _cold(
 ) -> Shapes | None:
     """Stable equilibria of lowest energy, or None if one is missing."""
     predictions = predict_poses(model, p, rest, [item.pose for item in used])
-    phi, lam = [], []
+    x, lam = [], []
     for prediction in predictions:
         if prediction is None:
             return None
-        phi.append(prediction.equilibrium.phi)
+        x.append(prediction.equilibrium.x)
         lam.append(prediction.equilibrium.multipliers)
-    return Shapes(np.array(phi), np.array(lam), np.zeros((len(used), len(DEVIATIONS))))
+    return Shapes(np.array(x), np.array(lam), np.zeros((len(used), len(DEVIATIONS))))

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.config import Config, dump_yaml, implausible_sizes, read_yaml
 from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
 from dlo_casadi.errors import ConfigError, DloError

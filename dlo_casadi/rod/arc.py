@@ -19,6 +19,7 @@ class Arc(Element):
     """
 
     name = "arc"
+    plain = "arc"
     node = Heading
     order = 2
     smooth = True

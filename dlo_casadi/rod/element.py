@@ -174,6 +174,8 @@ class Element(ABC):
     smooth : bool
         Whether the cable has a tangent at element boundaries: its curve is then interpolated with
         it, else by chords.
+    plain : str
+        Name of the element without the inner unknowns, on the same nodes.
     n_inner : int
         Number of unknowns inside an element that are eliminated from it.
     rule : (nodes, weights)
@@ -184,6 +186,7 @@ class Element(ABC):
     node: ClassVar[type[Node]]
     order: ClassVar[int]
     smooth: ClassVar[bool]
+    plain: ClassVar[str]
     n_inner: ClassVar[int] = 0
     rule: ClassVar[tuple[FloatArray, FloatArray]]
 

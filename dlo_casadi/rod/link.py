@@ -17,6 +17,7 @@ class Link(Element):
     """
 
     name = "link"
+    plain = "link"
     node = Heading
     order = 2
     smooth = False

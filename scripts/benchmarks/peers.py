@@ -30,7 +30,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 from benchmarks import speed
-from dlo_casadi.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import Pose, solve_equilibrium

@@ -1,0 +1,133 @@
+"""One pose as a whole, as CasADi expressions for IPOPT: the same functions of slots, added up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from dlo_casadi.model import DEVIATIONS, CableModel
+
+
+@dataclass(frozen=True)
+class PoseSymbols:
+    """What a pose's expressions depend on.
+
+    `x` (n_nodes coordinates,), `lam` (n_conditions,), `p` (n_parameters,), `rest` (n_cells,) [1/m],
+    `ends` (6,), `deviation` (len(DEVIATIONS),).
+    """
+
+    x: ca.SX
+    lam: ca.SX
+    p: ca.SX
+    rest: ca.SX
+    ends: ca.SX
+    deviation: ca.SX
+
+    @classmethod
+    def of(cls, model: CableModel) -> PoseSymbols:
+        """Fresh symbols."""
+        chain = model.chain
+        return cls(
+            ca.SX.sym("x", chain.n_nodes * chain.kind.node.coordinates),
+            ca.SX.sym("lam", model.n_conditions),
+            ca.SX.sym("p", len(model.parameters)),
+            ca.SX.sym("kappa_0", chain.n_cells),
+            ca.SX.sym("ends", 6),
+            ca.SX.sym("deviation", len(DEVIATIONS)),
+        )
+
+
+@dataclass(frozen=True)
+class Potential:
+    """A minimisation over one pose: symbols (coordinates, parameters), energy [J], conditions.
+
+    The parameters stack p, rest curvature of the cells, ends, deviation.
+    """
+
+    coordinates: ca.SX
+    parameters: ca.SX
+    energy: ca.SX
+    conditions: ca.SX
+
+
+def potential(model: CableModel) -> Potential:
+    """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
+
+    The coordinates are the nodes', then the unknowns inside the slots.
+    """
+    s, chain = PoseSymbols.of(model), model.chain
+    inner = ca.SX.sym("inner", model.n_inner, chain.n_slots)
+    energy, gradient, _ = model.at_ends(*_end_arguments(model, s))
+    conditions = gradient[2 * chain.kind.node.increment :]
+    for j, arguments in enumerate(_slot_arguments(model, s)):
+        own, advance = model.slot_potential(*arguments, inner[:, j])
+        energy += own
+        if model.end != "free":
+            conditions[:2] += advance
+    zero = ca.SX.zeros(model.n_conditions)
+    energy, conditions = ca.substitute([energy, conditions], [s.lam], [zero])
+    parameters = ca.vertcat(s.p, s.rest, s.ends, s.deviation)
+    return Potential(ca.vertcat(s.x, ca.vec(inner)), parameters, energy, conditions)
+
+
+def balance(model: CableModel, s: PoseSymbols) -> ca.SX:
+    """Gradient of the Lagrangian by increments and multipliers: force balance, then conditions."""
+    node, slots = model.chain.kind.node, model.chain.n_slots
+    b, n = node.increment, model.chain.n_nodes
+    rows = [ca.SX.zeros(b) for _ in range(max(n, slots + 1))]
+    _, ends, _ = model.at_ends(*_end_arguments(model, s))
+    border = ends[2 * b :]
+    for j, arguments in enumerate(_slot_arguments(model, s)):
+        _, gradient, _ = model.slot(*arguments)
+        rows[j] += gradient[:b]
+        rows[j + 1] += gradient[b : 2 * b]
+        border += gradient[2 * b :]
+    rows[0] += ends[:b]
+    rows[n - 1] += ends[b : 2 * b]
+    return ca.vertcat(*rows[:n], border)
+
+
+def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
+    """Measured curve ((n + 1) 2 or 4,): place, and slope of smooth elements, node by node."""
+    chain, layout = model.chain, model.chain.layout
+    c = chain.kind.node.coordinates
+    arguments = _slot_arguments(model, s)
+    steps = [model.slot_curve(*arguments[j]) for j in layout.advancing]
+    ratios = [step[2] for step in steps]
+    ratios = [
+        ratios[0],
+        *((a + b) / 2 for a, b in zip(ratios[:-1], ratios[1:], strict=True)),
+        ratios[-1],
+    ]
+    point, rows = s.ends[:2], []
+    for i, (first, last) in enumerate(layout.stations):
+        both = ca.vertcat(s.x[first * c : (first + 1) * c], s.x[last * c : (last + 1) * c])
+        rows.append(model.station(point, ratios[i], both, s.p, s.ends))
+        if i < chain.n:
+            point = point + steps[i][:2]
+    return ca.vertcat(*rows)
+
+
+def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
+    """Rest curvature (n_cells,) [1/m] that the pose leaves behind."""
+    arguments = _slot_arguments(model, s)
+    return ca.vertcat(*(model.slot_state(*arguments[j])[0] for j in model.chain.layout.bends))
+
+
+def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
+    c = model.chain.kind.node.coordinates
+    both = ca.vertcat(s.x[:c], s.x[s.x.numel() - c :])
+    return [both, s.lam, s.p, s.ends, s.deviation]
+
+
+def _slot_arguments(model: CableModel, s: PoseSymbols) -> list[list[ca.SX]]:
+    chain = model.chain
+    c, last = chain.kind.node.coordinates, chain.n_nodes - 1
+    rows = []
+    for j in range(chain.n_slots):
+        k = min(j + 1, last)
+        both = ca.vertcat(s.x[j * c : (j + 1) * c], s.x[k * c : (k + 1) * c])
+        own = ca.DM(chain.rest_of_slots[j]) @ s.rest
+        rows.append([both, s.lam, s.p, own, ca.DM(chain.layout.slots[j]), s.deviation])
+    return rows
