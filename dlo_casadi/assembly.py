@@ -264,9 +264,7 @@ class Assembly:
         (rows,) = self._call_slots("slot_strain", shapes, given)
         return rows[:, self.chain.layout.bends, 0, 0]
 
-    def state_after(
-        self, shapes: Shapes, given: Given
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def state_after(self, shapes: Shapes, given: Given) -> tuple[FloatArray, ...]:
         """Rest curvature (m, n_cells) that poses leave; its slopes by both nodes, rest and p."""
         bends = self.chain.layout.bends
         after, by_x, by_rest, by_p = self._call_slots("slot_state", shapes, given)
@@ -278,11 +276,7 @@ class Assembly:
         )
 
     def state_along(
-        self,
-        slopes: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-        x: FloatArray,
-        rest: FloatArray,
-        p: FloatArray,
+        self, slopes: tuple[FloatArray, ...], x: FloatArray, rest: FloatArray, p: FloatArray
     ) -> FloatArray:
         """Change (m, n_cells, q) of what poses leave behind, along nodes, rest and p."""
         bends = self.chain.layout.bends

@@ -180,19 +180,21 @@ class Sweep:
     def _pass_on(self, here: Shapes, given: Given, matrix: BandMatrix, step: Vector) -> Vector:
         """Newton step with the change of rest curvature handed from pose to pose."""
         a, n_p = self.assembly, given.p.shape[1]
-        change = np.zeros((1, given.rest.shape[1], 1))
+        change, none = np.zeros((1, given.rest.shape[1], 1)), np.zeros((1, n_p, 1))
         x, y = step.x.copy(), step.y.copy()
+        after = a.state_after(here, given)
+        if not after[1].any():
+            return step
         for j in range(len(x)):
-            one = [j]
-            shape, own = here.subset(one), given.subset(one)
+            one = np.array([j])
             if change.any():
-                along = _still(a, 1, change, np.zeros((1, n_p, 1)))
-                load = a.imbalance_by(shape, own, along)
-                more = matrix.subset(np.array(one)).factor().solve(load)
+                along = _still(a, 1, change, none)
+                load = a.imbalance_by(here.subset(one), given.subset(one), along)
+                more = matrix.subset(one).factor().solve(load)
                 x[j] -= more.x[0]
                 y[j] -= more.y[0]
-            slopes = a.state_after(shape, own)
-            change = a.state_along(slopes, x[one], change, np.zeros((1, n_p, 1)))
+            slopes = tuple(part[one] for part in after)
+            change = a.state_along(slopes, x[one], change, none)
         return Vector(x, y)
 
     # ---- derivatives -----------------------------------------------------------------------------
@@ -232,26 +234,41 @@ class Sweep:
         deviation = np.zeros((m, len(DEVIATIONS), q))
         deviation[:, self.used_deviations, size + np.arange(own)] = 1.0
         still = replace(_still(self.assembly, m, rest_along, p_along), deviation=deviation)
-        if not self.model.has_state:
-            load = self.assembly.imbalance_by(shapes, given, still)
-            found = matrix.factor().solve(load)
-            return replace(still, x=-found.x, lam=-found.y)
-        return self._carried(shapes, given, matrix, still, size)
+        if self.model.has_state:
+            slopes_after = self.assembly.state_after(shapes, given)
+            if slopes_after[1].any() or np.any(slopes_after[2] != 1):
+                return self._carried(shapes, given, matrix, still, slopes_after)
+            # A state that is not there yet hands on what it finds, and its own parameters' part.
+            left = slopes_after[3] @ p_along
+            still.rest[1:] += left[:-1].cumsum(axis=0)
+        return self._solved(shapes, given, matrix, still)
+
+    def _solved(
+        self, shapes: Shapes, given: Given, matrix: BandMatrix, still: Directions
+    ) -> Directions:
+        load = self.assembly.imbalance_by(shapes, given, still)
+        found = matrix.factor().solve(load)
+        return replace(still, x=-found.x, lam=-found.y)
 
     def _carried(
-        self, shapes: Shapes, given: Given, matrix: BandMatrix, along: Directions, size: int
+        self,
+        shapes: Shapes,
+        given: Given,
+        matrix: BandMatrix,
+        along: Directions,
+        after: tuple[FloatArray, ...],
     ) -> Directions:
         """`directions` in order: a pose finds the rest curvature that the one before has left."""
-        a = self.assembly
         x, lam, rest = along.x.copy(), along.lam.copy(), along.rest.copy()
+        size = rest.shape[2] - len(self.used_deviations)
         for j in range(self.m):
-            one = [j]
-            here, own = shapes.subset(one), given.subset(one)
+            one = np.array([j])
             now = Directions(x[one], lam[one], along.p[one], rest[one], along.deviation[one])
-            found = matrix.subset(np.array(one)).factor().solve(a.imbalance_by(here, own, now))
-            x[j], lam[j] = -found.x[0], -found.y[0]
+            now = self._solved(shapes.subset(one), given.subset(one), matrix.subset(one), now)
+            x[j], lam[j] = now.x[0], now.lam[0]
             if j + 1 < self.m:
-                change = a.state_along(a.state_after(here, own), x[one], now.rest, now.p)[0]
+                slopes = tuple(part[one] for part in after)
+                change = self.assembly.state_along(slopes, now.x, now.rest, now.p)[0]
                 # What a pose's own deviation leaves behind is left out of the later ones.
                 rest[j + 1, :, :size] = change[:, :size]
         return replace(along, x=x, lam=lam, rest=rest)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, Protocol
 
 import casadi as ca
@@ -80,18 +81,18 @@ class Layout:
     slots: FloatArray
     stations: NDArray[np.intp]
 
-    @property
+    @cached_property
     def bends(self) -> NDArray[np.intp]:
         """Slots that have a bending cell, in order."""
         return np.flatnonzero(self.slots[:, 4])
 
-    @property
+    @cached_property
     def cells(self) -> FloatArray:
         """Bending cells (n_cells, 2) [m]."""
         low, width = self.slots[self.bends, 2:4].T
         return np.stack([low, low + width], axis=1)
 
-    @property
+    @cached_property
     def advancing(self) -> NDArray[np.intp]:
         """Slots whose ends are element boundaries, in order (n,)."""
         return np.flatnonzero(self.slots[:, 1])
