@@ -452,6 +452,18 @@ class CableModel:
         outputs = ca.substitute([energy, kind.advance(slot)], [inner], [own])
         return self._here("slot_potential", [*self._slot_arguments, unknowns], outputs)
 
+    def true_length(self, p: FloatArray) -> float:
+        """Length [m] of the unloaded cable, whatever effects change it."""
+        function = ca.Function("length", [self._p], [self.cable.length * self._stretch])
+        return float(function(p))
+
+    def end_offsets(self, p: FloatArray) -> FloatArray:
+        """Held minus declared start (2), end (2) [m] and headings of start and end [rad] (6,)."""
+        held = self._held
+        where = ca.vertcat(held.start, held.end, held.start_heading, held.end_heading)
+        arguments = [self._ends, self._p, self._deviation]
+        return np.array(ca.Function("held", arguments, [where])(0, p, 0)).ravel()
+
     # ---- functions of a slot, an end, a node ---------------------------------------------------
 
     @property

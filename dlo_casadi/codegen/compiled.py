@@ -61,7 +61,7 @@ class CompiledSolver:
         folder = Path(tempfile.mkdtemp(prefix="dlo_solver_"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
-        n, k = model.n, model.chain.n_headings
+        n, k = model.n, model.chain.n_nodes
         self.record = np.dtype(
             {
                 "names": [
@@ -100,7 +100,7 @@ class CompiledSolver:
         """Record of a shape to start from, and its address."""
         if warm is None:
             return None, None
-        count = self.model.chain.n_headings
+        count = self.model.chain.n_nodes
         if not isinstance(warm, Shape) or np.shape(warm.headings) != (count,):
             raise DloError(f"warm: a shape of this solver, with {count} headings, belongs here")
         record = np.zeros(1, self.record)

@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import __version__
-from dlo_casadi.codegen.kernels import Group, groups_of, kernels_to_c, table_of, table_to_c
+from dlo_casadi.codegen.kernels import Kernels, c_number, kernels_of, table_to_c
 from dlo_casadi.codegen.prefix import check_prefix
-from dlo_casadi.codegen.program import c_number
-from dlo_casadi.codegen.split import Split
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.equilibrium import total_dead_load
+from dlo_casadi.errors import DloError
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -88,44 +87,47 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _extra(split: Split) -> list[float]:
+def _extra(model: CableModel, p: FloatArray) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
-    model = split.model
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
-    load = total_dead_load(model, split.p)
-    offset = split.offsets
-    return [split.length, down, *load, *split.constant, *offset[2:6]]
+    load = total_dead_load(model, p)
+    return [model.true_length(p), down, *load, *model.end_offsets(p)[2:6]]
 
 
-def _resting(split: Split) -> FloatArray:
-    """Headings (n_x,) of the cable at rest, counted from its start [rad]."""
-    chain = split.model.chain
-    cells = chain.cells
-    turn = np.concatenate([[0.0], np.cumsum(split.rest * np.diff(cells, axis=1).ravel())])
+def _resting(model: CableModel, rest: FloatArray) -> FloatArray:
+    """Headings (n_nodes,) of the cable at rest, counted from its start [rad]."""
+    cells = model.chain.cells
+    turn = np.concatenate([[0.0], np.cumsum(rest * np.diff(cells, axis=1).ravel())])
     edges = np.concatenate([cells[:1, 0], cells[:, 1]])
-    inner = np.interp(chain.heading_places, edges, turn)
-    head = [0.0] * split.first
-    return np.concatenate([head, inner, [turn[-1]] * (split.n_x - split.first - split.n_phi)])
+    return np.interp(model.chain.places, edges, turn)
 
 
-def numbers_of(split: Split, groups: list[Group]) -> list[float]:
-    """The solver's table: rows of the kernels, widths of the cells, rest shape, the rest."""
+def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray, kernels: Kernels) -> list[float]:
+    """The solver's table: numbers of the kernels, nodes, widths of the cells, rest, the others."""
+    stretch = model.true_length(p) / model.cable.length
     return [
-        *table_of(groups, split.slots),
-        *split.inverse_widths,
-        *_resting(split),
-        *_extra(split),
+        *kernels.table,
+        *(model.chain.places / model.cable.length),
+        *(1 / (np.diff(model.chain.cells, axis=1).ravel() * stretch)),
+        *_resting(model, rest),
+        *_extra(model, p),
     ]
 
 
-def _values(split: Split, groups: list[Group], prefix: str, digest: str) -> dict[str, str]:
+def _values(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    kernels: Kernels,
+    prefix: str,
+    digest: str,
+) -> dict[str, str]:
     """What the templates' marks stand for."""
-    model = split.model
-    kernels, loops = kernels_to_c(groups, split.n_x, model.yields)
-    rows = len(table_of(groups, split.slots))
+    functions, loops = kernels.to_c(model.yields)
+    chain, rows = model.chain, len(kernels.table)
     clamped = {side: int(getattr(model, side) == "clamped") for side in ("start", "end")}
-    links = model.element == "link"
     names = [effect.name for effect in model.effects]
+    count = chain.n_nodes
     return {
         "FILE": f"{prefix}_solver",
         "TITLE": model.cable.name.replace("*/", "* /"),
@@ -134,25 +136,25 @@ def _values(split: Split, groups: list[Group], prefix: str, digest: str) -> dict
         + (", ".join(names) or "none"),
         "HASH": digest,
         "N": str(model.n),
-        "N_HEADINGS": str(split.n_phi),
-        "HEADINGS_ARE": "of the links, element by element" if links else "at the nodes",
-        "LENGTH": c_number(split.length),
+        "N_HEADINGS": str(count),
+        "HEADINGS_ARE": chain.kind.nodes_are,
+        "LENGTH": c_number(model.true_length(p)),
         "START_CLAMPED": str(clamped["start"]),
         "END_CLAMPED": str(clamped["end"]),
         "END_FREE": str(int(model.end == "free")),
-        "WORKSPACE": str(_ARRAYS * (split.n_x + 1)),
-        "SLOTS": str(split.n_x),
-        "FIRST": str(split.first),
+        "WORKSPACE": str(_ARRAYS * (count + 1)),
+        "ELEMENTS": str(chain.n_slots),
+        "FIRST": str(chain.layout.advancing[0]),
         "LOW": str(clamped["start"]),
-        "HIGH": str(split.n_x - clamped["end"]),
+        "HIGH": str(count - clamped["end"]),
         "STRETCHES": str(int(model.extensible)),
         "ELASTIC": str(int(model.yields)),
-        "PLACE": "0.5" if links else "0.0",
-        "TABLE": table_to_c(numbers_of(split, groups)),
-        "WIDTHS": str(rows),
-        "RESTING": str(rows + split.n_x - 1),
-        "EXTRA": str(rows + 2 * split.n_x - 1),
-        "KERNELS": kernels,
+        "TABLE": table_to_c(numbers_of(model, p, rest, kernels)),
+        "PLACES": str(rows),
+        "WIDTHS": str(rows + count),
+        "RESTING": str(rows + 2 * count - 1),
+        "EXTRA": str(rows + 3 * count - 1),
+        "KERNELS": functions,
         "LOOPS": loops,
     }
 
@@ -198,10 +200,15 @@ def generate(
         If the prefix is not a C identifier or an effect cannot be generated.
     """
     check_prefix(prefix)
-    split = Split(model, p, rest)
-    groups = groups_of(split.slots, inline)
-    digest = solver_hash(model, split.p, split.rest)
-    values = _values(split, groups, prefix, digest)
+    p, rest = np.asarray(p, float).ravel(), np.asarray(rest, float).ravel()
+    if len(p) != len(model.parameters) or len(rest) != model.chain.n_cells:
+        raise DloError(
+            f"p has {len(p)} and rest {len(rest)} entries; the model has "
+            f"{len(model.parameters)} parameters and {model.chain.n_cells} cells"
+        )
+    kernels = kernels_of(model, p, rest, inline)
+    digest = solver_hash(model, p, rest)
+    values = _values(model, p, rest, kernels, prefix, digest)
     source = "".join(_template(name) for name in ("solver.c.in", "guesses.c.in", "interface.c.in"))
     names = {
         f"{prefix}_solver.h": "solver.h.in",

@@ -1,234 +1,35 @@
-"""C text of the kernels: one function per shape of slot, a table of numbers for each."""
+"""C text of the model's slots: CasADi prints the very functions that all else differentiates."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from math import isfinite
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from dlo_casadi.codegen.program import UNARY, Program, c_number, on_symbols
-from dlo_casadi.codegen.split import Slot
+from dlo_casadi.errors import DloError
+from dlo_casadi.model import DEVIATIONS, CableModel
+
+FloatArray = NDArray[np.floating]
 
 # Numbers that differ by less come from differences of the same mesh.
 _ROUNDING = 1e-14
-_HEAD = """\
-/* {n} of {total} slots, e.g. slot {first}; derivatives of {size} terms. */
-static double kernel_{k}(point_t *q, int j{row})
-{{
-    const double *const x = q->x + j;
-"""
+# Columns of a slot's own numbers: where it starts [m], and its rest curvature inside [1/m].
+_OWN = 4
+# What CasADi calls by names of its own; the others are those of libm.
+_CALLS = {"casadi_sq": "square", "casadi_sign": "sign_of", "casadi_real": "double"}
 
 
-@dataclass(frozen=True)
-class Kernel:
-    """L_j as a function of symbols, for all slots of one key.
-
-    Parameters
-    ----------
-    x : (2,), lam : (2,), numbers : (k,)
-    value : scalar
-    """
-
-    x: ca.SX
-    lam: ca.SX
-    numbers: ca.SX
-    value: ca.SX
-
-
-def kernel_of(key: str, n_numbers: int) -> Kernel:
-    """Rebuild L_j of a slot from its key, with symbols for the numbers."""
-    x, lam = ca.SX.sym("x", 2), ca.SX.sym("lam", 2)
-    numbers = ca.SX.sym("c", n_numbers)
-    used = 0
-    total = ca.SX(0)
-
-    def take() -> ca.SX:
-        nonlocal used
-        used += 1
-        return numbers[used - 1]
-
-    for term in key.split("|") if key else []:
-        multipliers, text = term.split(":")
-        factor = ca.SX(0)
-        for k in map(int, multipliers.split(",")):
-            factor += take() * (lam[k] if k >= 0 else 1)
-        stack: list[ca.SX] = []
-        for token in text.split(" "):
-            if token in ("a", "b"):
-                stack.append(x[token == "b"])
-            elif token in ("u", "v"):
-                stack.append(lam[token == "v"])
-            elif token == "#":
-                stack.append(take())
-            else:
-                op = int(token[1:])
-                n = 1 if op in UNARY else 2
-                operands = stack[-n:]
-                del stack[-n:]
-                stack.append(on_symbols(op, operands))
-        total += factor * stack.pop()
-    return Kernel(x, lam, numbers, total)
-
-
-@dataclass(frozen=True)
-class Group:
-    """Slots that share one kernel.
-
-    Parameters
-    ----------
-    key : str
-    members : tuple of int
-        Slots, ascending.
-    columns : tuple of int
-        Which of a slot's numbers form the row of the table; equal columns are stored once.
-    source : tuple of (str, float)
-        Of each number: ("column", which) or ("value", number).
-    """
-
-    key: str
-    members: tuple[int, ...]
-    columns: tuple[int, ...]
-    source: tuple[tuple[str, float], ...]
-
-    @classmethod
-    def of(cls, key: str, members: Sequence[int], slots: Sequence[Slot], inline: bool) -> Group:
-        """Sort a key's numbers into those that are the same everywhere and columns."""
-        table = np.array([slots[j].numbers for j in members])
-        columns: list[int] = []
-        source: list[tuple[str, float]] = []
-        seen: dict[bytes, int] = {}
-        for i in range(table.shape[1]):
-            column = table[:, i].tobytes()
-            if inline and np.allclose(table[:, i], table[0, i], rtol=_ROUNDING, atol=0.0):
-                source.append(("value", float(table[0, i])))
-                continue
-            if column not in seen:
-                seen[column] = len(columns)
-                columns.append(i)
-            source.append(("column", float(seen[column])))
-        return cls(key, tuple(members), tuple(columns), tuple(source))
-
-    def rows(self, slots: Sequence[Slot]) -> list[list[float]]:
-        """Rows of the table, one per member."""
-        return [[slots[j].numbers[i] for i in self.columns] for j in self.members]
-
-    @cached_property
-    def runs(self) -> list[tuple[int, int, int]]:
-        """Contiguous members: (first slot, one past the last, row of the first)."""
-        out: list[tuple[int, int, int]] = []
-        for row, j in enumerate(self.members):
-            if out and out[-1][1] == j:
-                out[-1] = (out[-1][0], j + 1, out[-1][2])
-            else:
-                out.append((j, j + 1, row))
-        return out
-
-
-def _function(group: Group) -> ca.Function:
-    """(x, lam, columns) -> L_j, its gradient (4,) and Hessian (4, 4) by (x_j, x_j+1, lam)."""
-    kernel = kernel_of(group.key, len(group.source))
-    columns = ca.SX.sym("c", len(group.columns))
-    numbers = [columns[int(v)] if kind == "column" else ca.SX(v) for kind, v in group.source]
-    (value,) = ca.substitute([kernel.value], [kernel.numbers], [ca.vertcat(*numbers)])
-    unknowns = ca.vertcat(kernel.x, kernel.lam)
-    hessian, gradient = ca.hessian(value, unknowns)
-    outputs = ca.cse([value, gradient, ca.triu(hessian)])
-    return ca.Function("kernel", [kernel.x, kernel.lam, columns], outputs)
-
-
-def _assignments(
-    names: dict[tuple[int, int], str], function: ca.Function, elastic: bool
-) -> list[str]:
-    """Statements that add a kernel's derivatives to the point."""
-    gradient, hessian = function.sparsity_out(1), function.sparsity_out(2)
-    found: dict[tuple[str | int, ...], str] = {}
-    for (which, element), text in names.items():
-        if which == 1:
-            found["g", gradient.row()[element]] = text
-        elif which == 2:
-            found["h", hessian.row()[element], hessian.get_col()[element]] = text
-    targets: list[tuple[str, tuple[str | int, ...]]] = [
-        ("q->gradient[j] +=", ("g", 0)),
-        ("q->gradient[j + 1] =", ("g", 1)),
-        ("q->diagonal[j] +=", ("h", 0, 0)),
-        ("q->diagonal[j + 1] =", ("h", 1, 1)),
-        ("q->off[j] =", ("h", 0, 1)),
-        ("q->jx[j] +=", ("h", 0, 2)),
-        ("q->jy[j] +=", ("h", 0, 3)),
-        ("q->jx[j + 1] =", ("h", 1, 2)),
-        ("q->jy[j + 1] =", ("h", 1, 3)),
-        ("q->bx[j] =", ("h", 1, 2)),
-        ("q->by[j] =", ("h", 1, 3)),
-        ("q->ax[j] =", ("g", 2)),
-        ("q->ay[j] =", ("g", 3)),
-    ]
-    if elastic:
-        targets += [
-            ("q->kx[j] =", ("h", 2, 2)),
-            ("q->kxy[j] =", ("h", 2, 3)),
-            ("q->ky[j] =", ("h", 3, 3)),
-        ]
-    lines = []
-    for target, place in targets:
-        if found.get(place, "0.0") != "0.0":
-            lines.append(f"    {target} {found[place]};")
-        elif target.endswith(" ="):
-            lines.append(f"    {target} 0.0;")
-    return lines
-
-
-def groups_of(slots: Sequence[Slot], inline: bool = True) -> list[Group]:
-    """Slots by shape, in order of first appearance."""
-    members: dict[str, list[int]] = {}
-    for j, slot in enumerate(slots):
-        members.setdefault(slot.key, []).append(j)
-    return [Group.of(key, found, slots, inline) for key, found in members.items()]
-
-
-def table_of(groups: Sequence[Group], slots: Sequence[Slot]) -> list[float]:
-    """All tables behind one another: what kernels read as `table`."""
-    return [number for group in groups for row in group.rows(slots) for number in row]
-
-
-def kernels_to_c(groups: Sequence[Group], n_slots: int, elastic: bool) -> tuple[str, str]:
-    """Kernel functions, and the loops that call them for all slots."""
-    functions, loops, offset = [], [], 0
-    for k, group in enumerate(groups):
-        function = _function(group)
-        program = Program.of(function)
-        width = len(group.columns)
-        inputs = {(0, i): f"x[{i}]" for i in range(2)}
-        inputs |= {(1, i): f"q->lam[{i}]" for i in range(2)}
-        inputs |= {(2, i): f"row[{i}]" for i in range(width)}
-        lines, names = program.to_c(inputs, "    ")
-        body = "\n".join([*lines, *_assignments(names, function, elastic)])
-        head = _HEAD.format(
-            k=k,
-            n=len(group.members),
-            total=n_slots,
-            first=group.members[0],
-            size=group.key.count("|") + 1 if group.key else 0,
-            row=", const double *row" if width else "",
-        )
-        if not re.search(r"(?<![\w>])x\[", body):
-            head = head[: head.index("    const double *const x")]
-        value = names.get((0, 0), "0.0")
-        functions.append(f"{head}{body}\n    return {value};\n}}\n")
-        for first, last, row in group.runs:
-            place = offset + row * width
-            argument = f", table + {place} + (j - {first}) * {width}" if width else ""
-            text = (
-                f"    for (j = {first}; j < {last}; ++j)\n"
-                f"        total += kernel_{k}(q, j{argument});"
-            )
-            loops.append((first, text))
-        offset += width * len(group.members)
-    # Ascending: a slot sets what it shares with the next one, which adds to it.
-    return "\n".join(functions), "\n".join(text for _, text in sorted(loops))
+def c_number(value: float) -> str:
+    """Shortest C literal of a finite double that reads back to the same bits."""
+    if not isfinite(value):
+        raise DloError(f"the generated solver would contain the constant {value}")
+    text = repr(float(value))
+    return text if any(mark in text for mark in ".e") else text + ".0"
 
 
 def table_to_c(numbers: Sequence[float]) -> str:
@@ -236,3 +37,257 @@ def table_to_c(numbers: Sequence[float]) -> str:
     texts = [c_number(number) for number in numbers] or ["0.0"]
     rows = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
     return ",\n    ".join(rows)
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Slots of one kind, which differ in numbers only.
+
+    Parameters
+    ----------
+    members : (first, last) int
+        Slots first <= j < last.
+    rows : (last - first, k)
+        Numbers that differ from slot to slot.
+    function : casadi.Function
+        (x (2,), lam (2,), row (k,), p) -> value, gradient (4,), upper triangle of the Hessian.
+    """
+
+    members: tuple[int, int]
+    rows: FloatArray
+    function: ca.Function
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """All that the generated solver knows of a model's mechanics.
+
+    Parameters
+    ----------
+    slots : tuple of Kernel
+        In the order of the cable.
+    ends : casadi.Function or None
+        The holders' own energy by the first and last node; None where they have none.
+    shared : (n_parameters,) or (0,)
+        Parameters that stand in the table, ahead of the slots' rows.
+    """
+
+    slots: tuple[Kernel, ...]
+    ends: ca.Function | None
+    shared: FloatArray
+
+    @property
+    def table(self) -> list[float]:
+        """What the kernels read: shared numbers, then the rows of all slots."""
+        rows = [kernel.rows.ravel() for kernel in self.slots]
+        return [float(number) for number in np.concatenate([self.shared, *rows])]
+
+    def to_c(self, elastic: bool) -> tuple[str, str]:
+        """Kernel functions, and the statements that call them for all slots."""
+        functions, loops, offset = [], [], len(self.shared)
+        for k, kernel in enumerate(self.slots):
+            (first, last), width = kernel.members, kernel.rows.shape[1]
+            functions.append(_kernel_text(k, kernel, elastic))
+            row = f"table + {offset} + (j - {first}) * {width}" if width else "table"
+            loops.append(
+                f"    for (j = {first}; j < {last}; ++j)\n"
+                f"        total += kernel_{k}(q, j, {row}, table);"
+            )
+            offset += kernel.rows.size
+        if self.ends is not None:
+            functions.append(_ends_text(self.ends))
+            loops.append("    total += at_ends(q, table);")
+        return "\n".join(functions), "\n".join(loops)
+
+
+def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True) -> Kernels:
+    """Kernels of a model at given parameters.
+
+    Parameters
+    ----------
+    inline : bool
+        Whether numbers that all slots share are written into the code; otherwise parameters and
+        rows are in the table, and cables of one kind differ in it alone.
+    """
+    places = model.chain.layout.slots
+    own = np.column_stack([places[:, 0], model.chain.rest_of_slots @ rest])
+    kinds = places[:, 1:].copy()
+    kinds[:, 1] -= places[:, 0]  # where the cell starts, counted from the slot
+    edges = [0, *(np.flatnonzero(np.any(np.diff(kinds.round(14), axis=0), axis=1)) + 1), len(own)]
+    parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
+    slots = tuple(
+        _kernel(model, parameters, kinds[first], own[first:last], (first, last), inline)
+        for first, last in zip(edges[:-1], edges[1:], strict=True)
+    )
+    shared = np.zeros(0) if inline else np.asarray(p, float)
+    return Kernels(slots, _ends(model, parameters), shared)
+
+
+def _kernel(
+    model: CableModel,
+    p: ca.SX,
+    kind: FloatArray,
+    own: FloatArray,
+    members: tuple[int, int],
+    inline: bool,
+) -> Kernel:
+    x, lam = ca.SX.sym("x", 2), ca.SX.sym("lam", 2)
+    varies = [
+        not (inline and np.allclose(column, column[0], rtol=_ROUNDING, atol=0.0))
+        for column in own.T
+    ]
+    row = ca.SX.sym("row", sum(varies))
+    symbols = iter(ca.vertsplit(row)) if row.numel() else iter(())
+    numbers = [
+        next(symbols) if varied else ca.SX(float(column[0]))
+        for varied, column in zip(varies, own.T, strict=True)
+    ]
+    start = numbers[0]
+    place = ca.vertcat(start, kind[0], start + kind[1], *kind[2:])
+    still = ca.DM.zeros(len(DEVIATIONS))
+    position = ca.SX.zeros(0) if model.end == "free" else lam
+    multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
+    arguments = [x, multipliers, p, ca.vertcat(*numbers[1:]), place, still]
+    value = model.slot(*arguments)[0]
+    if model.end == "free":
+        # lam is zero there; its derivative is the way from slot to slot all the same.
+        value += ca.dot(lam, model.slot_curve(*arguments)[:2])
+    function = _derivatives(value, [x, lam, row, _symbols(p)], ca.vertcat(x, lam))
+    return Kernel(members, own[:, varies], function)
+
+
+def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
+    """Energy of the holders, without end conditions."""
+    x, lam = ca.SX.sym("x", 2), ca.SX.zeros(model.n_conditions)
+    value, _, _ = model.at_ends(x, lam, p, ca.DM.zeros(6), ca.DM.zeros(len(DEVIATIONS)))
+    if not ca.depends_on(value, x):
+        return None
+    return _derivatives(value, [x, _symbols(p)], x)
+
+
+def _symbols(p: ca.SX) -> ca.SX:
+    return p if p.is_valid_input() else ca.SX.zeros(0)
+
+
+def _derivatives(value: ca.SX, arguments: list[ca.SX], by: ca.SX) -> ca.Function:
+    hessian, gradient = ca.hessian(value, by)
+    outputs = ca.cse([value, ca.sparsify(gradient), ca.triu(hessian)])
+    return ca.Function("kernel", arguments, outputs)
+
+
+# ---- text --------------------------------------------------------------------------------------
+
+_BODY = re.compile(r"^static int casadi_f0\(.*?\{\n(.*?)^\}", re.MULTILINE | re.DOTALL)
+_INPUT = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
+_OUTPUT = re.compile(r"if \(res\[(\d+)\]!=0\) res\[\1\]\[(\d+)\]=(.*?);")
+
+
+def _statements(function: ca.Function, inputs: Sequence[str], targets: dict[tuple, str]) -> str:
+    """What CasADi prints for a function, reading and writing our names.
+
+    Parameters
+    ----------
+    inputs : sequence of str
+        C array of each input.
+    targets : dict
+        ("value",), ("g", row) or ("h", row, column) -> the assignment's left side and operator.
+    """
+    generator = ca.CodeGenerator("kernel")
+    generator.add(function)
+    found = _BODY.search(generator.dump())
+    if found is None:  # pragma: no cover: another version of CasADi prints in another way
+        raise DloError("CasADi printed no function; try another version of CasADi")
+    names = dict(_places(function))
+
+    def output(match: re.Match[str]) -> str:
+        place = names[int(match[1]), int(match[2])]
+        return f"{targets[place]} {match[3]};" if place in targets else ""
+
+    text = _INPUT.sub(lambda match: f"{inputs[int(match[1])]}[{match[2]}]", found[1])
+    text = _OUTPUT.sub(output, text).replace("  return 0;\n", "")
+    text = re.sub(r"casadi_\w+", lambda match: _CALLS.get(match[0], match[0][len("casadi_") :]), text)
+    return "\n".join("  " + line for line in text.splitlines() if line.strip())
+
+
+def _places(function: ca.Function) -> Iterator[tuple[tuple[int, int], tuple]]:
+    """Where each nonzero of the outputs belongs."""
+    yield (0, 0), ("value",)
+    for i, row in enumerate(function.sparsity_out(1).row()):
+        yield (1, i), ("g", row)
+    hessian = function.sparsity_out(2)
+    for i, place in enumerate(zip(hessian.row(), hessian.get_col(), strict=True)):
+        yield (2, i), ("h", *place)
+
+
+# Of the unknowns (x_j, x_(j+1), lam_x, lam_y): where a slot's derivatives are added or set.
+_TARGETS: dict[tuple, tuple[str, ...]] = {
+    ("g", 0): ("q->gradient[j] +=",),
+    ("g", 1): ("q->gradient[j + 1] =",),
+    ("h", 0, 0): ("q->diagonal[j] +=",),
+    ("h", 1, 1): ("q->diagonal[j + 1] =",),
+    ("h", 0, 1): ("q->off[j] =",),
+    ("h", 0, 2): ("q->jx[j] +=",),
+    ("h", 0, 3): ("q->jy[j] +=",),
+    ("h", 1, 2): ("q->jx[j + 1] = q->bx[j] =",),
+    ("h", 1, 3): ("q->jy[j + 1] = q->by[j] =",),
+    ("g", 2): ("q->ax[j] =",),
+    ("g", 3): ("q->ay[j] =",),
+}
+_ELASTIC: dict[tuple, tuple[str, ...]] = {
+    ("h", 2, 2): ("q->kx[j] =",),
+    ("h", 2, 3): ("q->kxy[j] =",),
+    ("h", 3, 3): ("q->ky[j] =",),
+}
+
+
+def _kernel_text(k: int, kernel: Kernel, elastic: bool) -> str:
+    targets = {place: text for place, (text,) in (_TARGETS | (_ELASTIC if elastic else {})).items()}
+    there = {place for _, place in _places(kernel.function)}
+    zeros = [
+        f"    {text} 0.0;"
+        for place, text in targets.items()
+        if place not in there and not text.endswith("+=")
+    ]
+    targets["value",] = "value ="
+    body = _statements(kernel.function, ("x", "q->lam", "row", "table"), targets)
+    first, last = kernel.members
+    return "\n".join(
+        [
+            f"/* Slots {first} to {last - 1}. */",
+            f"static double kernel_{k}(point_t *q, int j, const double *row, const double *table)",
+            "{",
+            "    const double *const x = q->x + j;",
+            "    double value = 0.0;",
+            body,
+            *zeros,
+            "    (void)x, (void)row, (void)table;",
+            "    return value;",
+            "}",
+            "",
+        ]
+    )
+
+
+def _ends_text(function: ca.Function) -> str:
+    targets: dict[tuple, str] = {
+        ("value",): "value =",
+        ("g", 0): "q->gradient[0] +=",
+        ("g", 1): "q->gradient[SLOTS - 1] +=",
+        ("h", 0, 0): "q->diagonal[0] +=",
+        ("h", 1, 1): "q->diagonal[SLOTS - 1] +=",
+    }
+    body = _statements(function, ("x", "table"), targets)
+    return "\n".join(
+        [
+            "/* What holds the first and the last node beside their conditions. */",
+            "static double at_ends(point_t *q, const double *table)",
+            "{",
+            "    const double x[2] = {q->x[0], q->x[SLOTS - 1]};",
+            "    double value = 0.0;",
+            body,
+            "    (void)x, (void)table;",
+            "    return value;",
+            "}",
+            "",
+        ]
+    )

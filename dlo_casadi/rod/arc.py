@@ -20,6 +20,7 @@ class Arc(Element):
 
     name = "arc"
     plain = "arc"
+    nodes_are = "at the nodes"
     node = Heading
     order = 2
     smooth = True
@@ -39,7 +40,7 @@ class Arc(Element):
 
     def strain(self, slot: Slot) -> ca.SX:
         """Turning over true length."""
-        return (slot.last - slot.first) / (slot.length * slot.stretch)
+        return (slot.last - slot.first) * (1 / (slot.length * slot.stretch))
 
     def heading(self, slot: Slot, u: ca.SX | float) -> ca.SX:
         """Heading [rad] at the fraction u."""

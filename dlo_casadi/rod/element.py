@@ -168,6 +168,8 @@ class Element(ABC):
     Attributes
     ----------
     name : str
+    nodes_are : str
+        Where its nodes are, in words.
     node : Node
         What its nodes carry.
     order : int
@@ -188,6 +190,7 @@ class Element(ABC):
     order: ClassVar[int]
     smooth: ClassVar[bool]
     plain: ClassVar[str]
+    nodes_are: ClassVar[str]
     n_inner: ClassVar[int] = 0
     rule: ClassVar[tuple[FloatArray, FloatArray]]
 

@@ -18,6 +18,7 @@ class Link(Element):
 
     name = "link"
     plain = "link"
+    nodes_are = "in the middles of the links, and of the clamps"
     node = Heading
     order = 2
     smooth = False
@@ -45,7 +46,7 @@ class Link(Element):
 
     def strain(self, slot: Slot) -> ca.SX:
         """Bend of the hinge over the width of its cell."""
-        return slot.has_cell * (slot.last - slot.first) / (slot.cell.width * slot.stretch)
+        return slot.has_cell * (slot.last - slot.first) * (1 / (slot.cell.width * slot.stretch))
 
     def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
         """The link's direction."""

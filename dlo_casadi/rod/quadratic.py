@@ -46,7 +46,7 @@ class Quadratic(Arc):
             tangent = tangent * (first + second) / 2
             uneven += (first - second) / (first + second)
         # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
-        bowed = 4 / np.sqrt(3) * slot.inner / (slot.length * slot.stretch)
+        bowed = 4 / np.sqrt(3) * slot.inner * (1 / (slot.length * slot.stretch))
         # Where the halves resist differently, a mean bend bows the cell.
         density += stiffness / 2 * tangent * (bowed**2 + 2 * uneven * bend * bowed)
         return cell.width * density * slot.stretch

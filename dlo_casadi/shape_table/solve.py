@@ -48,7 +48,7 @@ class Plan:
     @property
     def chunk(self) -> int:
         """Poses of a chunk."""
-        n, k = self.model.n, self.model.chain.n_headings
+        n, k = self.model.n, self.model.chain.n_nodes
         return max(1, CHUNK_BYTES // (8 * (2 * (n + 1) + k + 12)))
 
     def part(self, index: int) -> Path:
