@@ -372,11 +372,27 @@ class CableModel:
         for u, weight in zip(*kind.rule, strict=True):
             resultant = self._resultant(slot.start + u * slot.length)
             energy -= weight * slot.length * ca.dot(resultant, kind.tangent(slot, u))
-        for force in self._forces:
-            # Up to where it acts; a slot without length has nothing to advance along.
-            u = ca.fmin(ca.fmax((force.position - slot.start) / self.chain.h, 0), 1)
-            energy -= ca.dot(force.force, kind.advance(slot, u))
+        for force, share in zip(self._forces, ca.vertsplit(self._shares), strict=False):
+            energy -= ca.dot(force.force, kind.advance(slot, share))
         return energy
+
+    @cached_property
+    def _shares(self) -> ca.SX:
+        """Shares of a slot up to which the forces on single places have it advance, 0 to 1."""
+        return ca.SX.sym("share", len(self._forces))
+
+    @cached_property
+    def shares(self) -> ca.Function:
+        """(p, place) -> the shares of a slot (n_forces,)."""
+        start = self._place[0]
+        found = [
+            ca.fmin(ca.fmax((force.position - start) / self.chain.h, 0), 1)
+            for force in self._forces
+        ]
+        return ca.Function("shares", [self._p, self._place], [ca.vertcat(ca.SX.zeros(0), *found)])
+
+    def _with_shares(self, expressions: list[ca.SX]) -> list[ca.SX]:
+        return ca.substitute(expressions, [self._shares], [self.shares(self._p, self._place)])
 
     def _pull(self, advance: ca.SX) -> ca.SX:
         """Work of the end's multipliers along a slot [J]."""
@@ -384,6 +400,19 @@ class CableModel:
 
     @cached_property
     def _terms(self) -> _SlotTerms:
+        """A slot's Lagrangian and curve."""
+        terms = self._terms_by_share
+        return _SlotTerms(*self._with_shares([terms.lagrangian, terms.advance, terms.ratio]))
+
+    @cached_property
+    def slot_by_share(self) -> ca.Function:
+        """(x, lam, p, rest, place, deviation, shares) -> L_e and advance: see `shares`."""
+        terms = self._terms_by_share
+        arguments = [*self._slot_arguments, self._shares]
+        return self._here("slot_by_share", arguments, [terms.lagrangian, terms.advance])
+
+    @cached_property
+    def _terms_by_share(self) -> _SlotTerms:
         """A slot's Lagrangian, and its curve, stretched by the tension and bowed.
 
             L_e = V_e + lam^T advance_e - h C N_e^2 / 2,   N_e = -(1/h) dL_e/d(ratio)
@@ -404,7 +433,7 @@ class CableModel:
             (tension,) = ca.substitute(
                 [-ca.gradient(plain, ratio) / h],
                 [ratio, inner],
-                [self._stretch, ca.SX.zeros(kind.n_inner)],
+                [self._stretch, ca.SX.zeros(inner.shape)],
             )
             lagrangian -= self._compliance * h * tension**2 / 2
             stretched = self._stretch + self._compliance * tension
@@ -448,9 +477,10 @@ class CableModel:
         inner = ca.SX.sym("inner", kind.n_inner)
         slot = self._slot(ratio, inner, inner**2)
         energy = kind.expanded(slot, self._slot_energy(slot)) + self.chain.h * axial**2 / 2
-        own = unknowns[self.n_inner - kind.n_inner :]
+        own = ca.reshape(unknowns[self.n_inner - kind.n_inner :], inner.shape)
         outputs = ca.substitute([energy, kind.advance(slot)], [inner], [own])
-        return self._here("slot_potential", [*self._slot_arguments, unknowns], outputs)
+        arguments = [*self._slot_arguments, unknowns]
+        return self._here("slot_potential", arguments, self._with_shares(outputs))
 
     def true_length(self, p: FloatArray) -> float:
         """Length [m] of the unloaded cable, whatever effects change it."""

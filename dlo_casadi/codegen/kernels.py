@@ -22,6 +22,10 @@ _ROUNDING = 1e-14
 _OWN = 4
 # What CasADi calls by names of its own; the others are those of libm.
 _CALLS = {"casadi_sq": "square", "casadi_sign": "sign_of", "casadi_real": "double"}
+_HELPERS = {
+    "square": "static double square(double a) { return a * a; }\n",
+    "sign_of": "static double sign_of(double a) { return a > 0.0 ? 1.0 : (a < 0.0 ? -1.0 : a); }\n",
+}
 
 
 def c_number(value: float) -> str:
@@ -97,7 +101,9 @@ class Kernels:
         if self.ends is not None:
             functions.append(_ends_text(self.ends))
             loops.append("    total += at_ends(q, table);")
-        return "\n".join(functions), "\n".join(loops)
+        text = "\n".join(functions)
+        helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
+        return "\n".join([*helpers, text]), "\n".join(loops)
 
 
 def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True) -> Kernels:
@@ -111,12 +117,16 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
     """
     places = model.chain.layout.slots
     own = np.column_stack([places[:, 0], model.chain.rest_of_slots @ rest])
-    kinds = places[:, 1:].copy()
-    kinds[:, 1] -= places[:, 0]  # where the cell starts, counted from the slot
-    edges = [0, *(np.flatnonzero(np.any(np.diff(kinds.round(14), axis=0), axis=1)) + 1), len(own)]
+    kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
+    # A force on a single place pulls at all of a slot, at nothing of it, or it stands in there.
+    shares = np.array([np.array(model.shares(p, place)).ravel() for place in places])
+    inside = (shares > 0) & (shares < 1)
+    alone = np.arange(len(own))[:, None] * inside
+    told = np.column_stack([kinds.round(14), shares * ~inside, alone]) if inline else kinds.round(14)
+    edges = [0, *(np.flatnonzero(np.any(np.diff(told, axis=0), axis=1)) + 1), len(own)]
     slots = tuple(
-        _kernel(model, parameters, kinds[first], own[first:last], (first, last), inline)
+        _kernel(model, parameters, places[first], own[first:last], (first, last), inline)
         for first, last in zip(edges[:-1], edges[1:], strict=True)
     )
     shared = np.zeros(0) if inline else np.asarray(p, float)
@@ -126,7 +136,7 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
 def _kernel(
     model: CableModel,
     p: ca.SX,
-    kind: FloatArray,
+    first: FloatArray,
     own: FloatArray,
     members: tuple[int, int],
     inline: bool,
@@ -143,15 +153,17 @@ def _kernel(
         for varied, column in zip(varies, own.T, strict=True)
     ]
     start = numbers[0]
-    place = ca.vertcat(start, kind[0], start + kind[1], *kind[2:])
+    # The cell's start is counted from the slot's, so that slots of one kind differ in that alone.
+    place = ca.vertcat(start, first[1], start + (first[2] - first[0]), *first[3:])
+    shares = model.shares(p, ca.DM(first) if inline else place)
     still = ca.DM.zeros(len(DEVIATIONS))
     position = ca.SX.zeros(0) if model.end == "free" else lam
     multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
-    arguments = [x, multipliers, p, ca.vertcat(*numbers[1:]), place, still]
-    value = model.slot(*arguments)[0]
+    arguments = [x, multipliers, p, ca.vertcat(*numbers[1:]), place, still, shares]
+    value, advance = model.slot_by_share(*arguments)
     if model.end == "free":
         # lam is zero there; its derivative is the way from slot to slot all the same.
-        value += ca.dot(lam, model.slot_curve(*arguments)[:2])
+        value += ca.dot(lam, advance)
     function = _derivatives(value, [x, lam, row, _symbols(p)], ca.vertcat(x, lam))
     return Kernel(members, own[:, varies], function)
 
