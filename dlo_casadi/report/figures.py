@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import StrMethodFormatter
+from matplotlib.ticker import LogLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from dlo_casadi.estimation.moment import LEAST_POINTS, law_of, measured_moment_curve
@@ -328,7 +328,9 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
         ]
         axes.set_yticks(middles, [rows[k][0] for k in range(0, len(rows), per_stage)])
         axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        for part in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+            part(StrMethodFormatter("{x:g}"))
         axes.set_xlim(1e3 * left, 1e3 * right)
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("distance of the measured points from the prediction, RMS [mm]")

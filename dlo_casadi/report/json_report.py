@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dlo_casadi.errors import well_formed
 from dlo_casadi.session.outcome import Outcome, ParameterEstimate, Stage, StageName
 
 SCHEMA = "dlo-report/1"
@@ -80,15 +81,17 @@ def all_warnings(outcome: Outcome) -> list[str]:
 
 
 def finite(value: Any) -> Any:
-    """Copy with NumPy's numbers as plain ones and None for what is not finite."""
+    """Copy with plain numbers for NumPy's, None for what is not finite, and `well_formed` text."""
     if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
+        return {finite(str(key)): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [finite(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
         return finite(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, str):
+        return well_formed(value)
     return value
 
 

@@ -9,6 +9,7 @@ import difflib
 import hashlib
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -286,11 +287,11 @@ def load_parameters(path: str | Path) -> Parameters:
         bounds; the message names the key.
     """
     source = Path(path)
-    if source.is_dir():
+    if os.path.isdir(source):
         source = source / FILE
         if not source.is_file():
             raise ConfigError(f"no {FILE} in this folder.{_results_near(source)}", source.parent)
-    elif not source.exists():
+    elif not os.path.exists(source):
         raise ConfigError(f"no such file or folder of results.{_results_near(source)}", source)
     document = read_yaml(source)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
