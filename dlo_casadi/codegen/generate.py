@@ -17,12 +17,15 @@ from dlo_casadi.codegen.kernels import Group, groups_of, kernels_to_c, table_of,
 from dlo_casadi.codegen.prefix import check_prefix
 from dlo_casadi.codegen.program import c_number
 from dlo_casadi.codegen.split import Split
+from dlo_casadi.durable import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.equilibrium import total_dead_load
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
+# By which a generated file is known, in all templates.
+MARK = "written by dlo-casadi"
 # Doubles of a workspace per slot; as in the template.
 _ARRAYS = 38
 
@@ -49,15 +52,23 @@ class Solver:
     workspace: int
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write all files into the folder, which is made if it is missing."""
+        """Write all files into the folder, which is made if it is missing: all of them or none.
+
+        Files of these names are replaced if they are generated ones, known by a mark in each;
+        other files in the folder stay.
+
+        Raises
+        ------
+        OutputError
+            If the folder cannot be written, or holds files of these names from elsewhere.
+        """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        written = []
-        for name, text in self.files.items():
-            path = folder / name
-            path.write_text(text, encoding="utf-8", newline="\n")
-            written.append(path)
-        return written
+        refuse_foreign(folder, [name for name in self.files if not is_marked(folder / name, MARK)])
+        with FolderDraft(folder) as draft:
+            for name, text in self.files.items():
+                write_file(draft.folder / name, text)
+            draft.put_in_place()
+        return [folder / name for name in self.files]
 
 
 def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
@@ -128,10 +139,10 @@ def _values(split: Split, groups: list[Group], prefix: str, digest: str) -> dict
     names = [effect.name for effect in model.effects]
     return {
         "FILE": f"{prefix}_solver",
-        "TITLE": model.cable.name.replace("*/", "* /"),
+        "TITLE": comment(model.cable.name),
         "VERSION": __version__,
         "MODEL": f"{model.n} {model.element}s, start {model.start}, end {model.end}, effects: "
-        + (", ".join(names) or "none"),
+        + (comment(", ".join(names)) or "none"),
         "HASH": digest,
         "N": str(model.n),
         "N_HEADINGS": str(split.n_phi),
@@ -159,6 +170,17 @@ def _values(split: Split, groups: list[Group], prefix: str, digest: str) -> dict
 
 def _template(name: str) -> str:
     return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
+
+
+def comment(text: str) -> str:
+    """Any text as a part of a comment in C: one line of ASCII that cannot end it.
+
+    What is no printable ASCII stands as its escape, a backslash as two. A space parts the signs
+    that begin or end a comment, and those that begin a trigraph: `??/` is a backslash, and one
+    at the end of a line continues it. To be followed by something else on its line.
+    """
+    line = text.encode("unicode_escape").decode()
+    return re.sub(r"(?<=/)(?=\*)|(?<=\*)(?=/)|(?<=\?)(?=\?)", " ", line)
 
 
 def fill(text: str, values: dict[str, str], prefix: str) -> str:
