@@ -41,10 +41,7 @@ def main(argv: Sequence[str]) -> int:
         model = model.with_mesh(chosen.elements or model.n, chosen.element)
         rest = model.rest_basis @ metadata.coefficients
     solver = generate(model, p, rest, chosen.prefix)
-    try:
-        written = solver.write(chosen.output)
-    except OSError as error:
-        raise DloError(f"--output {chosen.output}: cannot be written: {error.strerror}") from None
+    written = solver.write(chosen.output)
     if chosen.json:
         print_json({"files": [str(path) for path in written], "solver_hash": solver.hash})
     elif not chosen.quiet:
