@@ -21,6 +21,7 @@ import numpy as np
 from benchmarks import fleet, memory, peers, random_cables, speed
 
 from dlo_casadi.chain import ELEMENTS
+from dlo_casadi.durable import make_folder, write_file
 
 PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory", "peers", "fleet")
 
@@ -134,7 +135,7 @@ def main() -> int:
     parser.add_argument("--cables", type=int, default=1000, help="random cables, 100 poses each")
     parser.add_argument("--ipopt-problems", type=int, default=2000)
     chosen = parser.parse_args()
-    chosen.output.mkdir(parents=True, exist_ok=True)
+    make_folder(chosen.output)
     runs = {
         "speed": run_speed,
         "growth": run_growth,
@@ -152,7 +153,7 @@ def main() -> int:
         print(part, json.dumps(result[part], indent=1), flush=True)
         if part == "growth":
             draw(result[part], chosen.output / "benchmark.png")
-    (chosen.output / "benchmark.json").write_text(json.dumps(result, indent=1) + "\n")
+    write_file(chosen.output / "benchmark.json", json.dumps(result, indent=1) + "\n")
     return 0
 
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.durable import write_file
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
@@ -111,7 +112,7 @@ def main() -> None:
                     flush=True,
                 )
                 if args.output:
-                    args.output.write_text(json.dumps([rows[k] for k in sorted(rows)]))
+                    write_file(args.output, json.dumps([rows[k] for k in sorted(rows)]))
 
 
 def run_one(index: int, seed: int) -> dict:
