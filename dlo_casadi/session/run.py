@@ -94,7 +94,7 @@ def fit_session(
     fit, error = fit_declared(config, declared, measured)
     clock.lap("fit")
     if config.estimation.robust:
-        measured = reweighted(fit, measured)
+        measured = reweighted(fit)
         fit, error = fit_declared(config, declared, measured, fit.model.n)
         clock.lap("fit")
     fit = solved_by_ipopt(fit)
