@@ -52,7 +52,7 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
         feet.append(places)
     shapes = Shapes(phi, np.zeros((m, model.n_conditions)), np.zeros((m, len(DEVIATIONS))))
     for iteration in range(_KINEMATIC_STEPS + 1):
-        seen = sweep.observe(shapes, model.nominal, flat)
+        seen = sweep.observe(shapes, problem.unknowns.fixed, flat)
         for k, j in enumerate(used):
             curve = NodeCurve.of(chain, seen.z[j])
             if iteration > 1:
