@@ -387,10 +387,11 @@ class DiagnosisOptions(Section):
 
 
 class SkippedPose(NamedTuple):
-    """A pose that cannot be used, and why."""
+    """A pose that cannot be used, why, and what it was meant for."""
 
     name: str
     reason: str
+    role: Literal["fit", "held_out"]
 
 
 @dataclass(frozen=True)

@@ -201,6 +201,27 @@ def chord_places(measured: MeasuredPose, length: float) -> FloatArray:
     return np.clip(places, 0.0, length)
 
 
+def line_headings(measured: MeasuredPose, chain: Chain, places: FloatArray) -> FloatArray:
+    """Headings (n_headings,) [rad] of a measured line, unwrapped along the cable.
+
+    Those of chords of some hundredths of the length; `places` (K,) [m] are the points' arc lengths.
+    """
+    line = [np.array(measured.pose.start)[None], measured.points]
+    s = [np.array([0.0]), places]
+    if measured.pose.end is not None:
+        line.append(np.array(measured.pose.end)[None])
+        s.append(np.array([chain.length]))
+    points, at = np.concatenate(line), np.maximum.accumulate(np.concatenate(s))
+    grid = np.linspace(0.0, at[-1], 31)
+    coarse = np.stack([np.interp(grid, at, points[:, i]) for i in (0, 1)], axis=1)
+    chords = np.diff(coarse, axis=0)
+    headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+    if measured.pose.start_heading is not None:
+        turns = np.round((measured.pose.start_heading - headings[0]) / (2 * np.pi))
+        headings = headings + 2 * np.pi * turns
+    return np.interp(chain.heading_places, (grid[1:] + grid[:-1]) / 2, headings)
+
+
 def _denoised_length(polyline: FloatArray, steps: FloatArray) -> FloatArray:
     """Cumulative length of the polyline smoothed over about 1/50 of itself."""
     total = steps.sum()

@@ -13,6 +13,7 @@ from dlo_casadi.estimation.observation import (
     MeasuredPose,
     NodeCurve,
     chord_places,
+    line_headings,
     normal_rows,
 )
 from dlo_casadi.estimation.sweep import Sensitivities, Shapes, Sweep
@@ -48,7 +49,7 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     feet: list[FloatArray] = []
     for j in used:
         places = chord_places(problem.measured[j], chain.length)
-        phi[j] = _polyline_headings(problem.measured[j], model, places)
+        phi[j] = line_headings(problem.measured[j], chain, places)
         feet.append(places)
     shapes = Shapes(phi, np.zeros((m, model.n_conditions)), np.zeros((m, len(DEVIATIONS))))
     for iteration in range(_KINEMATIC_STEPS + 1):
@@ -97,25 +98,6 @@ def _kinematic_step(
     stacked = np.concatenate(system)
     step = np.linalg.solve(stacked.T @ stacked, stacked.T @ np.concatenate(target))
     return step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
-
-
-def _polyline_headings(measured: MeasuredPose, model: CableModel, places: FloatArray) -> FloatArray:
-    """Headings of chords of a few hundredths of the length, unwrapped along the cable."""
-    chain = model.chain
-    line = [np.array(measured.pose.start)[None], measured.points]
-    s = [np.array([0.0]), places]
-    if measured.pose.end is not None:
-        line.append(np.array(measured.pose.end)[None])
-        s.append(np.array([chain.length]))
-    points, at = np.concatenate(line), np.maximum.accumulate(np.concatenate(s))
-    grid = np.linspace(0.0, at[-1], 31)
-    coarse = np.stack([np.interp(grid, at, points[:, i]) for i in (0, 1)], axis=1)
-    chords = np.diff(coarse, axis=0)
-    headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
-    if measured.pose.start_heading is not None:
-        turns = np.round((measured.pose.start_heading - headings[0]) / (2 * np.pi))
-        headings = headings + 2 * np.pi * turns
-    return np.interp(chain.heading_places, (grid[1:] + grid[:-1]) / 2, headings)
 
 
 def all_at_once(

@@ -87,7 +87,7 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
     with figure(path, (width, (height + 0.4) * rows + 1.3)) as drawing:
         grid = drawing.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for axes, pose in zip(grid.ravel(), poses, strict=False):
-            _draw_pose(axes, pose, lines, outcome.measurement.std, factor)
+            _draw_pose(axes, pose, lines, factor)
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
         for axes in grid.ravel()[len(poses) :]:
@@ -151,12 +151,12 @@ def _magnification(outcome: Outcome, size: float) -> int:
 
 
 def _draw_pose(
-    axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, str]], std: float, factor: int
+    axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, str]], factor: int
 ) -> None:
     for stage, color, style in lines:
         shape = stage.shapes.get(pose.name)
         if shape is not None:
-            axes.plot(*magnified(pose, shape, std, factor).T, color=color, ls=style)
+            axes.plot(*magnified(pose, shape, factor).T, color=color, ls=style)
     if len(pose.points):
         axes.plot(*pose.points[:: max(1, len(pose.points) // 60)].T, ".", color=BLACK, ms=2.5)
     axes.set_aspect("equal")
@@ -173,6 +173,8 @@ def _draw_pose(
         title += f": {millimetres(last.rmse)}"
     if last is not None and not last.stable:
         title += ", unstable"
+    if last is not None and last.measured_branch is not None:
+        title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch"
     axes.set_title(title)
     if pose.role == "held_out":
         axes.title.set_color(_HELD_OUT_TEXT)
@@ -212,7 +214,7 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
                 held_out = pose.role == "held_out"
                 axes.plot(
                     shape.s,
-                    shape.residual,
+                    shape.residual / outcome.measurement.std,
                     color=_HELD_OUT if held_out else BLUE,
                     lw=1.1,
                     alpha=0.85 if held_out else 0.45,
