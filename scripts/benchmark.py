@@ -3,9 +3,9 @@
     python scripts/benchmark.py --output DIR [--only PART ...]
 
 Parts that need an extra which is not installed are left out, and named; one that is asked for by
---only without it is refused. Prints the compiler and its flags; saves benchmark.json and benchmark.png. Everything runs on one
-machine in one run; medians and 99th percentiles are over all solves, "best" is the median over the
-poses of each pose's fastest.
+--only without it is refused. Prints the compiler and its flags; saves benchmark.json and
+benchmark.png. Everything runs on one machine in one run; medians and 99th percentiles are over all
+solves, "best" is the median over the poses of each pose's fastest.
 """
 
 import argparse
