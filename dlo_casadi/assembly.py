@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.floating]
 
+# What may be different in every pose, in the order of `deviation`: where the ends deviate from
+# what is declared [m, rad], and a force of unknown cause [N].
+DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading", "pull_x", "pull_y")
+
 
 @dataclass(frozen=True)
 class Shapes:
@@ -31,13 +35,18 @@ class Shapes:
     x : (m, n_nodes, coordinates)
         States of the nodes: of a planar cable, headings [rad].
     lam : (m, n_conditions)
-    deviation : (m, n_deviations)
-        What is different in every pose, see `model.DEVIATIONS`.
+    deviation : (m, len(DEVIATIONS))
+        What is different in every pose, see DEVIATIONS.
     """
 
     x: FloatArray
     lam: FloatArray
     deviation: FloatArray
+
+    @classmethod
+    def declared(cls, x: FloatArray, lam: FloatArray) -> Shapes:
+        """Shapes whose ends are where they are declared to be."""
+        return cls(x, lam, np.zeros((len(x), len(DEVIATIONS))))
 
     def subset(self, index: Any) -> Shapes:
         """Shapes of some of the poses."""
@@ -46,7 +55,10 @@ class Shapes:
 
 @dataclass(frozen=True)
 class Given:
-    """What the equilibria of m poses depend on: `p` (m, n_parameters), `rest` (m, n_cells), `ends`."""
+    """What the equilibria of m poses depend on.
+
+    `p` (m, n_parameters), `rest` (m, n_cells) [1/m], `ends` (m, 6) as declared.
+    """
 
     p: FloatArray
     rest: FloatArray
@@ -69,8 +81,8 @@ class Given:
 class Directions:
     """Directions of all that shapes depend on, q of them, of m poses.
 
-    `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q), `rest`
-    (m, n_cells, q), `deviation` (m, n_deviations, q).
+    `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q),
+    `rest` (m, n_cells, q), `deviation` (m, len(DEVIATIONS), q).
     """
 
     x: FloatArray
@@ -215,7 +227,7 @@ class Assembly:
         return self._added(moved, at_ends)
 
     def _rest_along(self, rest: FloatArray) -> FloatArray:
-        """Rest curvature inside the slots (m, n_slots, 3, q) of that of the cells (m, n_cells, q)."""
+        """Rest curvature inside the slots (m, n_slots, 3, q) from the cells' (m, n_cells, q)."""
         flat = self._own_rest.reshape((-1, self.chain.n_cells)) @ rest
         return flat.reshape((len(rest), self._slots, 3, rest.shape[2]))
 
@@ -246,7 +258,9 @@ class Assembly:
         m, count = len(shapes.x), self.chain.n + 1
         places, ratio = self._stations(advance, given.ends[:, :2])
         x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
-        p, ends = (np.broadcast_to(a[:, None], (m, count, a.shape[1])) for a in (given.p, given.ends))
+        p, ends = (
+            np.broadcast_to(a[:, None], (m, count, a.shape[1])) for a in (given.p, given.ends)
+        )
         return self._mapped(name, count)(places, ratio, x, p, ends)
 
     def curve_slopes(self, shapes: Shapes, given: Given) -> CurveSlopes:

@@ -1,50 +1,212 @@
-"""Files that are there as a whole or not at all, even after a power cut."""
+"""Files and folders that are there as a whole or not at all, even after a power cut.
+
+All that the package writes goes through here, so that it fails in one way: the earlier file is
+as it was, no draft is left, and the error names the place, the system's reason and a remedy.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import os
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import secrets
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from types import TracebackType
+from typing import BinaryIO, Self
 
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import OutputError, well_formed
+
+# Begins the names of all drafts.
+_DRAFT = ".dlo-draft-"
 
 
-def write_durably(path: Path, fill: Callable[[BinaryIO], object]) -> None:
+def write_file(
+    path: Path,
+    content: str | bytes | Callable[[BinaryIO], object],
+    draft: Path | None = None,
+) -> None:
     """Fill a hidden draft beside the file, make it durable, rename it into place.
+
+    Parameters
+    ----------
+    path : Path
+        The file; of a link, the file that it leads to.
+    content : str, bytes or callable
+        Text is written as UTF-8, `well_formed`; a callable fills the open draft.
+    draft : Path, optional
+        Where the draft lies instead, on the same file system: one that a killed process leaves
+        behind is then written over by the next.
 
     Raises
     ------
-    DloError
+    OutputError
         If the file cannot be written.
     """
-    try:
-        number, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".draft")
-        draft = Path(name)
+    target = Path(os.path.realpath(path))
+    draft = draft or _draft_in(target.parent)
+    if isinstance(content, str):
+        content = well_formed(content).encode()
+    with _explained(path):
         try:
-            with os.fdopen(number, "wb") as stream:
-                fill(stream)
+            with draft.open("wb") as stream:
+                if callable(content):
+                    content(stream)
+                else:
+                    stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())
-            os.chmod(draft, 0o644)  # a draft is its owner's alone
-            os.replace(draft, path)
+            os.replace(draft, target)
         finally:
             draft.unlink(missing_ok=True)
-        _sync_folder(path.parent)
-    except OSError as error:
-        raise DloError(f"{path} cannot be written: {error.strerror or error}") from None
+    if _DRAFT not in str(target.parent):  # a draft's folders are made durable all at once
+        _sync_folder(target.parent)
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make a renaming durable."""
-    number = os.open(folder, os.O_RDONLY)
+class FolderDraft:
+    """A hidden folder, to be filled and then put in place of a folder, entry by entry.
+
+        with FolderDraft(path) as draft:  # raises if the folder cannot be written
+            write_file(draft.folder / "a.txt", "...")
+            draft.put_in_place()
+
+    Until then the folder stays as it is, and if putting in place fails it becomes so again.
+    Entries of other names stay: what lies there and is not ours is never touched.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder; made, with its parents, if it does not exist.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder to be filled.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(os.path.realpath(path))
+        # On the file system of the folder: moving is then a renaming.
+        beside = self.path if os.path.isdir(self.path) else self.path.parent
+        self._hidden = _draft_in(beside)
+        self.folder, self._previous = self._hidden / "complete", self._hidden / "previous"
+        self._made: list[Path] = []
+
+    def __enter__(self) -> Self:
+        if os.path.isfile(self.path):
+            raise OutputError(
+                f"the folder {self.path} cannot be written: it is a file.\n"
+                "  Try: another folder, or move the file away.",
+                self.path,
+            )
+        try:
+            with _explained(self.path):
+                with suppress(FileNotFoundError):
+                    self.path.stat()  # a name that no folder can have
+                for parent in [p for p in self.path.parents if not os.path.exists(p)][::-1]:
+                    parent.mkdir()
+                    self._made.insert(0, parent)
+                self.folder.mkdir(parents=True)
+        except BaseException:
+            self._remove()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._remove()
+        if isinstance(error, OutputError):  # the user knows nothing of drafts
+            error.retold(str(self.folder), str(self.path))
+        if error is not None and self._previous.exists():
+            error.add_note(f"What was in {self.path} before is in part in {self._previous}.")
+
+    def put_in_place(self, obsolete: Iterable[str] = ()) -> None:
+        """Move all that the draft holds into the folder; on any failure put back what was there.
+
+        Parameters
+        ----------
+        obsolete : iterable of str
+            Names of ours that go even if the draft holds nothing of that name.
+        """
+        for folder, *_ in os.walk(self.folder):
+            _sync_folder(Path(folder))
+        with _explained(self.path):
+            if os.path.exists(self.path):
+                self._swap(sorted({*obsolete, *os.listdir(self.folder)}))
+            else:
+                os.replace(self.folder, self.path)
+        self._made.clear()
+        _sync_folder(self.path)
+        _sync_folder(self.path.parent)
+
+    def _swap(self, names: Sequence[str]) -> None:
+        self._previous.mkdir()
+        moved: list[tuple[Path, Path]] = []
+        try:
+            for name in names:
+                for origin, goal in (
+                    (self.path / name, self._previous / name),
+                    (self.folder / name, self.path / name),
+                ):
+                    if os.path.lexists(origin):
+                        moved.append((origin, goal))
+                        os.replace(origin, goal)
+        except BaseException:
+            for origin, goal in reversed(moved):
+                if os.path.lexists(goal):
+                    os.replace(goal, origin)
+            raise
+        shutil.rmtree(self._previous, ignore_errors=True)
+
+    def _remove(self) -> None:
+        """Remove the draft, and parents that were made for nothing.
+
+        What was there before stays in the draft if it could not be put back.
+        """
+        shutil.rmtree(self.folder, ignore_errors=True)
+        for folder in (self._previous, self._hidden, *self._made):
+            with suppress(OSError):  # not there, or not empty
+                folder.rmdir()
+
+
+def is_marked(path: Path, mark: str) -> bool:
+    """Whether a file is known as ours by a text in it; true where there is none."""
     try:
-        os.fsync(number)
-    finally:
-        os.close(number)
+        return not os.path.lexists(path) or mark.encode() in path.read_bytes()
+    except OSError:
+        return False
+
+
+def refuse_foreign(folder: Path, taken: Sequence[str]) -> None:
+    """Raise OutputError if there are names, of entries of a folder that are not ours to replace."""
+    if taken:
+        raise OutputError(
+            f"{folder} holds {', '.join(taken)} from elsewhere, which would be replaced.\n"
+            "  Try: another folder with --output, or move them away.",
+            folder,
+        )
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and its parents, unless they are there.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made.
+    """
+    with _explained(path):
+        path.mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager
@@ -53,19 +215,45 @@ def only_run(folder: Path) -> Iterator[None]:
 
     Raises
     ------
-    DloError
+    OutputError
         If another run holds it, or it cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
+    with _explained(folder):
         stream = (folder / ".lock").open("w")
-    except OSError as error:
-        raise DloError(
-            f"the folder {folder} cannot be written: {error.strerror or error}"
-        ) from None
     with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise DloError(f"another run is writing to {folder}; wait for its end") from None
+            raise OutputError(
+                f"another run is writing to {folder}; wait for its end", folder
+            ) from None
         yield
+
+
+def _draft_in(folder: Path) -> Path:
+    """Place of a draft; not named after the file, whose name may be as long as can be."""
+    return folder / f"{_DRAFT}{secrets.token_hex(8)}"
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Say what cannot be written, why, and what to try."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written: {error.strerror or error}.\n"
+            "  Try: another place, or check its permissions and the free space.",
+            path,
+        ) from None
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make renamings durable, where the file system can: some refuse to, and all is written."""
+    with suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)

@@ -11,10 +11,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Given, Shapes
+from dlo_casadi.assembly import DEVIATIONS, Given, Shapes
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, clamped_headings
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.whole_pose import potential
 
@@ -115,7 +115,7 @@ class Equilibrium:
     @property
     def shapes(self) -> Shapes:
         """As stacked unknowns of one pose, its ends where they are declared."""
-        return Shapes(self.x[None], self.multipliers[None], np.zeros((1, len(DEVIATIONS))))
+        return Shapes.declared(self.x[None], self.multipliers[None])
 
     @property
     def phi(self) -> FloatArray:

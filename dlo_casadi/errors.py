@@ -6,13 +6,21 @@ from pathlib import Path
 from typing import Any
 
 
+def well_formed(text: str) -> str:
+    r"""Text that can be written anywhere: a lone surrogate as its escape, such as `\udce9`.
+
+    File names that are no UTF-8 hold them (PEP 383), and YAML permits them.
+    """
+    return text.encode(errors="backslashreplace").decode()
+
+
 class DloError(Exception):
     """Base class of all errors raised on purpose by dlo_casadi.
 
     Parameters
     ----------
     message : str
-        What happened, with numbers and units, and what to try.
+        What happened, with numbers and units, and what to try; made `well_formed`.
 
     Attributes
     ----------
@@ -21,8 +29,8 @@ class DloError(Exception):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(message)
-        self.message = message
+        super().__init__(well_formed(message))
+        self.message = str(self)
         self.poses: tuple[Any, ...] = ()
 
 
@@ -94,3 +102,25 @@ class EquilibriumError(DloError):
 
 class EstimationError(DloError):
     """An estimate that cannot be made from the poses at hand."""
+
+
+class OutputError(DloError):
+    """A file or folder that cannot be written.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what to try.
+    path : Path, optional
+        The file or folder.
+    """
+
+    def __init__(self, message: str, path: Path | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+
+    def retold(self, draft: str, place: str) -> None:
+        """Name the place instead of its draft."""
+        self.message = self.message.replace(draft, place)
+        self.args = (self.message,)
+        self.path = None if self.path is None else Path(str(self.path).replace(draft, place))

@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from dlo_casadi.durable import make_folder
 from dlo_casadi.errors import DloError
 from dlo_casadi.workers import THREADS, begin_worker, environment, software
 
@@ -215,7 +216,7 @@ def open_executor(
         )
     if logs is not None:
         logs = logs.resolve()
-        logs.mkdir(parents=True, exist_ok=True)
+        make_folder(logs)
     executor: AnyExecutor
     if scheduler is not None:
         executor = Cluster(scheduler, logs)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from dlo_casadi.durable import write_file
 from dlo_casadi.errors import MeasurementError
 
 HEADER = ["x_m", "y_m"]
@@ -83,7 +83,9 @@ def write_centerline(path: str | Path, points: npt.ArrayLike) -> None:
     Raises
     ------
     MeasurementError
-        If the points have another shape or are not finite, or the file cannot be written.
+        If the points have another shape or are not finite.
+    OutputError
+        If the file cannot be written.
     """
     target = Path(path)
     array = np.asarray(points, dtype=float)
@@ -94,14 +96,7 @@ def write_centerline(path: str | Path, points: npt.ArrayLike) -> None:
         raise MeasurementError(f"point {bad} is {array[bad]}, not finite", pose=target.name)
 
     lines = [",".join(HEADER), *(f"{x!r},{y!r}" for x, y in array.tolist())]
-    draft = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
-        draft.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-        os.replace(draft, target)
-    except OSError as error:
-        raise MeasurementError(f"{target} cannot be written: {error.strerror}") from None
-    finally:
-        draft.unlink(missing_ok=True)
+    write_file(target, "\n".join(lines) + "\n")
 
 
 def _parse(source: Path) -> npt.NDArray[np.float64]:

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Assembly
+from dlo_casadi.assembly import DEVIATIONS, Assembly
 from dlo_casadi.effects import (
     BoundaryEffect,
     Cable,
@@ -45,9 +45,6 @@ FloatArray = NDArray[np.floating]
 BENDING_STIFFNESS = "bending_stiffness"
 # ln(1000): a prior of the stiffness may be off by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
-# What may be different in every pose, in the order of `deviation`: where the ends deviate from
-# what is declared [m, rad], and a force of unknown cause [N].
-DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading", "pull_x", "pull_y")
 
 
 @dataclass(frozen=True)
@@ -365,6 +362,19 @@ class CableModel:
     def _bending_stiffness(self) -> ca.SX:
         return self._p[self.names.index(BENDING_STIFFNESS)]
 
+    @cached_property
+    def section_moment(self) -> ca.Function:
+        """(bend [1/m], p) -> moment [N m] of the section in the middle of the cable.
+
+        M = dW/dk of the energy W = EI/2 k^2 factor(k) per length.
+        """
+        bend, length = ca.SX.sym("bend"), self.cable.length
+        cell = Cell(ca.SX(0.499 * length), ca.SX(0.002 * length), 0.002 * length)
+        energy = self._bending_stiffness / 2 * bend**2
+        for effect, local in self._filling(SectionLaw):
+            energy *= effect.factor(bend, cell, self.cable, local)
+        return ca.Function("section_moment", [bend, self._p], [ca.gradient(energy, bend)])
+
     def _slot_energy(self, slot: Slot) -> ca.SX:
         """Energy of bending and loads of one slot [J]: of the loads, minus their work along it."""
         kind = self.chain.kind
@@ -559,7 +569,7 @@ class CableModel:
 
     @cached_property
     def slot_curve_slopes(self) -> ca.Function:
-        """As `slot` -> the same, its derivatives by increments and lam, and by p, rest, deviation."""
+        """As `slot` -> the same, derivatives by increments and lam, and by p, rest, deviation."""
         others = ca.vertcat(self._p, self._rest, self._deviation)
         blocks = [ca.jacobian(self._advanced, symbols) for symbols in (self._moving, others)]
         return self._here("slot_curve_slopes", self._slot_arguments, [self._advanced, *blocks])
@@ -570,10 +580,7 @@ class CableModel:
         kind = self.chain.kind
         x, delta = self._nodes
         point, ratio = ca.SX.sym("point", 2), ca.SX.sym("ratio")
-        halves = [
-            kind.node.retract(x[i : i + 1], delta[i : i + 1]) for i in range(kind.node.coordinates * 2)
-        ]
-        heading = (halves[0] + halves[1]) / 2
+        heading = (kind.node.retract(x[0], delta[0]) + kind.node.retract(x[1], delta[1])) / 2
         slope = ratio * kind.node.tangent(heading)
         image = point
         maps = self._filling(MeasurementEffect)
@@ -587,7 +594,7 @@ class CableModel:
 
     @cached_property
     def station(self) -> ca.Function:
-        """(point, ratio, x, p, ends) of an element boundary -> its image: place, and slope dr/ds."""
+        """(point, ratio, x, p, ends) of an element boundary -> its image: place, slope dr/ds."""
         arguments, rows, _ = self._seen
         return self._here("station", arguments, [rows])
 

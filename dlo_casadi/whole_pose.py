@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.assembly import DEVIATIONS
+from dlo_casadi.model import CableModel
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     ratios = [step[2] for step in steps]
     ratios = [
         ratios[0],
-        *((a + b) / 2 for a, b in zip(ratios[:-1], ratios[1:], strict=True)),
+        *((a + b) / 2 for a, b in pairwise(ratios)),
         ratios[-1],
     ]
     point, rows = s.ends[:2], []
@@ -112,7 +115,8 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
 def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Rest curvature (n_cells,) [1/m] that the pose leaves behind."""
     arguments = _slot_arguments(model, s)
-    return ca.vertcat(*(model.slot_state(*arguments[j])[0] for j in model.chain.layout.bends))
+    rests: list[Any] = [model.slot_state(*arguments[j])[0] for j in model.chain.layout.bends]
+    return ca.vertcat(*rests)
 
 
 def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
@@ -124,7 +128,7 @@ def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
 def _slot_arguments(model: CableModel, s: PoseSymbols) -> list[list[ca.SX]]:
     chain = model.chain
     c, last = chain.kind.node.coordinates, chain.n_nodes - 1
-    rows = []
+    rows: list[list[Any]] = []
     for j in range(chain.n_slots):
         k = min(j + 1, last)
         both = ca.vertcat(s.x[j * c : (j + 1) * c], s.x[k * c : (k + 1) * c])

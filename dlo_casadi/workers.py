@@ -107,7 +107,9 @@ def worker_log(folder: str | None) -> logging.Logger:
         logger.removeHandler(old)
         old.close()
     try:
-        handler: logging.Handler = logging.FileHandler(path, encoding="utf-8")
+        handler: logging.Handler = logging.FileHandler(
+            path, encoding="utf-8", errors="backslashreplace"
+        )
     except OSError:
         # A machine of the cluster that does not see the folder: Dask keeps its own log there.
         return logger

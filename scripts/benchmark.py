@@ -2,14 +2,17 @@
 
     python scripts/benchmark.py --output DIR [--only PART ...]
 
-Prints the compiler and its flags; saves benchmark.json and benchmark.png. Everything runs on one
-machine in one run; medians and 99th percentiles are over all solves, "best" is the median over the
-poses of each pose's fastest.
+Parts that need an extra which is not installed are left out, and named; one that is asked for by
+--only without it is refused. Prints the compiler and its flags; saves benchmark.json and
+benchmark.png. Everything runs on one machine in one run; medians and 99th percentiles are over all
+solves, "best" is the median over the poses of each pose's fastest.
 """
 
 import argparse
 import json
 import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +23,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from benchmarks import fleet, memory, peers, random_cables, speed
 
+from dlo_casadi.durable import make_folder, write_file
 from dlo_casadi.rod.chain import ELEMENTS
 
 PARTS = ("speed", "growth", "throughput", "random", "ipopt", "memory", "peers", "fleet")
+# Parts that need more than the package: the extras, and what of them is imported.
+EXTRAS = {"fleet": ("table,dask", ("pyarrow", "distributed"))}
 
 
 def run_speed() -> dict[str, Any]:
@@ -126,15 +132,30 @@ def draw(growth: dict[str, Any], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
+def without_extra(parts: Sequence[str]) -> dict[str, str]:
+    """Parts whose extra is not installed, and what to do about it."""
+    return {
+        part: f"{part} needs {' and '.join(modules)}. Try: pip install -e '.[{extra}]'"
+        for part, (extra, modules) in EXTRAS.items()
+        if part in parts and not all(find_spec(module) for module in modules)
+    }
+
+
 def main() -> int:
     """Run the parts, print and save."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, default=Path("results/benchmark"))
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--only", nargs="+", choices=PARTS)
     parser.add_argument("--cables", type=int, default=1000, help="random cables, 100 poses each")
     parser.add_argument("--ipopt-problems", type=int, default=2000)
     chosen = parser.parse_args()
-    chosen.output.mkdir(parents=True, exist_ok=True)
+    missing = without_extra(chosen.only or PARTS)
+    if missing and chosen.only:
+        parser.error("; ".join(missing.values()))
+    parts = [part for part in chosen.only or PARTS if part not in missing]
+    for text in missing.values():
+        print(f"left out: {text}", flush=True)
+    make_folder(chosen.output)
     runs = {
         "speed": run_speed,
         "growth": run_growth,
@@ -146,13 +167,14 @@ def main() -> int:
         "fleet": fleet.run,
     }
     result: dict[str, Any] = {"compiler": speed.compiler(), "flags": list(speed.FLAGS)}
+    result["left_out"] = list(missing)
     print(json.dumps(result), flush=True)
-    for part in chosen.only:
+    for part in parts:
         result[part] = runs[part]()
         print(part, json.dumps(result[part], indent=1), flush=True)
         if part == "growth":
             draw(result[part], chosen.output / "benchmark.png")
-    (chosen.output / "benchmark.json").write_text(json.dumps(result, indent=1) + "\n")
+    write_file(chosen.output / "benchmark.json", json.dumps(result, indent=1) + "\n")
     return 0
 
 

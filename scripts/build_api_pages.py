@@ -1,10 +1,14 @@
 """Write the pages of the Python API: python scripts/build_api_pages.py (results/api/index.html)."""
 
+import sys
 from pathlib import Path
 
-import pdoc
-
 import dlo_casadi
+
+try:
+    import pdoc
+except ModuleNotFoundError:
+    sys.exit("error: the pages need pdoc.\n  Try: pip install -e '.[docs]'")
 
 MODULES = ("dlo_casadi", "dlo_casadi.effects", "dlo_casadi.vision", "dlo_casadi.parallel")
 FOLDER = Path(__file__).parents[1] / "results/api"

@@ -21,6 +21,7 @@ import numpy as np
 import yaml
 
 from dlo_casadi.config import load_config
+from dlo_casadi.durable import write_file
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.parallel import map_as_completed, open_executor
 from dlo_casadi.session import run_session
@@ -177,7 +178,7 @@ def main() -> None:
             show(done.value, done.seconds)
             if args.output:
                 ordered = [rows[k] for k in sorted(rows)]
-                args.output.write_text(json.dumps(ordered, indent=1, default=str))
+                write_file(args.output, json.dumps(ordered, indent=1, default=str))
 
 
 def run_one(name: str, without_true_effect: bool) -> dict:

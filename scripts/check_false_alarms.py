@@ -22,12 +22,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.durable import write_file
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.sweep import Shapes, Sweep
+from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
@@ -61,7 +63,7 @@ def simulate(config, generator):
     deviation = np.zeros((len(poses), 6))
     deviation[:, :2] = tolerances.end * generator.standard_normal((len(poses), 2))
     shapes = Shapes(
-        np.array([item.equilibrium.phi for item in predictions]),
+        np.array([item.equilibrium.x for item in predictions]),
         np.array([item.equilibrium.multipliers for item in predictions]),
         deviation,
     )
@@ -73,9 +75,9 @@ def simulate(config, generator):
     noise = NoiseModel(std, share, generator.uniform(0.02, 0.04), "gaussian")
     measured = []
     for pose, z, own in zip(
-        config.experiment.poses, sweep.shapes_seen(shapes, p, rest), poses, strict=True
+        config.experiment.poses, sweep.seen(shapes, p, rest), poses, strict=True
     ):
-        curve = NodeCurve.of(model.chain, z)
+        curve = NodeCurve.of(cable.length, z)
         s = np.sort(generator.uniform(0.01, 0.99, 200)) * cable.length
         factor = np.linalg.cholesky(noise.covariance(s, np.ones(len(s))))
         points = curve.at(s) + factor @ generator.standard_normal((len(s), 2))
@@ -111,7 +113,7 @@ def main() -> None:
                     flush=True,
                 )
                 if args.output:
-                    args.output.write_text(json.dumps([rows[k] for k in sorted(rows)]))
+                    write_file(args.output, json.dumps([rows[k] for k in sorted(rows)]))
 
 
 def run_one(index: int, seed: int) -> dict:

@@ -8,7 +8,7 @@ import dlo_casadi as dlo
 from dlo_casadi.session.measure import draw_steps
 
 ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
+PICTURES = ROOT / ".readme"
 TITLES = {
     "1_workplane": "1 the board's plane, within reach of the cable",
     "2_contrast": "2 what stands out in the colour of the cable",
@@ -26,16 +26,16 @@ def draw_camera_steps() -> None:
         axes.imshow(pictures[name][..., ::-1])
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
-    drawing.savefig(DOCS / "camera_steps.jpg", dpi=110, pil_kwargs={"quality": 82})
+    drawing.savefig(PICTURES / "camera_steps.jpg", dpi=110, pil_kwargs={"quality": 82})
 
 
 def main() -> None:
     """Draw all of them."""
-    DOCS.mkdir(exist_ok=True)
+    PICTURES.mkdir(exist_ok=True)
     draw_camera_steps()
     result = dlo.fit(ROOT / "configs/cable.yaml")
-    result.plot().savefig(DOCS / "poses.png", dpi=100)
-    result.predict(end=(0.3, -0.1)).plot().savefig(DOCS / "shape.png", dpi=80)
+    result.plot().savefig(PICTURES / "poses.png", dpi=100)
+    result.predict(end=(0.3, -0.1)).plot().savefig(PICTURES / "shape.png", dpi=80)
     print(result)
 
 

@@ -5,8 +5,8 @@ import itertools
 import casadi as ca
 import numpy as np
 import pytest
-
 from dlo_casadi.chain import Chain, Curve, se3_nodes
+
 from dlo_casadi.errors import DloError
 from dlo_casadi.rest import RestCurvature
 

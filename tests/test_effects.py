@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.effects import (
     EFFECTS,
     BendingSoftening,
@@ -29,7 +30,7 @@ from dlo_casadi.effects import (
     StiffSection,
 )
 from dlo_casadi.equilibrium import Pose, solve_equilibrium
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 ENDS = np.array([0.1, 0.05, 0.5, -0.1, 0.4, -0.2])  # start, end [m], headings [rad]

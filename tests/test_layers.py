@@ -17,14 +17,14 @@ PARALLEL = {"executors", "parallel"}
 MAY_IMPORT: dict[str, set[str]] = {
     **{layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)},
     "config": {"errors", "parameters", "effects"},
-    "measurements": {"errors", "config"},
-    "vision": {"errors"},
+    "durable": {"errors"},
+    "measurements": {"errors", "config", "durable"},
+    "vision": {"errors", "durable"},
     "estimation": MECHANICS | {"config", "measurements"} | PARALLEL,
     "diagnosis": MECHANICS | {"config", "measurements", "estimation"} | PARALLEL,
-    "codegen": MECHANICS | {"config"},
-    "durable": {"errors"},
+    "codegen": MECHANICS | {"config", "durable"},
     "workers": {"vision"},
-    "executors": {"errors", "workers"},
+    "executors": {"durable", "errors", "workers"},
     "parallel": {"errors", "executors", "workers"},
 }
 # A session: what is declared and measured -> stages and findings -> one outcome.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import Centerlines, load_config
-from dlo_casadi.errors import MeasurementError
+from dlo_casadi.errors import MeasurementError, OutputError
 from dlo_casadi.measurements import read_centerline, write_centerline
 
 ROOT = Path(__file__).parents[1]
@@ -112,6 +112,6 @@ def test_writing_keeps_the_old_file_if_it_fails(tmp_path):
     with pytest.raises(MeasurementError, match=r"points of shape \(3,\)"):
         write_centerline(path, [1, 2, 3])
     np.testing.assert_array_equal(read_centerline(path, START), LINE)
-    with pytest.raises(MeasurementError, match="cannot be written: No such file"):
+    with pytest.raises(OutputError, match="cannot be written: No such file"):
         write_centerline(tmp_path / "none" / "a.csv", LINE)
     assert [file.name for file in tmp_path.iterdir()] == ["a.csv"]

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.effects import (
     AxialStretch,
     Cable,
@@ -20,7 +21,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 
 CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
 WEIGHT = 9.81 * CABLE.mass  # N

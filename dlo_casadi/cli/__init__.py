@@ -58,9 +58,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         With 2 for unknown arguments, with 0 after `--help`.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    return guarded(lambda: _run(arguments))
+
+
+def _run(arguments: list[str]) -> int:
     if arguments and arguments[0] in COMMANDS:
-        name, rest = arguments[0], arguments[1:]
-        return guarded(lambda: _module(name).main(rest))
+        code: int = _module(arguments[0]).main(arguments[1:])
+        return code
     if arguments[:1] in (["-h"], ["--help"]):
         print(_overview())
         return OK

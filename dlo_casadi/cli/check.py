@@ -12,6 +12,7 @@ from dlo_casadi.cli.guard import BAD_INPUT, OK
 from dlo_casadi.cli.options import command, configuration, console, print_json
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config
+from dlo_casadi.durable import make_folder
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.report.check_table import advice_lines, check_dict, check_table
 from dlo_casadi.session.checks import find_suspicions
@@ -78,10 +79,7 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
         raise DloError("--show draws photographs; this configuration has centre-lines")
     poses = [pose for pose in config.measured_poses if pose.file.is_file()]
     written = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DloError(f"--show {folder}: cannot be written: {error.strerror}") from None
+    make_folder(folder)
     for k, pose in enumerate(poses):
         watch.step("draw the steps", k, len(poses))
         try:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, print_json
 from dlo_casadi.codegen import generate
 from dlo_casadi.errors import DloError
 from dlo_casadi.report.parameters_file import load_parameters
+from dlo_casadi.rod.chain import ELEMENTS
 
 EXAMPLES = """\
 dlo generate-solver results/cable/parameters.yaml --output solver
@@ -41,10 +41,7 @@ def main(argv: Sequence[str]) -> int:
         model = model.with_mesh(chosen.elements or model.n, chosen.element)
         rest = model.rest_basis @ metadata.coefficients
     solver = generate(model, p, rest, chosen.prefix)
-    try:
-        written = solver.write(chosen.output)
-    except OSError as error:
-        raise DloError(f"--output {chosen.output}: cannot be written: {error.strerror}") from None
+    written = solver.write(chosen.output)
     if chosen.json:
         print_json({"files": [str(path) for path in written], "solver_hash": solver.hash})
     elif not chosen.quiet:

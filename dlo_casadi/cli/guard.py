@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import signal
 import sys
 import traceback
@@ -11,6 +13,10 @@ from types import FrameType
 from dlo_casadi.errors import DloError
 
 OK, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+
+# Errors of a stream. Those of files have become an OutputError: what is left is the output.
+_LOST = (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class _Signals:
@@ -41,20 +47,26 @@ def guarded(work: Callable[[], int]) -> int:
     try:
         for number in before:
             signal.signal(number, signals.interrupt)
-        return work()
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")  # as stderr is
+        code = work()
+        print(end="", flush=True)
+        return code
     except KeyboardInterrupt:
         return _interrupted()
     except DloError as error:
         notes = getattr(error, "__notes__", [])
         print("\n".join([f"{type(error).__name__}: {error}", *notes]), file=sys.stderr)
         return BAD_INPUT
-    except BrokenPipeError:
-        # The reader of the output has gone, as `head` does; nothing is left to be said.
-        sys.stdout = None
-        return OK
-    except Exception:
+    except Exception as error:
         if signals.received:  # an import that was interrupted may end as any error
             return _interrupted()
+        if isinstance(error, OSError) and error.errno in _LOST:
+            sys.stdout = None  # what is left in it would be tried again at exit
+            if error.errno == errno.EPIPE:
+                return OK  # the reader has gone, as `head` does; nothing is left to be said
+            print(f"OutputError: the output cannot be written: {error.strerror}", file=sys.stderr)
+            return BAD_INPUT
         traceback.print_exc()
         print(
             "This is a bug. Please report it with the lines above and your configuration.",

@@ -11,6 +11,7 @@ from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, print_json
 from dlo_casadi.config.schema import schema_text
 from dlo_casadi.config.template import template
+from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError
 
 EXAMPLES = """\
@@ -48,16 +49,12 @@ def main(argv: Sequence[str]) -> int:
     text = template(target.stem, files, "images" if chosen.centerlines is None else "centerlines")
     schema = target.with_name("schema.json")
     written = [target]
-    try:
-        with target.open("x", encoding="utf-8") as stream:
-            stream.write(text)
-        if not schema.exists():
-            schema.write_text(schema_text(), encoding="utf-8")
-            written.append(schema)
-    except FileExistsError:
-        raise DloError(f"{target} exists already, and nothing is replaced") from None
-    except OSError as error:
-        raise DloError(f"{target} cannot be written: {error.strerror}") from None
+    if os.path.lexists(target):
+        raise DloError(f"{target} exists already, and nothing is replaced")
+    if not os.path.lexists(schema):
+        write_file(schema, schema_text())
+        written.append(schema)
+    write_file(target, text)
     if chosen.json:
         print_json({"files": [str(path) for path in written], "poses": len(files)})
     elif not chosen.quiet:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,7 @@ def add_jobs(parser: argparse.ArgumentParser) -> None:
 
 def configuration(path: Path) -> Config:
     """Load a configuration; of a folder, say which configurations it holds."""
-    if path.is_dir():
+    if os.path.isdir(path):
         found = [str(file) for file in sorted(path.glob("*.y*ml"))[:5]]
         hint = ", ".join(found) or "a YAML file, such as configs/cable.yaml"
         many = f"; all in it and below: dlo fit-many {path}" if found else ""

@@ -61,10 +61,7 @@ def main(argv: Sequence[str]) -> int:
         branch=chosen.branch,
     )
     if figure is not None:
-        try:
-            draw_prediction(figure, shape.as_dict())
-        except OSError as error:
-            raise DloError(f"--figure {figure}: cannot be written: {error.strerror}") from None
+        draw_prediction(figure, shape.as_dict())
     if chosen.json:
         print_json(shape.as_dict())
         return OK

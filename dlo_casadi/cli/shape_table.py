@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.cli.counter import Counter
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import add_jobs, command, console, print_json
@@ -17,6 +16,7 @@ from dlo_casadi.fleet.store import parquet_library
 from dlo_casadi.model import CableModel
 from dlo_casadi.parallel import open_executor
 from dlo_casadi.report.parameters_file import Parameters, load_parameters
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.shape_table import Grid, Plan, PoseList, shape_table
 from dlo_casadi.shape_table.poses import Poses
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dlo_casadi import __version__
 from dlo_casadi.codegen.kernels import Kernels, c_number, kernels_of, table_to_c
 from dlo_casadi.codegen.prefix import check_prefix
+from dlo_casadi.durable import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.equilibrium import total_dead_load
 from dlo_casadi.errors import DloError
@@ -22,6 +23,8 @@ from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
+# By which a generated file is known, in all templates.
+MARK = "written by dlo-casadi"
 # Doubles of a workspace per slot; as in the template.
 _ARRAYS = 38
 
@@ -48,15 +51,23 @@ class Solver:
     workspace: int
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write all files into the folder, which is made if it is missing."""
+        """Write all files into the folder, which is made if it is missing: all of them or none.
+
+        Files of these names are replaced if they are generated ones, known by a mark in each;
+        other files in the folder stay.
+
+        Raises
+        ------
+        OutputError
+            If the folder cannot be written, or holds files of these names from elsewhere.
+        """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        written = []
-        for name, text in self.files.items():
-            path = folder / name
-            path.write_text(text, encoding="utf-8", newline="\n")
-            written.append(path)
-        return written
+        refuse_foreign(folder, [name for name in self.files if not is_marked(folder / name, MARK)])
+        with FolderDraft(folder) as draft:
+            for name, text in self.files.items():
+                write_file(draft.folder / name, text)
+            draft.put_in_place()
+        return [folder / name for name in self.files]
 
 
 def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
@@ -130,10 +141,10 @@ def _values(
     count = chain.n_nodes
     return {
         "FILE": f"{prefix}_solver",
-        "TITLE": model.cable.name.replace("*/", "* /"),
+        "TITLE": comment(model.cable.name),
         "VERSION": __version__,
         "MODEL": f"{model.n} {model.element}s, start {model.start}, end {model.end}, effects: "
-        + (", ".join(names) or "none"),
+        + (comment(", ".join(names)) or "none"),
         "HASH": digest,
         "N": str(model.n),
         "N_HEADINGS": str(count),
@@ -161,6 +172,17 @@ def _values(
 
 def _template(name: str) -> str:
     return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
+
+
+def comment(text: str) -> str:
+    """Any text as a part of a comment in C: one line of ASCII that cannot end it.
+
+    What is no printable ASCII stands as its escape, a backslash as two. A space parts the signs
+    that begin or end a comment, and those that begin a trigraph: `??/` is a backslash, and one
+    at the end of a line continues it. To be followed by something else on its line.
+    """
+    line = text.encode("unicode_escape").decode()
+    return re.sub(r"(?<=/)(?=\*)|(?<=\*)(?=/)|(?<=\?)(?=\?)", " ", line)
 
 
 def fill(text: str, values: dict[str, str], prefix: str) -> str:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import isfinite
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -123,11 +126,13 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
     shares = np.array([np.array(model.shares(p, place)).ravel() for place in places])
     inside = (shares > 0) & (shares < 1)
     alone = np.arange(len(own))[:, None] * inside
-    told = np.column_stack([kinds.round(14), shares * ~inside, alone]) if inline else kinds.round(14)
+    told = (
+        np.column_stack([kinds.round(14), shares * ~inside, alone]) if inline else kinds.round(14)
+    )
     edges = [0, *(np.flatnonzero(np.any(np.diff(told, axis=0), axis=1)) + 1), len(own)]
     slots = tuple(
         _kernel(model, parameters, places[first], own[first:last], (first, last), inline)
-        for first, last in zip(edges[:-1], edges[1:], strict=True)
+        for first, last in pairwise(edges)
     )
     shared = np.zeros(0) if inline else np.asarray(p, float)
     return Kernels(slots, _ends(model, parameters), shared)
@@ -160,7 +165,8 @@ def _kernel(
     position = ca.SX.zeros(0) if model.end == "free" else lam
     multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
     arguments = [x, multipliers, p, ca.vertcat(*numbers[1:]), place, still, shares]
-    value, advance = model.slot_by_share(*arguments)
+    both: Any = model.slot_by_share(*arguments)  # CasADi's stubs know of one kind of result
+    value, advance = both
     if model.end == "free":
         # lam is zero there; its derivative is the way from slot to slot all the same.
         value += ca.dot(lam, advance)
@@ -217,7 +223,9 @@ def _statements(function: ca.Function, inputs: Sequence[str], targets: dict[tupl
 
     text = _INPUT.sub(lambda match: f"{inputs[int(match[1])]}[{match[2]}]", found[1])
     text = _OUTPUT.sub(output, text).replace("  return 0;\n", "")
-    text = re.sub(r"casadi_\w+", lambda match: _CALLS.get(match[0], match[0][len("casadi_") :]), text)
+    text = re.sub(
+        r"casadi_\w+", lambda match: _CALLS.get(match[0], match[0][len("casadi_") :]), text
+    )
     return "\n".join("  " + line for line in text.splitlines() if line.strip())
 
 

@@ -28,7 +28,7 @@ class Shape:
     Parameters
     ----------
     points : (n + 1, 2) [m]
-    headings : (n_headings,) [rad]
+    headings : (n_nodes,) [rad]
     lam_start, lam : (2,) [N]
         Force of the cable on whatever holds its start and its end.
     moments : (2,) [N m]
@@ -73,7 +73,7 @@ class Path2D:
 class Slope:
     """Derivatives by (end x, end y, start heading, end heading), last index.
 
-    `points` (n + 1, 2, 4), `headings` (n_headings, 4), `lam` (2, 4).
+    `points` (n + 1, 2, 4), `headings` (n_nodes, 4), `lam` (2, 4).
     """
 
     points: FloatArray

@@ -83,7 +83,11 @@ def load_config(path: str | Path) -> Config:
         estimation=file.estimation,
         diagnosis=file.diagnosis,
         warnings=tuple(warnings),
-        skipped=tuple(SkippedPose(name, reason) for name, reason in skipped.items()),
+        skipped=tuple(
+            SkippedPose(pose.name, skipped[pose.name], pose.role)
+            for pose in poses
+            if pose.name in skipped
+        ),
     )
 
 

@@ -20,6 +20,7 @@ from pydantic import (
 )
 
 from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean, show
+from dlo_casadi.errors import well_formed
 
 
 def _optional(section: type[Section]) -> BeforeValidator:
@@ -279,7 +280,7 @@ class Pose(Section):
     @property
     def name(self) -> str:
         """Name of the pose: its file without folder and ending."""
-        return self.file.stem
+        return well_formed(self.file.stem)
 
     @field_validator("file", mode="before")
     @classmethod
@@ -386,10 +387,11 @@ class DiagnosisOptions(Section):
 
 
 class SkippedPose(NamedTuple):
-    """A pose that cannot be used, and why."""
+    """A pose that cannot be used, why, and what it was meant for."""
 
     name: str
     reason: str
+    role: Literal["fit", "held_out"]
 
 
 @dataclass(frozen=True)
@@ -422,7 +424,7 @@ class Config:
     @property
     def name(self) -> str:
         """Name of the configuration: its file without folder and ending."""
-        return self.path.stem
+        return well_formed(self.path.stem)
 
     @property
     def measured_poses(self) -> tuple[Pose, ...]:

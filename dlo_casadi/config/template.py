@@ -85,10 +85,12 @@ def template(
 
 
 def _quoted(text: str) -> str:
-    """Text in YAML's single quotes, where it needs them."""
+    """Text in YAML's quotes, where it needs them: double ones for what cannot be printed."""
     plain = text.replace("_", "").replace("/", "").replace(".", "").replace("-", "")
     if plain.isascii() and plain.isalnum() and text[0].isalpha() and plain.lower() not in _WORDS:
         return text
+    if not text.isprintable():
+        return '"' + text.encode("unicode_escape").decode().replace('"', '\\"') + '"'
     return "'" + text.replace("'", "''") + "'"
 
 

@@ -61,7 +61,7 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
     model = screened.candidate.add_to(base.model)
     best: Fit | None = None
     for share in SHARES:
-        values = model.nominal.copy()
+        values = base.values_in(model)
         for name, value in screened.start.items():
             i = model.names.index(name)
             scanned = name not in screened.candidate.screened
@@ -71,7 +71,6 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
                 model,
                 base.problem.history,
                 base.problem.tolerances,
-                free=_free(base, model.names),
                 values=values,
                 start=base,
                 max_iterations=MOST_STEPS,
@@ -83,12 +82,3 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
         if best.point.objective < base.point.objective and best.converged:
             break
     return best
-
-
-def _free(base: Fit, names: tuple[str, ...]) -> list[str]:
-    """All parameters but those that the base keeps fixed."""
-    unknowns = base.problem.unknowns
-    fixed = {
-        name for name, free in zip(unknowns.model.names, unknowns.free, strict=True) if not free
-    }
-    return [name for name in names if name not in fixed]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model, starting_points
@@ -15,7 +16,7 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.parallel import map_in_order
 
 FloatArray = NDArray[np.floating]
@@ -80,8 +81,6 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
                 model,
                 base.problem.history,
                 base.problem.tolerances,
-                free=[key for key, free in zip(model.names, search.free, strict=True) if free],
-                values=fit.p,
                 start=fit,
                 max_iterations=MOST_STEPS,
             )
@@ -121,9 +120,7 @@ class _Search:
     @property
     def free(self) -> NDArray[np.bool_]:
         """Which parameters are estimated: all but those that the base keeps fixed."""
-        found = self.base.problem.unknowns
-        held = {key for key, free in zip(found.model.names, found.free, strict=True) if not free}
-        return np.array([key not in held for key in self.model.names])
+        return self.base.free_in(self.model)
 
     def run(self, executor: Executor) -> list[Fit]:
         """Fits from the most promising places, the best first."""
@@ -159,11 +156,11 @@ class _Search:
         return Fit(moving, *moving.descend(start, MOST_STEPS))
 
     def held_at(self, share: float) -> BatchProblem:
-        """Problem with the load at a share of the length, all else nominal."""
-        values = base_values(self.base, self.model)
+        """Problem with the load at a share of the length, all else nominal or kept fixed."""
+        free = self.free
+        values = np.where(free, self.model.nominal, self.base.values_in(self.model))
         place = self.model.names.index(self.position)
         values[place] = share * self.model.cable.length
-        free = self.free
         free[place] = False
         return self._problem(
             Unknowns(self.model, free, values, self.base.problem.unknowns.rest_free)
@@ -193,12 +190,3 @@ def pull_scatter(base: Fit) -> FloatArray:
     scatter = base.problem.scatter.copy()
     scatter[4:] = PULL_WEIGHTS * max(weight, cable.bending_stiffness / cable.length**2)
     return scatter
-
-
-def base_values(base: Fit, model: CableModel) -> FloatArray:
-    """Nominal values, but what the base keeps fixed."""
-    values = model.nominal.copy()
-    for key, free in zip(base.model.names, base.problem.unknowns.free, strict=True):
-        if not free:
-            values[model.names.index(key)] = base.value(key)
-    return values

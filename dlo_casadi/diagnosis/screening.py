@@ -110,18 +110,9 @@ class Screen:
         self.fit = fit
         self.listed = list(listed)
         self.model = extended(fit, listed)
-        base = self.fit.problem.unknowns
         # Nuisances that are candidates enter twice: with their prior, and free.
-        self.free = np.array(
-            [
-                name not in base.model.names or bool(base.free[base.model.names.index(name)])
-                for name in self.model.names
-            ]
-        )
-        p = self.model.nominal.copy()
-        for name, value in zip(fit.model.names, fit.p, strict=True):
-            p[self.model.names.index(name)] = value
-        self.p = p
+        self.free = fit.free_in(self.model)
+        self.p = fit.values_in(self.model)
         # What scans change the derivatives of.
         self.moving = tuple(
             name for c in self.listed if len(c.scans) > 1 for name in c.screened if not c.nuisance

@@ -302,9 +302,7 @@ class InnerProblem:
         """Arc through both ends on the pose's branch, or nearer to the measured points."""
         sides = {"ccw": (1,), "cw": (-1,), None: (1, -1)}[pose.branch]
         arcs = [
-            arc_headings(
-                self.chain.places, self.chain.length, np.zeros(2), target.end, side
-            )
+            arc_headings(self.chain.places, self.chain.length, np.zeros(2), target.end, side)
             for side in sides
         ]
         return min(arcs, key=lambda phi: target.residual(self.nodes(phi)[1:-1]))

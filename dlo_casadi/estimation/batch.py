@@ -5,7 +5,7 @@
     over  theta (parameters and rest curvature, shared), and of every pose its headings phi_j,
           multipliers lam_j, deviations and, where a state is carried, rest curvature
     s.t.  grad_(phi, lam) Lagrangian(phi_j, lam_j; theta) = 0           (balance and end conditions)
-          rest_(j+1) = next_rest(phi_j, rest_j)                         (only with a state)
+          rest_(j+1) = rest_after(x_j, rest_j)                         (only with a state)
 
 The measured points enter through R_j, the triangular factor of whitening x normals x Hermite
 interpolation: |R_j z - b_j|^2 equals the sum of squares over all points up to a constant. Feet
@@ -25,12 +25,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Shapes
+from dlo_casadi.assembly import DEVIATIONS, Shapes
 from dlo_casadi.equilibrium import stats_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import normal_rows
-from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.whole_pose import PoseSymbols, balance, curve, rest_after
 
 FloatArray = NDArray[np.floating]

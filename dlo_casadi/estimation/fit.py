@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Shapes
+from dlo_casadi.assembly import DEVIATIONS, Shapes
 from dlo_casadi.equilibrium import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
@@ -21,7 +21,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.parallel import map_in_order
 
 FloatArray = NDArray[np.floating]
@@ -83,11 +83,13 @@ def fit_model(
     std : float, optional [m]
         Declared noise of one coordinate; estimated, with its correlation, when absent.
     free : sequence of str, optional
-        Names of the parameters to estimate; all by default.
+        Names of the parameters to estimate; by default all but those that `start` keeps fixed.
     values : (n_parameters,), optional
-        Where the parameters start, or stay if they are not estimated; nominal by default.
+        Where the parameters start, or stay if they are not estimated; by default where `start`
+        has them, nominal where it does not know them.
     start : Fit, optional
-        A fit of a similar model on the same mesh to start from; its noise is kept.
+        A fit of a similar model on the same mesh to start from; its noise is kept, and what it
+        has found of the parameters that are estimated.
     decades : sequence of float
         Stiffnesses to start from, powers of ten about the prior.
     max_iterations : int
@@ -103,8 +105,14 @@ def fit_model(
             "no pose to fit: every pose is held out or could not be read.\n"
             "  Try: role: fit for at least one pose."
         )
-    chosen = np.array([free is None or name in free for name in model.names])
-    begin = model.nominal if values is None else values
+    if free is not None:
+        chosen = np.array([name in free for name in model.names])
+    else:
+        chosen = np.ones(len(model.names), dtype=bool) if start is None else start.free_in(model)
+    if values is not None:
+        begin = values
+    else:
+        begin = model.nominal if start is None else start.values_in(model)
     unknowns = Unknowns(model, chosen, begin)
     if start is not None:
         return _continue(unknowns, measured, tolerances, start, max_iterations)
@@ -155,10 +163,8 @@ def _continue(
 ) -> Fit:
     """Fit a similar model from the minimum of another one, with the noise found there."""
     model = unknowns.model
-    p = unknowns.fixed.copy()
-    for i, name in enumerate(model.names):
-        if name in start.model.names and unknowns.free[i]:
-            p[i] = start.value(name)
+    known = np.array([name in start.model.names for name in model.names])
+    p = np.where(known & unknowns.free, start.values_in(model), unknowns.fixed)
     unknowns = replace(unknowns, fixed=p)
     theta = unknowns.pack(p, start.coefficients)
     problem = BatchProblem(
@@ -240,6 +246,5 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
 
 def _feet_for(problem: BatchProblem, start: Fit) -> list[FloatArray]:
     """Feet of the problem's fitted poses, by the pose's place in the session."""
-    places = [start.problem.indices[j] for j in start.problem.used]
-    known = dict(zip(places, start.point.feet, strict=True))
-    return [known[problem.indices[j]] for j in problem.used]
+    known = dict(zip(start.problem.fitted, start.point.feet, strict=True))
+    return [known[k] for k in problem.fitted]

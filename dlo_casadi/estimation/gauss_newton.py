@@ -117,7 +117,8 @@ class BatchProblem:
     unknowns : Unknowns
     measured : sequence of MeasuredPose
         All poses in order, the `history`; those held out or unreadable are among the problem's
-        own poses, `measured`, only if the model carries a state.
+        own poses, `measured`, only if the model carries a state. The poses that are fitted are
+        `history[k] for k in fitted`, the same as `measured[j] for j in used`.
     noise : NoiseModel
     tolerances : Tolerances
     roughness_std : float
@@ -140,17 +141,18 @@ class BatchProblem:
     ) -> None:
         self.unknowns = unknowns
         self.history = tuple(measured)
-        fitted = [k for k, item in enumerate(measured) if item.readable and not item.held_out]
+        self.fitted = [
+            k for k, item in enumerate(self.history) if item.readable and not item.held_out
+        ]
         # Poses that are not fitted matter only where they leave something behind in the cable.
-        self.indices = list(range(len(measured))) if unknowns.model.has_state else fitted
+        coupled = unknowns.model.has_state
+        self.indices = list(range(len(self.history))) if coupled else self.fitted
+        self.used = self.fitted if coupled else list(range(len(self.fitted)))
         self.measured = tuple(self.history[k] for k in self.indices)
         self.noise = noise
         self.tolerances = tolerances
         self.roughness_std = roughness_std
         self.sweep = sweep or Sweep(unknowns.model, [item.pose for item in self.measured])
-        self.used = [
-            j for j, item in enumerate(self.measured) if item.readable and not item.held_out
-        ]
         self.precision = unknowns.prior_precision(roughness_std)
         self.mean = unknowns.prior_mean()
         self.scatter = tolerances.deviation if scatter is None else scatter
@@ -376,10 +378,10 @@ class BatchProblem:
 
         Not for models with a state, whose poses depend on those before them.
         """
-        fitted = [self.measured[j] for j in self.used]
+        kept = self.fitted[:: -(-len(self.fitted) // most)]
         return BatchProblem(
             self.unknowns,
-            fitted[:: -(-len(fitted) // most)],
+            [self.history[k] for k in kept],
             self.noise,
             self.tolerances,
             self.roughness_std,

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 
-from dlo_casadi.effects import SectionLaw
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.model import CableModel
 from dlo_casadi.rest import RestCurvature
@@ -100,19 +98,6 @@ def measured_moment_curve(
 def law_of(model: CableModel, p: FloatArray, bend: FloatArray) -> FloatArray:
     """Moments (K,) [N m] that a model's section answers to bends (K,) [1/m] with.
 
-    M = dW/dk of the energy W = EI/2 k^2 factor(k) per length; laws that depend on the place count
-    with the middle of the cable.
+    Laws that depend on the place count with the middle of the cable.
     """
-    k, q = ca.SX.sym("k"), ca.SX.sym("p", len(p))
-    energy = q[0] / 2 * k**2
-    length = model.cable.length
-    middle = np.array([[0.499 * length, 0.501 * length]])
-    for effect in model.effects:
-        if isinstance(effect, SectionLaw):
-            local = {
-                item.name: q[model.names.index(f"{effect.label}.{item.name}")]
-                for item in effect.parameters(model.cable)
-            }
-            energy *= effect.factor(k, middle, model.cable, local)
-    moment = ca.Function("moment", [k, q], [ca.gradient(energy, k)])
-    return np.array([float(moment(value, p)) for value in bend])
+    return np.array([float(model.section_moment(value, p)) for value in bend])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium import Pose
+from dlo_casadi.rod.chain import Chain
 
 FloatArray = NDArray[np.floating]
 
@@ -159,7 +160,7 @@ class NodeCurve:
         return self.frame(s, derivative)[derivative]
 
     def moved(self, s: FloatArray, slopes: FloatArray) -> FloatArray:
-        """Change (K, 2, q) [m] of the positions at fixed s for one (n + 1, 2 or 4, q) of the curve."""
+        """Change (K, 2, q) [m] of positions at fixed s for one (n + 1, 2 or 4, q) of the curve."""
         e, w = self.weights(s)
         w = w[:, :, None, None]
         out = w[:, 0] * slopes[e, :2] + w[:, 1] * slopes[e + 1, :2]
@@ -207,7 +208,7 @@ class NodeCurve:
 
 
 def normal_rows(curve: NodeCurve, s: FloatArray, normals: FloatArray) -> FloatArray:
-    """Matrix (K, (n + 1) 2 or 4) of d(n . r(s)) by the curve's numbers, places and normals fixed."""
+    """Matrix (K, (n + 1) 2 or 4) of d(n . r(s)) by the curve's numbers, s and n fixed."""
     width = 2 if curve.slopes is None else 4
     unit = np.eye((curve.n + 1) * width).reshape((curve.n + 1, width, -1))
     return np.einsum("kd,kdq->kq", normals, curve.moved(s, unit))
@@ -230,6 +231,27 @@ def chord_places(measured: MeasuredPose, length: float) -> FloatArray:
     if measured.pose.end is not None:
         places = places * (length / s[-1])
     return np.clip(places, 0.0, length)
+
+
+def line_headings(measured: MeasuredPose, chain: Chain, places: FloatArray) -> FloatArray:
+    """Headings (n_nodes,) [rad] of a measured line, unwrapped along the cable.
+
+    Those of chords of some hundredths of the length; `places` (K,) [m] are the points' arc lengths.
+    """
+    line = [np.array(measured.pose.start)[None], measured.points]
+    s = [np.array([0.0]), places]
+    if measured.pose.end is not None:
+        line.append(np.array(measured.pose.end)[None])
+        s.append(np.array([chain.length]))
+    points, at = np.concatenate(line), np.maximum.accumulate(np.concatenate(s))
+    grid = np.linspace(0.0, at[-1], 31)
+    coarse = np.stack([np.interp(grid, at, points[:, i]) for i in (0, 1)], axis=1)
+    chords = np.diff(coarse, axis=0)
+    headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+    if measured.pose.start_heading is not None:
+        turns = np.round((measured.pose.start_heading - headings[0]) / (2 * np.pi))
+        headings = headings + 2 * np.pi * turns
+    return np.interp(chain.places, (grid[1:] + grid[:-1]) / 2, headings)
 
 
 def _denoised_length(polyline: FloatArray, steps: FloatArray) -> FloatArray:

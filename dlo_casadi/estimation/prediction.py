@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given
-from dlo_casadi.equilibrium import Equilibrium, Pose, solve_equilibrium
+from dlo_casadi.equilibrium import NEARBY, Branch, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve, chord_places, line_headings
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -35,8 +35,29 @@ class Prediction:
     rest: FloatArray
 
 
+@dataclass(frozen=True)
+class MeasuredBranch:
+    """The equilibrium in which a pose was measured, where another one is predicted.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        Solved from the measured shape: no prediction any more, but what one would be if it knew
+        the branch.
+    branch : "ccw", "cw" or None
+        What the pose has to name for this equilibrium to be predicted; None if no name does.
+    """
+
+    prediction: Prediction
+    branch: Branch | None
+
+
 def predict_poses(
-    model: CableModel, p: FloatArray, rest: FloatArray, poses: Sequence[Pose]
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    poses: Sequence[Pose],
+    starts: Sequence[FloatArray | None] | None = None,
 ) -> list[Prediction | None]:
     """Predict poses in the order in which they are taken; None where there is no equilibrium.
 
@@ -47,11 +68,13 @@ def predict_poses(
     p : (n_parameters,)
     rest : (n_cells,) [1/m]
         Before the first pose.
+    starts : sequence of (n_nodes,) [rad] or None, optional
+        Headings from which a pose is solved instead, whichever branch that leads to.
     """
     out: list[Prediction | None] = []
-    for pose in poses:
+    for pose, start in zip(poses, starts or [None] * len(poses), strict=True):
         try:
-            eq = solve_equilibrium(model, p, rest, pose)
+            eq = solve_equilibrium(model, p, rest, pose, phi_init=start)
         except EquilibriumError:
             out.append(None)
             continue
@@ -61,6 +84,66 @@ def predict_poses(
         if model.has_state:
             rest = model.assembly.state_after(shapes, given)[0][0]
     return out
+
+
+def measured_branches(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    measured: Sequence[MeasuredPose],
+    predictions: Sequence[Prediction | None],
+) -> list[MeasuredBranch | None]:
+    """Poses that were measured in another stable equilibrium than the predicted one; else None.
+
+    Each pose is solved from its measured shape. It is another equilibrium where headings differ,
+    and the measured one where it is nearer to the points.
+    """
+    starts = [
+        line_headings(item, model.chain, chord_places(item, model.cable.length))
+        if item.readable
+        else None
+        for item in measured
+    ]
+    solved = predict_poses(model, p, rest, [item.pose for item in measured], starts)
+    out: list[MeasuredBranch | None] = []
+    for item, known, found in zip(measured, predictions, solved, strict=True):
+        other = None
+        if (
+            item.readable
+            and known is not None
+            and found is not None
+            and found.equilibrium.stable
+            and not _same(known.equilibrium, found.equilibrium)
+            and _square(found, item) < _square(known, item)
+        ):
+            other = MeasuredBranch(found, _name_of(model, p, item.pose, found))
+        out.append(other)
+    return out
+
+
+def _square(prediction: Prediction, item: MeasuredPose) -> float:
+    """Mean square distance [m^2] of measured points to a prediction."""
+    return float((prediction.curve.distances(item.points) ** 2).mean())
+
+
+def _same(one: Equilibrium, other: Equilibrium) -> bool:
+    """Whether two equilibria are one; headings may differ by full turns of the whole cable."""
+    gap = one.phi - other.phi
+    gap = gap - 2 * np.pi * np.round(gap.mean() / (2 * np.pi))
+    return bool(np.abs(gap).max() < NEARBY)
+
+
+def _name_of(model: CableModel, p: FloatArray, pose: Pose, found: Prediction) -> Branch | None:
+    """The branch that a pose has to name for an equilibrium to be predicted."""
+    names: tuple[Branch, Branch] = ("ccw", "cw")
+    for name in names:
+        try:
+            eq = solve_equilibrium(model, p, found.rest, replace(pose, branch=name))
+        except EquilibriumError:
+            continue
+        if _same(eq, found.equilibrium):
+            return name
+    return None
 
 
 def rms_distance(

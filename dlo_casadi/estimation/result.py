@@ -134,6 +134,16 @@ class Fit:
         """Value of a parameter (SI)."""
         return float(self.p[self.model.names.index(name)])
 
+    def values_in(self, model: CableModel) -> FloatArray:
+        """Parameter vector of a similar model: this fit's values, nominal where it has none."""
+        known = dict(zip(self.model.names, self.p, strict=True))
+        return np.array([known.get(q.name, q.nominal) for q in model.parameters])
+
+    def free_in(self, model: CableModel) -> NDArray[np.bool_]:
+        """Which parameters of a similar model are estimated: all but those kept fixed here."""
+        free = dict(zip(self.model.names, self.problem.unknowns.free, strict=True))
+        return np.array([free.get(name, True) for name in model.names], dtype=bool)
+
     @cached_property
     def stable(self) -> NDArray[np.bool_]:
         """Whether each pose is a stable equilibrium at the fitted parameters."""

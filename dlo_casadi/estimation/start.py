@@ -7,12 +7,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Directions, Shapes
+from dlo_casadi.assembly import DEVIATIONS, Directions, Shapes
 from dlo_casadi.equilibrium import guesses
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve, chord_places
+from dlo_casadi.estimation.observation import (
+    MeasuredPose,
+    NodeCurve,
+    chord_places,
+    line_headings,
+)
 from dlo_casadi.estimation.sweep import Sweep
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import Vector
 
 FloatArray = NDArray[np.floating]
@@ -43,12 +48,12 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     feet: list[FloatArray] = []
     for j in used:
         places = chord_places(problem.measured[j], chain.length)
-        x[j, :, 0] = _polyline_headings(problem.measured[j], model, places)
+        x[j, :, 0] = line_headings(problem.measured[j], chain, places)
         feet.append(places)
     shapes = problem.sweep.start_shapes(x)
     each = _each_node(sweep)
     for iteration in range(_KINEMATIC_STEPS + 1):
-        seen = sweep.observe(shapes, model.nominal, flat, each)
+        seen = sweep.observe(shapes, problem.unknowns.fixed, flat, each)
         for k, j in enumerate(used):
             curve = problem.curve_of(seen.z[j])
             if iteration > 1:
@@ -102,25 +107,6 @@ def _kinematic_step(
     stacked = np.concatenate(system)
     step = np.linalg.solve(stacked.T @ stacked, stacked.T @ np.concatenate(target))
     return step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
-
-
-def _polyline_headings(measured: MeasuredPose, model: CableModel, places: FloatArray) -> FloatArray:
-    """Headings of chords of a few hundredths of the length, unwrapped along the cable."""
-    chain = model.chain
-    line = [np.array(measured.pose.start)[None], measured.points]
-    s = [np.array([0.0]), places]
-    if measured.pose.end is not None:
-        line.append(np.array(measured.pose.end)[None])
-        s.append(np.array([chain.length]))
-    points, at = np.concatenate(line), np.maximum.accumulate(np.concatenate(s))
-    grid = np.linspace(0.0, at[-1], 31)
-    coarse = np.stack([np.interp(grid, at, points[:, i]) for i in (0, 1)], axis=1)
-    chords = np.diff(coarse, axis=0)
-    headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
-    if measured.pose.start_heading is not None:
-        turns = np.round((measured.pose.start_heading - headings[0]) / (2 * np.pi))
-        headings = headings + 2 * np.pi * turns
-    return np.interp(chain.places, (grid[1:] + grid[:-1]) / 2, headings)
 
 
 def all_at_once(

@@ -13,7 +13,7 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Sweep
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -50,7 +50,9 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         # Where bending dominates the weight, the shape stays and the forces grow with EI.
         grown = replace(shapes, lam=shapes.lam * np.exp(log_ei - from_log_ei))
         start = min(
-            shapes, grown, key=lambda x: float(np.linalg.norm(sweep.balance(x, at(log_ei), rest)[0].rows))
+            shapes,
+            grown,
+            key=lambda x: float(np.linalg.norm(sweep.balance(x, at(log_ei), rest)[0].rows)),
         )
         moved, converged = sweep.solve(start, at(log_ei), rest)
         if not converged.all() or not sweep.stable(moved, at(log_ei), rest).all():
@@ -104,4 +106,4 @@ def _cold(
             return None
         x.append(prediction.equilibrium.x)
         lam.append(prediction.equilibrium.multipliers)
-    return Shapes(np.array(x), np.array(lam), np.zeros((len(used), len(DEVIATIONS))))
+    return Shapes.declared(np.array(x), np.array(lam))

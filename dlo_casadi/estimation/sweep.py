@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Assembly, CurveSlopes, Directions, Given, Shapes
+from dlo_casadi.assembly import DEVIATIONS, Assembly, CurveSlopes, Directions, Given, Shapes
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 
 FloatArray = NDArray[np.floating]
@@ -55,8 +55,7 @@ class Sweep:
 
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes of these nodes (m, n_nodes, coordinates), without forces and deviations."""
-        lam = np.zeros((self.m, self.model.n_conditions))
-        return Shapes(x, lam, np.zeros((self.m, len(DEVIATIONS))))
+        return Shapes.declared(x, np.zeros((self.m, self.model.n_conditions)))
 
     # ---- state -----------------------------------------------------------------------------------
 
@@ -88,9 +87,7 @@ class Sweep:
 
     # ---- equilibria ------------------------------------------------------------------------------
 
-    def balance(
-        self, shapes: Shapes, p: FloatArray, rest: FloatArray
-    ) -> tuple[Vector, BandMatrix]:
+    def balance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> tuple[Vector, BandMatrix]:
         """Imbalance and tangent matrices; `rest` is that before the first pose, or of each."""
         return self.assembly.balance(shapes, self._given(shapes, p, rest))[1:]
 
@@ -164,15 +161,15 @@ class Sweep:
         self, here: Shapes, given: Given, force: Vector, matrix: BandMatrix, coupled: bool
     ) -> Vector:
         """Newton step of one column; not finite where the shape is not."""
-        finite = np.isfinite(matrix.diagonal).all(axis=(1, 2, 3))
+        finite = np.flatnonzero(np.isfinite(matrix.diagonal).all(axis=(1, 2, 3)))
         right = Vector(-force.x, -force.y)
-        if finite.all():
+        if len(finite) == len(matrix.diagonal):
             step = matrix.factor().solve(right)
         else:
             step = Vector(np.full_like(force.x, np.nan), np.full_like(force.y, np.nan))
-            if finite.any():
-                found = matrix.subset(finite).factor().solve(
-                    Vector(right.x[finite], right.y[finite])
+            if len(finite):
+                found = (
+                    matrix.subset(finite).factor().solve(Vector(right.x[finite], right.y[finite]))
                 )
                 step.x[finite], step.y[finite] = found.x, found.y
         return self._pass_on(here, given, matrix, step) if coupled else step
@@ -180,7 +177,8 @@ class Sweep:
     def _pass_on(self, here: Shapes, given: Given, matrix: BandMatrix, step: Vector) -> Vector:
         """Newton step with the change of rest curvature handed from pose to pose."""
         a, n_p = self.assembly, given.p.shape[1]
-        change, none = np.zeros((1, given.rest.shape[1], 1)), np.zeros((1, n_p, 1))
+        change: FloatArray = np.zeros((1, given.rest.shape[1], 1))
+        none = np.zeros((1, n_p, 1))
         x, y = step.x.copy(), step.y.copy()
         after = a.state_after(here, given)
         if not after[1].any():

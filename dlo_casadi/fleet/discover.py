@@ -12,7 +12,7 @@ from typing import Any
 
 from dlo_casadi import __version__
 from dlo_casadi.config import read_yaml
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, well_formed
 
 ENDINGS = (".yaml", ".yml")
 # A line that makes a YAML file a configuration, even one with mistakes.
@@ -54,7 +54,7 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
     """
     text = str(where)
     folder = Path(text)
-    if folder.is_dir():
+    if os.path.isdir(folder):
         base = folder.resolve()
         found = [path for path in _yaml_files(base) if _is_session(path)]
     else:
@@ -66,7 +66,8 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
             f"no configuration in {text}: a YAML file with cable: and experiment: is looked for.\n"
             "  Try: a folder, or a pattern in quotes, such as 'cables/*/session.yaml'."
         )
-    sessions = sorted(Session(path.relative_to(base).as_posix(), path) for path in found)
+    keys = [well_formed(path.relative_to(base).as_posix()) for path in found]
+    sessions = sorted(map(Session, keys, found))
     return base, tuple(sessions)
 
 
@@ -103,7 +104,7 @@ def digest_of(session: Session, options: tuple[Any, ...]) -> str:
     add(repr((__version__, options)).encode())
     add(_content(session.path))
     for name in _data_files(session.path):
-        add(name.encode())
+        add(well_formed(name).encode())
         add(_content(session.path.parent / name))
     return digest.hexdigest()
 
@@ -113,7 +114,7 @@ def _content(path: Path) -> bytes:
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").digest()
-    except OSError:
+    except (OSError, ValueError):  # a name that no file can have is a ValueError
         return b""
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dlo_casadi.config import load_config
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.fleet.columns import Row, empty_row, row_of
 from dlo_casadi.fleet.discover import Session
 from dlo_casadi.fleet.store import write_row
@@ -62,10 +62,18 @@ class Job:
 
 
 def fit_one(job: Job) -> Row:
-    """Fit a session and write its results, at last its row; a failure is a row with a message."""
+    """Fit a session and write its results, at last its row; a failure is a row with a message.
+
+    Raises
+    ------
+    OutputError
+        If the results or the row cannot be written: that is no property of the session.
+    """
     begin = time.perf_counter()
     try:
         row = _fitted(job, begin)
+    except OutputError:
+        raise
     except DloError as error:
         row = _failed(job, str(error), begin)
     except Exception as error:

@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from dlo_casadi.durable import only_run, write_durably
+from dlo_casadi.durable import make_folder, only_run, write_file
 from dlo_casadi.fleet.columns import Row, empty_row
 from dlo_casadi.fleet.discover import Session, digest_of
 from dlo_casadi.fleet.one import Job, Options, fit_one
@@ -70,7 +70,8 @@ def fit_fleet(
     executor : Executor
     options : Options, optional
     retry_failed : bool
-        Whether sessions that failed are tried again. Those lost with a killed worker always are.
+        Whether sessions that failed are tried again. Those lost always are: with a killed worker,
+        or because their results could not be written.
     begin : callable
         Told how many rows are taken over and how many sessions are left.
     progress : callable, optional
@@ -85,7 +86,7 @@ def fit_fleet(
     options = options or Options()
     output = output.resolve()
     with only_run(output):
-        (output / "rows").mkdir(exist_ok=True)
+        make_folder(output / "rows")
         digests = {session.key: digest_of(session, astuple(options)) for session in sessions}
         rows: dict[str, Row] = {}
         for session in sessions:
@@ -100,7 +101,7 @@ def fit_fleet(
             if session.key not in rows
         ]
         for job in jobs:
-            job.folder.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(job.folder.parent)
         taken_over = len(rows)
         begin(taken_over, len(jobs))
         folding = _Folding(output)
@@ -136,7 +137,6 @@ class _Folding:
         """Fold."""
         begin = time.perf_counter()
         write_table(self._output, rows.values())
-        page = overview_html(list(rows.values()), self._output).encode()
-        write_durably(self._output / PAGE, lambda stream: stream.write(page))
+        write_file(self._output / PAGE, overview_html(list(rows.values()), self._output))
         end = time.perf_counter()
         self._next = end + max(FOLD_AFTER, (end - begin) / FOLD_SHARE)

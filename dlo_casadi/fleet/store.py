@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dlo_casadi import __version__
-from dlo_casadi.durable import write_durably
+from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet.columns import COLUMNS, SCHEMA, UNITS, Row
 
@@ -27,8 +27,7 @@ def row_file(output: Path, key: str) -> Path:
 
 def write_row(output: Path, row: Row) -> None:
     """Write a session's row; it is durable when this returns. A second one replaces the first."""
-    text = json.dumps(row, allow_nan=False).encode()
-    write_durably(row_file(output, row["session"]), lambda stream: stream.write(text))
+    write_file(row_file(output, row["session"]), json.dumps(row, allow_nan=False))
 
 
 def read_row(output: Path, key: str, digest: str) -> Row | None:
@@ -48,7 +47,7 @@ def write_table(output: Path, rows: Iterable[Row]) -> Path:
         sorted(rows, key=lambda row: str(row["session"])), schema=arrow_schema()
     )
     path = output / TABLE
-    write_durably(path, lambda stream: parquet.write_table(table, stream))
+    write_file(path, lambda stream: parquet.write_table(table, stream))
     return path
 
 

@@ -11,6 +11,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from dlo_casadi.durable import write_file
 from dlo_casadi.session.outcome import Outcome, Stage, StageName
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
@@ -39,6 +40,7 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.6,
     "font.family": "DejaVu Sans",
+    "text.parse_math": False,  # a name with two dollar signs is no formula
 }
 _DPI = 150
 
@@ -48,7 +50,13 @@ def figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
     """Open a figure of a size [inch] and save it to a file when it is drawn."""
     with styled(size) as drawing:
         yield drawing
-        drawing.savefig(path, dpi=_DPI)
+        save_figure(path, drawing, dpi=_DPI)
+
+
+def save_figure(path: Path, drawing: Figure, **options: Any) -> None:
+    """Write a figure in the format of the file's ending, whole or not at all."""
+    form = path.suffix[1:]
+    write_file(path, lambda stream: drawing.savefig(stream, format=form, **options))
 
 
 @contextmanager

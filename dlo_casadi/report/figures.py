@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import StrMethodFormatter
+from matplotlib.ticker import LogLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from dlo_casadi.estimation.moment import LEAST_POINTS, law_of, measured_moment_curve
@@ -87,7 +87,7 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
     with figure(path, (width, (height + 0.4) * rows + 1.3)) as drawing:
         grid = drawing.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for axes, pose in zip(grid.ravel(), poses, strict=False):
-            _draw_pose(axes, pose, lines, outcome.measurement.std, factor)
+            _draw_pose(axes, pose, lines, factor)
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
         for axes in grid.ravel()[len(poses) :]:
@@ -151,12 +151,12 @@ def _magnification(outcome: Outcome, size: float) -> int:
 
 
 def _draw_pose(
-    axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, str]], std: float, factor: int
+    axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, str]], factor: int
 ) -> None:
     for stage, color, style in lines:
         shape = stage.shapes.get(pose.name)
         if shape is not None:
-            axes.plot(*magnified(pose, shape, std, factor).T, color=color, ls=style)
+            axes.plot(*magnified(pose, shape, factor).T, color=color, ls=style)
     if len(pose.points):
         axes.plot(*pose.points[:: max(1, len(pose.points) // 60)].T, ".", color=BLACK, ms=2.5)
     axes.set_aspect("equal")
@@ -173,6 +173,8 @@ def _draw_pose(
         title += f": {millimetres(last.rmse)}"
     if last is not None and not last.stable:
         title += ", unstable"
+    if last is not None and last.measured_branch is not None:
+        title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch"
     axes.set_title(title)
     if pose.role == "held_out":
         axes.title.set_color(_HELD_OUT_TEXT)
@@ -212,7 +214,7 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
                 held_out = pose.role == "held_out"
                 axes.plot(
                     shape.s,
-                    shape.residual,
+                    shape.residual / outcome.measurement.std,
                     color=_HELD_OUT if held_out else BLUE,
                     lw=1.1,
                     alpha=0.85 if held_out else 0.45,
@@ -328,7 +330,9 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
         ]
         axes.set_yticks(middles, [rows[k][0] for k in range(0, len(rows), per_stage)])
         axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        for part in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+            part(StrMethodFormatter("{x:g}"))
         axes.set_xlim(1e3 * left, 1e3 * right)
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("distance of the measured points from the prediction, RMS [mm]")

@@ -10,14 +10,14 @@ from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape
 FloatArray = NDArray[np.floating]
 
 
-def magnified(pose: PoseInput, shape: PoseShape, std: float, factor: int) -> FloatArray:
+def magnified(pose: PoseInput, shape: PoseShape, factor: int) -> FloatArray:
     """The predicted curve, its distance from the measured points multiplied."""
     if factor == 1 or not len(pose.points):
         return shape.curve
-    return beside(pose, shape, std, factor)
+    return beside(pose, shape, factor)
 
 
-def beside(pose: PoseInput, shape: PoseShape, std: float, factor: float = 1.0) -> FloatArray:
+def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray:
     """Points (K, 2) [m] of the prediction beside the measured ones, distances multiplied."""
     places = np.linspace(0.0, 1.0, len(shape.curve))
     slope = np.gradient(shape.curve, places, axis=0)
@@ -25,7 +25,7 @@ def beside(pose: PoseInput, shape: PoseShape, std: float, factor: float = 1.0) -
     at = np.clip(shape.s / length, 0.0, 1.0)
     tangent = np.stack([np.interp(at, places, slope[:, i]) for i in (0, 1)], axis=1)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.hypot(*tangent.T)[:, None]
-    moved = pose.points - factor * std * shape.residual[:, None] * normal
+    moved = pose.points - factor * shape.residual[:, None] * normal
     return np.asarray(moved)
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from dlo_casadi.session.outcome import Outcome, ParameterEstimate, Stage, StageName
+from dlo_casadi.errors import well_formed
+from dlo_casadi.session.outcome import Outcome, ParameterEstimate, StageName
 
 SCHEMA = "dlo-report/1"
 # In every report, in this order; `closed` only where an effect was added.
@@ -34,12 +36,13 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
             "kind": measurement.kind,
             "poses_fit": measurement.poses_fit,
             "poses_held_out": measurement.poses_held_out,
+            "held_out_missing": list(measurement.held_out_missing),
             "points": measurement.points,
             "std": measurement.std,
             "std_source": measurement.std_source,
             "correlation_length_m": measurement.correlation_length,
         },
-        "stages": [_stage(name, outcome.stage(name)) for name in names],
+        "stages": [_stage(name, outcome) for name in names],
         "discretization": {
             "n": outcome.discretization.n,
             "element": outcome.discretization.element,
@@ -80,20 +83,23 @@ def all_warnings(outcome: Outcome) -> list[str]:
 
 
 def finite(value: Any) -> Any:
-    """Copy with NumPy's numbers as plain ones and None for what is not finite."""
+    """Copy with plain numbers for NumPy's, None for what is not finite, and `well_formed` text."""
     if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
+        return {finite(str(key)): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [finite(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
         return finite(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, str):
+        return well_formed(value)
     return value
 
 
-def _stage(name: StageName, stage: Stage | None) -> dict[str, Any]:
+def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
     """One stage; with None for all numbers if it did not run."""
+    stage = outcome.stage(name)
     if stage is None or not stage.parameters:
         unknown = {
             "value": None,
@@ -106,6 +112,10 @@ def _stage(name: StageName, stage: Stage | None) -> dict[str, Any]:
             "name": name,
             "rmse_fit": None,
             "rmse_held_out": None,
+            "rmse_fit_measured_branch": None,
+            "rmse_held_out_measured_branch": None,
+            "other_branch": {},
+            "held_out": None,
             "chi2_per_dof": None,
             "parameters": {
                 "bending_stiffness": unknown,
@@ -121,6 +131,17 @@ def _stage(name: StageName, stage: Stage | None) -> dict[str, Any]:
         "name": name,
         "rmse_fit": stage.rmse_fit,
         "rmse_held_out": stage.rmse_held_out,
+        "rmse_fit_measured_branch": stage.rmse_fit_measured_branch,
+        "rmse_held_out_measured_branch": stage.rmse_held_out_measured_branch,
+        "other_branch": {
+            pose: {
+                "rmse": stage.shapes[pose].rmse,
+                "rmse_measured_branch": found.rmse,
+                "branch": found.branch,
+            }
+            for pose, found in stage.other_branch.items()
+        },
+        "held_out": asdict(outcome.held_out(stage)),
         "chi2_per_dof": stage.chi2_per_dof,
         "parameters": parameters,
     }

@@ -10,7 +10,13 @@ from matplotlib.figure import Figure
 
 from dlo_casadi.report.canvas import BLACK, BLUE, PURPLE, label_of, styled
 from dlo_casadi.report.json_report import all_warnings
-from dlo_casadi.report.terminal import describe, prediction_rows, verdict_lines
+from dlo_casadi.report.terminal import (
+    ON_BRANCH,
+    describe,
+    predicted_share,
+    prediction_rows,
+    verdict_lines,
+)
 from dlo_casadi.session.outcome import Outcome
 
 _POINTS = 40
@@ -82,7 +88,11 @@ def _errors(outcome: Outcome) -> list[tuple[str, ...]]:
     stage = outcome.stages[-1]
     rows = [("error of the fit", _mm(stage.rmse_fit))]
     if stage.rmse_held_out is not None:
-        rows.append(("held out", _mm(stage.rmse_held_out)))
+        share = predicted_share(outcome, stage)
+        rows.append(("held out", _mm(stage.rmse_held_out) + share))
+    if stage.other_branch:
+        both = (stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch)
+        rows.append((ON_BRANCH, ", ".join(_mm(value) for value in both if value is not None)))
     measurement = outcome.measurement
     return [*rows, (f"noise ({measurement.std_source})", _mm(measurement.std))]
 

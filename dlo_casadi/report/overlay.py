@@ -6,12 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from dlo_casadi.durable import make_folder
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.report.canvas import BLUE, ORANGE, before_after, label_of, millimetres
+from dlo_casadi.report.canvas import (
+    BLUE,
+    ORANGE,
+    before_after,
+    label_of,
+    millimetres,
+    save_figure,
+    styled,
+)
 from dlo_casadi.session.outcome import Outcome, PoseInput
 from dlo_casadi.vision import read_image
 
@@ -23,7 +30,7 @@ _DPI = 100
 
 def write_overlays(folder: Path, outcome: Outcome) -> None:
     """Draw one JPEG for each pose with a photograph into a new folder."""
-    folder.mkdir()
+    make_folder(folder)
     for pose in outcome.poses:
         if pose.image is not None and pose.to_pixels is not None:
             try:
@@ -48,25 +55,25 @@ def draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome:
     zoom = min(_LARGEST[0] / (right - left), _LARGEST[1] / (bottom - top))
     width, height = (right - left) * zoom, (bottom - top) * zoom
     width = max(width, _NARROWEST)
-    drawing = Figure(figsize=(width / _DPI, (height + _STRIP) / _DPI), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(drawing)
-    share = _STRIP / (height + _STRIP)
-    axes = drawing.add_axes((0, share, 1, 1 - share))
-    extent = (left - 0.5, right - 0.5, bottom - 0.5, top - 0.5)
-    axes.imshow(image[top:bottom, left:right], extent=extent, interpolation="bilinear")
-    axes.set_axis_off()
-    axes.plot(*measured.T, ".", color="white", ms=4.2)
-    axes.plot(*measured.T, ".", color="black", ms=2.2, label="measured")
-    for line, color, style, label in lines:
-        axes.plot(*line.T, color="white", lw=2.6, alpha=0.6)
-        axes.plot(*line.T, color=color, ls=style, lw=1.5, label=label)
-    axes.set_xlim(left - 0.5, right - 0.5)
-    axes.set_ylim(bottom - 0.5, top - 0.5)
-    role = "held out" if pose.role == "held_out" else "fit"
-    drawing.legend(
-        loc="lower center", ncols=3, fontsize=9, frameon=False, title=f"{pose.name} ({role})"
-    )
-    drawing.savefig(path, dpi=_DPI, pil_kwargs={"quality": 88})
+    with styled((width / _DPI, (height + _STRIP) / _DPI)) as drawing:
+        drawing.set_layout_engine("none")  # the axes have their place
+        share = _STRIP / (height + _STRIP)
+        axes = drawing.add_axes((0, share, 1, 1 - share))
+        extent = (left - 0.5, right - 0.5, bottom - 0.5, top - 0.5)
+        axes.imshow(image[top:bottom, left:right], extent=extent, interpolation="bilinear")
+        axes.set_axis_off()
+        axes.plot(*measured.T, ".", color="white", ms=4.2)
+        axes.plot(*measured.T, ".", color="black", ms=2.2, label="measured")
+        for line, color, style, label in lines:
+            axes.plot(*line.T, color="white", lw=2.6, alpha=0.6)
+            axes.plot(*line.T, color=color, ls=style, lw=1.5, label=label)
+        axes.set_xlim(left - 0.5, right - 0.5)
+        axes.set_ylim(bottom - 0.5, top - 0.5)
+        role = "held out" if pose.role == "held_out" else "fit"
+        drawing.legend(
+            loc="lower center", ncols=3, fontsize=9, frameon=False, title=f"{pose.name} ({role})"
+        )
+        save_figure(path, drawing, dpi=_DPI, pil_kwargs={"quality": 88})
 
 
 def _window(

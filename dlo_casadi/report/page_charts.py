@@ -212,11 +212,11 @@ def residuals_chart(outcome: Outcome) -> Model:
 def _residual_lines(chart: figure, kind: str, stage: Stage, outcome: Outcome, color: str) -> None:
     """All poses thin, and a source that the page fills with the chosen one."""
     shapes = [stage.shapes.get(pose.name) for pose in outcome.poses]
-    empty = np.zeros(0, dtype=np.float32)
+    empty, noise = np.zeros(0, dtype=np.float32), outcome.measurement.std
     all_poses = ColumnDataSource(
         {
             "s": [empty if x is None else x.s.astype(np.float32) for x in shapes],
-            "r": [empty if x is None else x.residual.astype(np.float32) for x in shapes],
+            "r": [empty if x is None else (x.residual / noise).astype(np.float32) for x in shapes],
             "pose": [pose.name for pose in outcome.poses],
             "role": ["held out" if p.role == "held_out" else "fit" for p in outcome.poses],
             "dash": [[5, 3] if p.role == "held_out" else [] for p in outcome.poses],

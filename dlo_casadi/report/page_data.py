@@ -11,12 +11,14 @@ from dlo_casadi.report.canvas import before_after, label_of, millimetres
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.terminal import (
     CANDIDATE_ORDER,
+    ON_BRANCH,
     cross_validated,
     describe,
     fixed_rows,
     footnotes,
     nuisance_rows,
     p_value_note,
+    predicted_share,
     rest_rows,
     separation_text,
     timing_rows,
@@ -109,26 +111,45 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         said = "" if was is None or before is None else f"{label_of(before, outcome)}: "
         rows.append((f"error, {role}", _mm(now), f"{said}{_mm(was)}" if said else ""))
     rows.append(("noise floor", millimetres(m.std), f"of the centre-lines, {m.std_source}"))
-    rows.append(("poses", f"{m.poses_fit} + {m.poses_held_out}", "to fit + held out to check"))
+    lost = f"; {len(m.held_out_missing)} held out were not measured" if m.held_out_missing else ""
+    said = f"to fit + held out to check{lost}"
+    rows.append(("poses", f"{m.poses_fit} + {m.poses_held_out}", said))
     return rows
 
 
 def stage_rows(outcome: Outcome) -> list[dict[str, Any]]:
-    """Errors of the stages: fit, cross-validated, held out, chi-square."""
+    """Errors of the stages: fit, cross-validated, held out, chi-square.
+
+    A stage of which poses were measured in another equilibrium has a second row.
+    """
     validated = cross_validated(outcome)
     before, after = before_after(outcome)
-    return [
-        {
-            "label": label_of(stage, outcome),
-            "mark": "before" if stage is before else "after" if stage is after else "",
-            "fit": _mm(stage.rmse_fit),
-            "validated": _mm(validated.get(stage.name)),
-            "held_out": _mm(stage.rmse_held_out),
-            "chi2": NOTHING if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
-            "note": stage.note,
-        }
-        for stage in outcome.stages
-    ]
+    rows = []
+    for stage in outcome.stages:
+        rows.append(
+            {
+                "label": label_of(stage, outcome),
+                "mark": "before" if stage is before else "after" if stage is after else "",
+                "fit": _mm(stage.rmse_fit),
+                "validated": _mm(validated.get(stage.name)),
+                "held_out": _mm(stage.rmse_held_out) + predicted_share(outcome, stage),
+                "chi2": NOTHING if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
+                "note": stage.note,
+            }
+        )
+        if stage.other_branch:
+            rows.append(
+                {
+                    "label": ON_BRANCH,
+                    "mark": "",
+                    "fit": _mm(stage.rmse_fit_measured_branch),
+                    "validated": NOTHING,
+                    "held_out": _mm(stage.rmse_held_out_measured_branch),
+                    "chi2": NOTHING,
+                    "note": f"poses in another equilibrium: {', '.join(stage.other_branch)}",
+                }
+            )
+    return rows
 
 
 def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:

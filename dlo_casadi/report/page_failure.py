@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dlo_casadi.config import Config
+from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError
 from dlo_casadi.report.page import page_script, render
 from dlo_casadi.report.page_data import configuration_text, sentence
@@ -25,7 +25,7 @@ def write_failure_page(
     Parameters
     ----------
     path : Path
-        The file; its folder is made if it does not exist.
+        The file.
     config : Config
         What was run.
     error : DloError
@@ -35,17 +35,10 @@ def write_failure_page(
 
     Raises
     ------
-    OSError
+    OutputError
         If the file cannot be written.
     """
-    text = failure_page(config, error, poses)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        draft.write_text(text, encoding="utf-8")
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    write_file(path, failure_page(config, error, poses))
 
 
 def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = ()) -> str:

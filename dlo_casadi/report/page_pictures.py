@@ -17,6 +17,7 @@ from dlo_casadi.config import Config
 from dlo_casadi.report.canvas import before_after, label_of, millimetres
 from dlo_casadi.report.geometry import beside
 from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds
+from dlo_casadi.report.terminal import branch_text
 from dlo_casadi.session.outcome import Outcome, PoseInput
 
 FloatArray = NDArray[np.floating]
@@ -130,12 +131,14 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
             facts.append((kind, label, "no equilibrium"))
             continue
         drawn.append(behind.points(shape.curve))
-        near = beside(pose, shape, outcome.measurement.std) if len(measured) else measured
+        near = beside(pose, shape) if len(measured) else measured
         lines.append(Line(kind, _svg(drawn[-1], 1), _svg(behind.points(near), 2)))
         if shape.rmse is not None:
             facts.append((kind, label, millimetres(shape.rmse)))
         if not shape.stable:
             facts.append((kind, label, "not stable"))
+        if shape.measured_branch is not None:
+            facts.append((kind, label, branch_text(shape.measured_branch)))
     if len(measured):
         lines.append(Line("measured", _svg(measured, 2)))
         facts.append(("measured", "measured", _seen(pose)))

@@ -9,6 +9,7 @@ import difflib
 import hashlib
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.config import Config, dump_yaml, implausible_sizes, read_yaml
 from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
 from dlo_casadi.errors import ConfigError, DloError
@@ -25,6 +25,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
 from dlo_casadi.parameters import Parameter
 from dlo_casadi.report.json_report import finite
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.session.outcome import Outcome
 
 FloatArray = NDArray[np.floating]
@@ -286,11 +287,11 @@ def load_parameters(path: str | Path) -> Parameters:
         bounds; the message names the key.
     """
     source = Path(path)
-    if source.is_dir():
+    if os.path.isdir(source):
         source = source / FILE
         if not source.is_file():
             raise ConfigError(f"no {FILE} in this folder.{_results_near(source)}", source.parent)
-    elif not source.exists():
+    elif not os.path.exists(source):
         raise ConfigError(f"no such file or folder of results.{_results_near(source)}", source)
     document = read_yaml(source)
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
@@ -347,7 +348,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     model = CableModel(
         cable=cable,
         n=int(document["n"]),
-        element=_one_of(document["element"], ELEMENTS, "element"),
+        element=_one_of(document["element"], tuple(ELEMENTS), "element"),
         start=_one_of(boundary["start"], ("pinned", "clamped"), "boundary.start"),
         end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary.end"),
         gravity=(float(gravity[0]), float(gravity[1])),

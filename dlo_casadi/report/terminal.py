@@ -14,7 +14,13 @@ from rich.text import Text
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.canvas import label_of
 from dlo_casadi.report.json_report import all_warnings
-from dlo_casadi.session.outcome import Outcome, ParameterEstimate, StageName
+from dlo_casadi.session.outcome import (
+    BranchShape,
+    Outcome,
+    ParameterEstimate,
+    Stage,
+    StageName,
+)
 
 # Parts of the run in the order in which they are done.
 TIMED = {
@@ -59,8 +65,12 @@ def _heading(outcome: Outcome) -> Text:
     noise = f"noise {_mm(m.std)} ({m.std_source})"
     if m.correlation_length > 0:
         noise += f", correlated over {_mm(m.correlation_length)}"
+    declared = m.poses_held_out + len(m.held_out_missing)
+    held_out = f"{m.poses_held_out} held out"
+    if m.held_out_missing:
+        held_out = f"{m.poses_held_out} of {declared} held out"
     text = (
-        f"{m.poses_fit} fit poses, {m.poses_held_out} held out, {m.points} points; {noise}; "
+        f"{m.poses_fit} fit poses, {held_out}, {m.points} points; {noise}; "
         f"{outcome.discretization.n} {outcome.discretization.element}s, "
         f"mesh error {_mm(outcome.discretization.error)}"
     )
@@ -197,14 +207,38 @@ def error_table(outcome: Outcome) -> Table:
         cells = {
             "fit": _mm(stage.rmse_fit),
             "cross-validated": _mm(validated.get(stage.name)),
-            "held out": _mm(stage.rmse_held_out),
+            "held out": _mm(stage.rmse_held_out) + predicted_share(outcome, stage),
             "chi2/dof": "-" if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
         }
         table.add_row(label_of(stage, outcome), *(cells[column] for column in columns))
+        if stage.other_branch:
+            cells = {
+                "fit": _mm(stage.rmse_fit_measured_branch),
+                "held out": _mm(stage.rmse_held_out_measured_branch),
+            }
+            table.add_row(f"  {ON_BRANCH}", *(cells.get(column, "") for column in columns))
     table.add_section()
     floor = [_mm(outcome.measurement.std)] + [""] * (len(columns) - 1)
     table.add_row(f"noise ({outcome.measurement.std_source})", *floor)
     return table
+
+
+# The errors of a stage, of which some poses were measured in another equilibrium.
+ON_BRANCH = "on the measured branch"
+
+
+def predicted_share(outcome: Outcome, stage: Stage) -> str:
+    """How many of the held-out poses a stage has predicted, where it is not all of them."""
+    held_out = outcome.held_out(stage)
+    if not held_out.missing or not stage.shapes:
+        return ""
+    return f" ({held_out.predicted} of {held_out.declared})"
+
+
+def branch_text(found: BranchShape) -> str:
+    """Error of a pose in the equilibrium in which it was measured, and how to choose that one."""
+    cure = "no branch chooses it" if found.branch is None else f"branch: {found.branch}"
+    return f"{ON_BRANCH} {_mm(found.rmse)} ({cure})"
 
 
 def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:

@@ -1,4 +1,4 @@
-"""Elements whose heading runs from node to node: arcs, if the cable is straight or round at rest."""
+"""Elements whose heading runs from node to node: arcs, if the cable is round at rest."""
 
 from __future__ import annotations
 

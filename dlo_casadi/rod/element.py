@@ -53,7 +53,9 @@ class Cell:
 class Law(Protocol):
     """A section law with its parameters: factors on the bending energy, see `SectionLaw`."""
 
-    even: bool
+    @property
+    def even(self) -> bool:
+        """Whether the law is the same all along the cable."""
 
     def factor(self, bend: ca.SX, cell: Cell) -> ca.SX:
         """Factor on EI/2 bend^2."""
@@ -209,8 +211,7 @@ class Element(ABC):
     def advance(self, slot: Slot, u: ca.SX | float = 1.0) -> ca.SX:
         """Vector (dimension,) [m] from the start of the element to the fraction u of it."""
         parts = [
-            weight * self.tangent(slot, u * node)
-            for node, weight in zip(*self.rule, strict=True)
+            weight * self.tangent(slot, u * node) for node, weight in zip(*self.rule, strict=True)
         ]
         return slot.length * u * sum(parts[1:], start=parts[0])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -68,9 +67,7 @@ class Quadratic(Arc):
         torque = ca.gradient(energy, slot.inner)
         stiffness = ca.jacobian(torque, slot.inner)
         zero = ca.SX(0)
-        given, torque, stiffness = ca.substitute(
-            [energy, torque, stiffness], [slot.inner], [zero]
-        )
+        given, torque, stiffness = ca.substitute([energy, torque, stiffness], [slot.inner], [zero])
         return given + torque * slot.inner + stiffness * slot.inner**2 / 2
 
 

@@ -91,12 +91,12 @@ def solved_by_ipopt(fit: Fit) -> Fit:
         return replace(fit, converged=False)
 
 
-def reweighted(fit: Fit, measured: Sequence[MeasuredPose]) -> tuple[MeasuredPose, ...]:
-    """Measured poses in which outlying points weigh less (Huber's weights)."""
-    out = list(measured)
-    for j, d in zip(fit.problem.used, fit.linearization.raw, strict=True):
-        item = measured[j]
+def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:
+    """All poses of a fit, in those fitted outlying points weigh less (Huber's weights)."""
+    out = list(fit.problem.history)
+    for k, d in zip(fit.problem.fitted, fit.linearization.raw, strict=True):
+        item = out[k]
         score = np.abs(d) / (fit.noise.std * item.relative_std)
         grown = np.sqrt(np.maximum(1.0, score / HUBER))
-        out[j] = replace(item, weight=item.relative_std * grown)
+        out[k] = replace(item, weight=item.relative_std * grown)
     return tuple(out)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
+from dlo_casadi.equilibrium import Branch
 from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
@@ -52,6 +53,22 @@ class RestCurvatureEstimate:
 
 
 @dataclass(frozen=True)
+class BranchShape:
+    """The stable equilibrium in which a pose was measured, where it is not the predicted one.
+
+    Parameters
+    ----------
+    rmse : float [m]
+        Root mean square distance of the measured points to it.
+    branch : "ccw", "cw" or None
+        What the pose has to name for it to be predicted; None if no name does.
+    """
+
+    rmse: float
+    branch: Branch | None
+
+
+@dataclass(frozen=True)
 class PoseShape:
     """One pose as one stage sees it.
 
@@ -63,10 +80,12 @@ class PoseShape:
         Root mean square distance of the measured points to it; None without points.
     s : (K,) [m]
         Arc lengths of the measured points.
-    residual : (K,)
-        Normal distance of the measured points from the prediction over the noise's std.
+    residual : (K,) [m]
+        Normal distance of the measured points from the prediction.
     energy : float [J]
     stable : bool
+    measured_branch : BranchShape or None
+        Where the pose was measured in another stable equilibrium than the predicted one.
     """
 
     curve: FloatArray
@@ -75,6 +94,7 @@ class PoseShape:
     residual: FloatArray
     energy: float
     stable: bool
+    measured_branch: BranchShape | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +105,8 @@ class Stage:
     ----------
     name : StageName
     rmse_fit, rmse_held_out : float or None [m]
-        Over all measured points of that role.
+        Over all measured points of that role; None if there are none, or if a pose of that role
+        has no prediction.
     chi2_per_dof : float or None
     parameters : dict of ParameterEstimate
     rest_curvature : RestCurvatureEstimate
@@ -93,6 +114,11 @@ class Stage:
         By pose name; poses without a prediction are absent.
     note : str
         Why the stage is empty or ended early, if so.
+    rmse_fit_measured_branch, rmse_held_out_measured_branch : float or None [m]
+        The same errors with those poses that were measured in another stable equilibrium than
+        the predicted one compared with that one.
+    unpredicted : tuple of str
+        Measured held-out poses without a prediction.
     """
 
     name: StageName
@@ -103,6 +129,15 @@ class Stage:
     rest_curvature: RestCurvatureEstimate
     shapes: dict[str, PoseShape]
     note: str = ""
+    rmse_fit_measured_branch: float | None = None
+    rmse_held_out_measured_branch: float | None = None
+    unpredicted: tuple[str, ...] = ()
+
+    @property
+    def other_branch(self) -> dict[str, BranchShape]:
+        """By name the poses that were measured in another equilibrium than the predicted one."""
+        found = {name: shape.measured_branch for name, shape in self.shapes.items()}
+        return {name: branch for name, branch in found.items() if branch is not None}
 
 
 @dataclass(frozen=True)
@@ -158,7 +193,17 @@ class PoseInput:
 
 @dataclass(frozen=True)
 class MeasurementSummary:
-    """How well the centre-lines were measured."""
+    """How well the centre-lines were measured.
+
+    Parameters
+    ----------
+    poses_fit, poses_held_out : int
+        Poses with a measured line.
+    held_out_missing : tuple of str
+        Held-out poses without one: no error counts them.
+    points : int
+    std, correlation_length : float [m]
+    """
 
     kind: Literal["images", "centerlines"]
     poses_fit: int
@@ -167,6 +212,16 @@ class MeasurementSummary:
     std: float
     std_source: Literal["declared", "estimated"]
     correlation_length: float
+    held_out_missing: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How many of the declared held-out poses a stage has predicted, and names of the others."""
+
+    predicted: int
+    declared: int
+    missing: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -174,7 +229,7 @@ class Discretization:
     """Mesh of the model and the largest shape error [m] it causes, from two meshes."""
 
     n: int
-    element: Literal["quadratic", "arc", "link"]
+    element: str
     error: float
 
 
@@ -216,3 +271,10 @@ class Outcome:
     def stage(self, name: StageName) -> Stage | None:
         """Return the stage of that name, or None."""
         return next((stage for stage in self.stages if stage.name == name), None)
+
+    def held_out(self, stage: Stage) -> HeldOut:
+        """How many of the declared held-out poses a stage has predicted."""
+        measurement = self.measurement
+        missing = (*measurement.held_out_missing, *stage.unpredicted)
+        declared = measurement.poses_held_out + len(measurement.held_out_missing)
+        return HeldOut(declared - len(missing), declared, missing)

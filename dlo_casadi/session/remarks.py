@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.session.fitting import MESH_SHARE, allowed_mesh_error
-from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.outcome import PoseInput, Stage
 
 # Fixtures that move a prediction by more than this share of the noise get a warning.
 FIXTURES = 0.5
@@ -33,6 +33,45 @@ def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
         if item.problem:
             lines.append(f"{item.name} is left out: {item.problem}")
         lines += [f"{item.name}: {text}" for text in item.messages]
+    missing = held_out_missing(inputs, skipped)
+    if missing:
+        declared = len({item.name for item in inputs if item.role == "held_out"} | set(missing))
+        lines.append(
+            f"held out and in no error, because there is no measured line: {', '.join(missing)}, "
+            f"{len(missing)} of {declared} held-out poses"
+        )
+    return lines
+
+
+def held_out_missing(
+    inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
+) -> tuple[str, ...]:
+    """Names of held-out poses that have no measured line to be compared with."""
+    read = {item.name for item in inputs if len(item.points)}
+    roles = {item.name: item.role for item in skipped} | {item.name: item.role for item in inputs}
+    return tuple(name for name, role in roles.items() if role == "held_out" and name not in read)
+
+
+def branch_warnings(stages: Sequence[Stage]) -> list[str]:
+    """Poses that the fitted models predict in another stable equilibrium than the measured one."""
+    lines = []
+    for stage in stages:
+        if stage.name not in ("batch", "closed"):
+            continue
+        for branch in dict.fromkeys(shape.branch for shape in stage.other_branch.values()):
+            found = {k: shape for k, shape in stage.other_branch.items() if shape.branch == branch}
+            predicted = max(stage.shapes[name].rmse or 0.0 for name in found)
+            measured = max(shape.rmse for shape in found.values())
+            cure = (
+                "no `branch` of these poses would choose it"
+                if branch is None
+                else f"`branch: {branch}` in these poses chooses it"
+            )
+            lines.append(
+                f"stage {stage.name}: {', '.join(found)}: the equilibrium of lowest energy, which "
+                f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
+                f"off, on the measured branch {1e3 * measured:.3g} mm; {cure}"
+            )
     return lines
 
 

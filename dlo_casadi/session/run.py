@@ -41,7 +41,12 @@ from dlo_casadi.session.fitting import (
 from dlo_casadi.session.measure import measured_poses, read_inputs
 from dlo_casadi.session.outcome import Discretization, MeasurementSummary, Outcome, PoseInput, Stage
 from dlo_casadi.session.progress import Clock, Progress, Silent
-from dlo_casadi.session.remarks import fit_warnings, reading_warnings
+from dlo_casadi.session.remarks import (
+    branch_warnings,
+    fit_warnings,
+    held_out_missing,
+    reading_warnings,
+)
 from dlo_casadi.session.stages import algorithm1_stage, fit_stage, initial_stage, stiffness_stage
 from dlo_casadi.workers import one_thread
 
@@ -94,22 +99,21 @@ def fit_session(
     fit, error = fit_declared(config, declared, measured)
     clock.lap("fit")
     if config.estimation.robust:
-        measured = reweighted(fit, measured)
+        measured = reweighted(fit)
         fit, error = fit_declared(config, declared, measured, fit.model.n)
         clock.lap("fit")
     fit = solved_by_ipopt(fit)
     clock.lap("batch")
     progress.step("fit the declared model", 1, 1)
 
-    std = fit.noise.std
-    stages = before_stages(config, declared, measured, std, fit.model.n, clock, progress)
+    stages = before_stages(config, declared, measured, fit.model.n, clock, progress)
     reported = _declared_names(config, fit.model)
     stages.append(fit_stage("batch", fit, measured, stiffness_interval(fit), reported))
     clock.lap("fit")
     outcome = Outcome(
         config=config,
         poses=tuple(inputs),
-        measurement=_summary(config, measured, fit),
+        measurement=_summary(config, inputs, measured, fit),
         stages=tuple(stages),
         discretization=Discretization(fit.model.n, fit.model.element, error),
         timing=clock.total(),
@@ -118,7 +122,8 @@ def fit_session(
         versions=versions(),
     )
     if not config.diagnosis.enabled:
-        return replace(outcome, warnings=(*warnings, *fit_warnings(fit, error)))
+        said = (*warnings, *fit_warnings(fit, error), *branch_warnings(stages))
+        return replace(outcome, warnings=said)
     return close_the_loop(outcome, measured, reported, _center(inputs), clock, progress, executor)
 
 
@@ -172,7 +177,7 @@ def close_the_loop(
     return replace(
         outcome,
         fit=fit,
-        measurement=_summary(outcome.config, measured, fit),
+        measurement=_summary(outcome.config, outcome.poses, measured, fit),
         stages=tuple(stages),
         discretization=mesh,
         timing=clock.total(),
@@ -183,7 +188,7 @@ def close_the_loop(
         next_pose=next_pose_row(diagnosis),
         structure=structure_rows(diagnosis),
         diagnosis=diagnosis,
-        warnings=(*outcome.warnings, *fit_warnings(fit, error)),
+        warnings=(*outcome.warnings, *fit_warnings(fit, error), *branch_warnings(stages)),
     )
 
 
@@ -191,7 +196,6 @@ def before_stages(
     config: Config,
     declared: Declared,
     measured: Sequence[MeasuredPose],
-    std: float,
     n: int,
     clock: Clock,
     progress: Progress,
@@ -199,16 +203,16 @@ def before_stages(
     """The stages to compare with: prior, stiffness alone, the paper's loop."""
     plain = straight(declared.model).with_mesh(n)
     progress.step("stiffness alone", 0, 1)
-    stages = [initial_stage(plain, measured, std)]
-    stages.append(stiffness_stage(plain, measured, std, fit_stiffness(plain, measured)))
+    stages = [initial_stage(plain, measured)]
+    stages.append(stiffness_stage(plain, measured, fit_stiffness(plain, measured)))
     progress.step("stiffness alone", 1, 1)
     clock.lap("fit")
     length = config.cable.length
     if not config.estimation.algorithm1:
-        stages.append(algorithm1_stage(None, measured, std, length, "switched off"))
+        stages.append(algorithm1_stage(None, measured, length, "switched off"))
     elif not applies(declared.model):
         note = "the paper's loop needs two pinned ends"
-        stages.append(algorithm1_stage(None, measured, std, length, note))
+        stages.append(algorithm1_stage(None, measured, length, note))
     else:
         progress.step("the paper's loop", 0, 1)
         result = run_algorithm1(
@@ -219,7 +223,7 @@ def before_stages(
             inner=config.estimation.algorithm1_inner,
         )
         clock.lap("algorithm1")
-        stages.append(algorithm1_stage(result, measured, std, length))
+        stages.append(algorithm1_stage(result, measured, length))
         progress.step("the paper's loop", 1, 1)
     clock.lap("fit")
     return stages
@@ -250,7 +254,9 @@ def _declared_names(config: Config, model: CableModel) -> list[str]:
     return [name for name in model.names if name.split(".")[0] in labels]
 
 
-def _summary(config: Config, measured: Sequence[MeasuredPose], fit: Fit) -> MeasurementSummary:
+def _summary(
+    config: Config, inputs: Sequence[PoseInput], measured: Sequence[MeasuredPose], fit: Fit
+) -> MeasurementSummary:
     readable = [item for item in measured if item.readable]
     return MeasurementSummary(
         kind=config.experiment.measurement.kind,
@@ -260,4 +266,5 @@ def _summary(config: Config, measured: Sequence[MeasuredPose], fit: Fit) -> Meas
         std=fit.noise.std,
         std_source="declared" if fit.noise.declared else "estimated",
         correlation_length=fit.noise.length if fit.noise.share > 0 else 0.0,
+        held_out_missing=held_out_missing(inputs, config.skipped),
     )

@@ -10,12 +10,19 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.algorithm1 import Algorithm1Result
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.prediction import Prediction, predict_poses, rms_distance
+from dlo_casadi.estimation.prediction import (
+    MeasuredBranch,
+    Prediction,
+    measured_branches,
+    predict_poses,
+    rms_distance,
+)
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.outcome import (
+    BranchShape,
     ParameterEstimate,
     PoseShape,
     RestCurvatureEstimate,
@@ -29,7 +36,9 @@ _CURVE_POINTS = 201
 _REST_POINTS = 41
 
 
-def pose_shape(prediction: Prediction, item: MeasuredPose, std: float) -> PoseShape:
+def pose_shape(
+    prediction: Prediction, item: MeasuredPose, other: MeasuredBranch | None
+) -> PoseShape:
     """One predicted pose beside its measured points."""
     curve = prediction.curve
     places = np.linspace(0.0, curve.length, _CURVE_POINTS)
@@ -39,9 +48,13 @@ def pose_shape(prediction: Prediction, item: MeasuredPose, std: float) -> PoseSh
         return PoseShape(curve.at(places), None, empty, empty, eq.energy, eq.stable)
     s = curve.nearest(item.points)
     gap = item.points - curve.at(s)
-    residual = (gap * curve.normals(s)).sum(axis=1) / std
+    residual = (gap * curve.normals(s)).sum(axis=1)
     rmse = float(np.sqrt((gap**2).sum(axis=1).mean()))
-    return PoseShape(curve.at(places), rmse, s, residual, eq.energy, eq.stable)
+    branch = None
+    if other is not None:
+        distances = other.prediction.curve.distances(item.points)
+        branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)
+    return PoseShape(curve.at(places), rmse, s, residual, eq.energy, eq.stable, branch)
 
 
 def _stage(
@@ -50,25 +63,26 @@ def _stage(
     p: FloatArray,
     rest: FloatArray,
     measured: Sequence[MeasuredPose],
-    std: float,
     parameters: dict[str, ParameterEstimate],
     rest_curvature: RestCurvatureEstimate,
     chi2_per_dof: float | None,
     note: str = "",
 ) -> Stage:
     predictions = predict_poses(model, p, rest, [item.pose for item in measured])
+    others = measured_branches(model, p, rest, measured, predictions)
     shapes = {
-        item.pose.name: pose_shape(prediction, item, std)
-        for prediction, item in zip(predictions, measured, strict=True)
+        item.pose.name: pose_shape(prediction, item, other)
+        for prediction, item, other in zip(predictions, measured, others, strict=True)
         if prediction is not None
     }
-    lost = [
-        item.pose.name
-        for prediction, item in zip(predictions, measured, strict=True)
-        if prediction is None
-    ]
+    lost = [item for item in measured if item.pose.name not in shapes]
     if lost:
-        note = (note + f" No equilibrium for {', '.join(lost)}.").strip()
+        names = ", ".join(item.pose.name for item in lost)
+        note = (note + f" No equilibrium for {names}.").strip()
+    on_branch = [
+        prediction if other is None else other.prediction
+        for prediction, other in zip(predictions, others, strict=True)
+    ]
     return Stage(
         name,
         rms_distance(predictions, measured, held_out=False),
@@ -78,6 +92,9 @@ def _stage(
         rest_curvature,
         shapes,
         note,
+        rms_distance(on_branch, measured, held_out=False),
+        rms_distance(on_branch, measured, held_out=True),
+        tuple(item.pose.name for item in lost if item.held_out and item.readable),
     )
 
 
@@ -86,7 +103,7 @@ def _no_rest(length: float) -> RestCurvatureEstimate:
     return RestCurvatureEstimate(s, np.zeros_like(s), np.zeros_like(s))
 
 
-def initial_stage(model: CableModel, measured: Sequence[MeasuredPose], std: float) -> Stage:
+def initial_stage(model: CableModel, measured: Sequence[MeasuredPose]) -> Stage:
     """Prior stiffness, straight at rest: the paper's alpha^0."""
     stiffness = ParameterEstimate(float(model.nominal[0]), 0.0, "N m^2")
     rest = np.zeros(model.chain.n_cells)
@@ -96,7 +113,6 @@ def initial_stage(model: CableModel, measured: Sequence[MeasuredPose], std: floa
         model.nominal,
         rest,
         measured,
-        std,
         {"bending_stiffness": stiffness},
         _no_rest(model.cable.length),
         None,
@@ -104,7 +120,7 @@ def initial_stage(model: CableModel, measured: Sequence[MeasuredPose], std: floa
 
 
 def stiffness_stage(
-    model: CableModel, measured: Sequence[MeasuredPose], std: float, found: StiffnessFit
+    model: CableModel, measured: Sequence[MeasuredPose], found: StiffnessFit
 ) -> Stage:
     """Stiffness fitted, straight at rest."""
     p = model.nominal.copy()
@@ -123,7 +139,6 @@ def stiffness_stage(
         p,
         np.zeros(model.chain.n_cells),
         measured,
-        std,
         {"bending_stiffness": stiffness},
         _no_rest(model.cable.length),
         None,
@@ -133,7 +148,6 @@ def stiffness_stage(
 def algorithm1_stage(
     result: Algorithm1Result | None,
     measured: Sequence[MeasuredPose],
-    std: float,
     length: float,
     note: str = "",
 ) -> Stage:
@@ -149,7 +163,6 @@ def algorithm1_stage(
         result.p,
         result.rest,
         measured,
-        std,
         {"bending_stiffness": ParameterEstimate(result.EI, 0.0, "N m^2")},
         RestCurvatureEstimate(s, value, np.zeros_like(s)),
         None,
@@ -193,7 +206,6 @@ def fit_stage(
         fit.p,
         fit.rest,
         measured,
-        fit.noise.std,
         parameters,
         rest_curvature_of(fit),
         fit.chi2_per_dof,

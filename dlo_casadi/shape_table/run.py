@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import __version__
 from dlo_casadi.codegen.shapes import STATUSES
-from dlo_casadi.durable import only_run, write_durably
+from dlo_casadi.durable import only_run, write_file
 from dlo_casadi.errors import DloError
 from dlo_casadi.parallel import Tally, map_as_completed
 from dlo_casadi.shape_table.arrow import table_of, table_schema
@@ -75,7 +75,7 @@ def shape_table(
         },
         sort_keys=True,
     )
-    if output.exists() and not restart:
+    if os.path.exists(output) and not restart:
         if _identity_of(output) == identity:
             return {}
         raise DloError(
@@ -86,13 +86,11 @@ def shape_table(
         shutil.rmtree(plan.parts, ignore_errors=True)
     with only_run(plan.parts):
         _claim(plan.parts, identity)
-        counts = _computed(plan, poses, executor, identity, metadata or {}, progress)
-        try:
-            os.replace(plan.parts / "draft.parquet", output)
-        except OSError as error:
-            raise DloError(f"{output} cannot be written: {error.strerror}") from None
-        shutil.rmtree(plan.parts)
-    return counts
+        counts = np.zeros(len(STATUSES), int)
+        fill = partial(_fill, plan, poses, executor, identity, metadata or {}, progress, counts)
+        write_file(output, fill, plan.parts / "draft.parquet")
+        shutil.rmtree(plan.parts, ignore_errors=True)
+    return {name: int(n) for name, n in zip(STATUSES, counts, strict=True) if n}
 
 
 def _identity_of(path: Path) -> str | None:
@@ -117,24 +115,28 @@ def _claim(parts: Path, identity: str) -> None:
                 "  Try: another --output, or --restart to throw them away."
             )
         return
-    write_durably(mark, lambda stream: stream.write(identity.encode()))
+    write_file(mark, identity)
 
 
-def _computed(
+def _fill(
     plan: Plan,
     poses: Poses,
     executor: Executor,
     identity: str,
     metadata: dict[str, Any],
     progress: Callable[[Tally], None] | None,
-) -> dict[str, int]:
-    """Compute what is missing; append each chunk to the draft as soon as those before are in."""
+    counts: NDArray[np.int_],
+    stream: BinaryIO,
+) -> None:
+    """Compute what is missing; append each chunk to the table as soon as those before are in.
+
+    The poses are counted by status into `counts`.
+    """
     import pyarrow.parquet as pq
 
     total = -(-poses.count // plan.chunk)
     there = {k for k in range(total) if plan.part(k).exists()}
     schema = table_schema(plan.model, {"identity": identity, **metadata})
-    counts = np.zeros(len(STATUSES), int)
     written = 0
 
     def missing() -> Iterator[Chunk]:
@@ -142,40 +144,36 @@ def _computed(
             if index not in there:
                 yield Chunk(index, chunk)
 
-    with (plan.parts / "draft.parquet").open("wb") as stream:
-        with pq.ParquetWriter(
-            stream,
-            schema,
-            use_dictionary=["status"],
-            # Without it the digits of neighbouring points would not compress.
-            use_byte_stream_split=["points.list.element"],
-            compression="zstd",
-            compression_level=1,
-        ) as writer:
+    with pq.ParquetWriter(
+        stream,
+        schema,
+        use_dictionary=["status"],
+        # Without it the digits of neighbouring points would not compress.
+        use_byte_stream_split=["points.list.element"],
+        compression="zstd",
+        compression_level=1,
+    ) as writer:
 
-            def append() -> None:
-                nonlocal written
-                while written in there:
-                    part = _read_part(plan, written)
-                    counts[:] += np.bincount(part["status"], minlength=len(STATUSES))
-                    writer.write_table(table_of(part, schema, plan.model))
-                    written += 1
+        def append() -> None:
+            nonlocal written
+            while written in there:
+                part = _read_part(plan, written)
+                counts[:] += np.bincount(part["status"], minlength=len(STATUSES))
+                writer.write_table(table_of(part, schema, plan.model))
+                written += 1
 
+        append()
+        tasks = map_as_completed(
+            executor,
+            partial(solve_chunk, plan),
+            missing(),
+            total=total - len(there),
+            progress=progress,
+        )
+        for done in tasks:
+            _ = done.value  # a chunk that fails ends the run; finished ones are kept
+            there.add(done.item.index)
             append()
-            tasks = map_as_completed(
-                executor,
-                partial(solve_chunk, plan),
-                missing(),
-                total=total - len(there),
-                progress=progress,
-            )
-            for done in tasks:
-                _ = done.value  # a chunk that fails ends the run; finished ones are kept
-                there.add(done.item.index)
-                append()
-        stream.flush()
-        os.fsync(stream.fileno())
-    return {name: int(n) for name, n in zip(STATUSES, counts, strict=True) if n}
 
 
 def _read_part(plan: Plan, index: int) -> NDArray[np.void]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.codegen.compiled import Branch, CompiledSolver
 from dlo_casadi.codegen.generate import solver_hash
-from dlo_casadi.durable import write_durably
+from dlo_casadi.durable import write_file
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -100,7 +100,7 @@ def solve_chunk(plan: Plan, chunk: Chunk) -> int:
     part["pose"], part["status"] = poses, statuses
     for name in ("energy", "lam_start", "lam", "moments", "min_bend_radius", "points"):
         part[name] = records[name]
-    write_durably(plan.part(chunk.index), lambda stream: np.save(stream, part))
+    write_file(plan.part(chunk.index), lambda stream: np.save(stream, part))
     return int((statuses == 0).sum())
 
 

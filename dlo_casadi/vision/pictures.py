@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dlo_casadi.durable import write_file
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.centerline import Centerline
 from dlo_casadi.vision.view import Array, View
@@ -76,16 +77,13 @@ def write_picture(path: Path, picture: Picture) -> None:
 
     Raises
     ------
-    VisionError
+    OutputError
         If the file cannot be written.
     """
-    try:
-        done, data = cv2.imencode(path.suffix, picture)
-        if not done:
-            raise VisionError(f"{path} cannot be written: OpenCV cannot encode it")
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise VisionError(f"{path} cannot be written: {error.strerror}") from None
+    done, data = cv2.imencode(path.suffix, picture)
+    if not done:
+        raise VisionError(f"{path} cannot be written: OpenCV cannot encode it")
+    write_file(path, data.tobytes())
 
 
 def _workplane(plane: WorkPlane, start: Array, end: Array | None) -> Picture:

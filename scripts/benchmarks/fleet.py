@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import yaml
 
 from dlo_casadi.config import load_config
+from dlo_casadi.fleet.store import parquet_library
 from dlo_casadi.report.parameters_file import parameters_text
 from dlo_casadi.session import run_session
 
@@ -86,6 +86,7 @@ def million(folder: Path, side: int = 1000) -> dict[str, Any]:
     command = ["shape_table.py", str(folder), "--grid", *map(str, grid), "--elements", "20"]
     command += ["--element", "arc"]
     timed = measured([*command, "--output", str(output), "--jobs", "2"])
+    _, pq = parquet_library()
     statuses = pq.read_table(output, columns=["status"])["status"].value_counts().to_pylist()
     size = output.stat().st_size / 1e6
     return {
@@ -123,6 +124,7 @@ def fit_many(folder: Path, name: str, options: Sequence[str]) -> tuple[dict[str,
     output = folder / name
     command = ["fit_many.py", str(folder / "cables"), "--output", str(output), "--no-reports"]
     cost = measured([*command, *options])
+    _, pq = parquet_library()
     table = pq.read_table(output / "table.parquet")
     kept = [column for column in table.column_names if not column.startswith("time_")]
     return cost, table.select(kept).to_pylist()

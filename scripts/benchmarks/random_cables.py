@@ -53,8 +53,8 @@ def random_problem(
 ) -> Problem:
     """A cable from the ranges of the specification, and ends uniform in its disc.
 
-    Cables of 0.3 to 3 m, 0.02 to 1 kg/m and 0.002 to 100 N m^2, in units of their length and weight,
-    gravity along -y: EI / (weight length^2) is all that tells them apart.
+    Cables of 0.3 to 3 m, 0.02 to 1 kg/m and 0.002 to 100 N m^2, in units of their length and
+    weight, gravity along -y: EI / (weight length^2) is all that tells them apart.
     """
     length = rng.uniform(0.3, 3.0)
     weight = 9.81 * length * np.exp(rng.uniform(np.log(0.02), np.log(1.0)))

@@ -22,6 +22,7 @@ from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.effects import Cable
 from dlo_casadi.initial import arc_headings
 from dlo_casadi.model import CableModel
+from dlo_casadi.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
 HERE = Path(__file__).parent
@@ -129,9 +130,10 @@ def bare(n: int, repeats: int) -> dict[str, Any]:
 
 
 def _problem(model: CableModel) -> dict[str, ca.SX]:
-    x, parameters, energy, conditions = model.potential
-    bends = x[1:] - x[:-1]
-    return {"x": x, "p": parameters, "f": energy, "g": ca.vertcat(conditions, bends)}
+    problem = potential(model)
+    x = problem.coordinates
+    g = ca.vertcat(problem.conditions, x[1:] - x[:-1])
+    return {"x": x, "p": problem.parameters, "f": problem.energy, "g": g}
 
 
 def by_casadi(n: int, kind: str, repeats: int) -> dict[str, Any]:
@@ -161,7 +163,7 @@ def by_casadi(n: int, kind: str, repeats: int) -> dict[str, Any]:
     reference = CompiledSolver(model, model.nominal, np.zeros(n - 1))
     seconds, errors = [], []
     for end in poses():
-        start = arc_headings(model.chain.heading_places, CABLE.length, np.zeros(2), end, 1)
+        start = arc_headings(model.chain.places, CABLE.length, np.zeros(2), end, 1)
         p = np.concatenate([model.nominal, np.zeros(n - 1), [0, 0, *end, 0, 0], np.zeros(6)])
         good = reference.solve(end, branch="ccw").headings
         # Sixteen at a time, so that no conversion of arguments is timed.
@@ -193,7 +195,7 @@ def by_cobyla(n: int) -> dict[str, Any]:
     seconds, reached = [], 0
     for end in poses()[:4]:
         good = reference.solve(end, branch="ccw").headings
-        start = arc_headings(model.chain.heading_places, CABLE.length, np.zeros(2), end, 1)
+        start = arc_headings(model.chain.places, CABLE.length, np.zeros(2), end, 1)
 
         def energy(theta: FloatArray) -> float:
             phi = np.cumsum(theta)

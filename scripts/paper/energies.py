@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, Equilibrium, Pose, solve_equilibrium
+from dlo_casadi.assembly import DEVIATIONS, Given
 from dlo_casadi.equilibrium import JOINT_BOUND
 from dlo_casadi.estimation.observation import NodeCurve
-from dlo_casadi.model import DEVIATIONS
+from dlo_casadi.whole_pose import potential
 from paper import published
 from paper.content import Claim, Part, Section, Table, Target, mm, number, rms
 
@@ -47,8 +48,8 @@ def chain() -> CableModel:
 
 def energy_of(model: CableModel, found: Equilibrium, rest: FloatArray, pose: Pose) -> float:
     """Energy [J] of a shape for another rest curvature."""
-    arguments = (found.phi, found.multipliers, model.nominal, rest, pose.vector)
-    return float(model.energy(*arguments, np.zeros(len(DEVIATIONS)))[0])
+    given = Given.of(model.nominal, rest, pose.vector[None])
+    return float(model.assembly.energy(found.shapes, given)[0])
 
 
 def rows_of_table_4(roundings: int = ROUNDINGS) -> list[Row]:
@@ -82,16 +83,22 @@ def rows_of_table_4(roundings: int = ROUNDINGS) -> list[Row]:
 def with_bounded_heading(pose: Pose) -> float:
     """Energy [J] of a pose if Eq. 8's bound is applied to theta_1, a heading, too."""
     model = chain()
-    x, parameters, energy, conditions = model.potential
+    problem = potential(model)
+    x, g = problem.coordinates, problem.conditions
     solver = ca.nlpsol(
         "bounded",
         "ipopt",
-        {"x": x, "p": parameters, "f": energy, "g": ca.vertcat(conditions, x[1:] - x[:-1])},
+        {
+            "x": x,
+            "p": problem.parameters,
+            "f": problem.energy,
+            "g": ca.vertcat(g, x[1:] - x[:-1]),
+        },
         {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"},
     )
     rest = np.zeros(model.chain.n_cells)
     free = solve_equilibrium(model, model.nominal, rest, pose)
-    joints = model.chain.n_headings - 1
+    joints = model.chain.n_nodes - 1
     bound = np.concatenate([np.zeros(2), np.full(joints, JOINT_BOUND)])
     headings = np.concatenate([[JOINT_BOUND], np.full(joints, np.inf)])
     found = solver(

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, DloError
+from dlo_casadi.assembly import DEVIATIONS, Shapes
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Tolerances
 from dlo_casadi.estimation.hyperparameters import settle
@@ -26,9 +27,8 @@ from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import NORMAL_95, stiffness_interval
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sweep import Shapes, Sweep
+from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.parallel import generator_of, map_as_completed
 from dlo_casadi.report.canvas import BLACK, BLUE
 from dlo_casadi.session.declared import nuisances
@@ -108,7 +108,7 @@ def simulate(truth: Truth, rng: np.random.Generator) -> list[MeasuredPose] | Non
     if len(shapes) < len(found):
         return None
     stacked = Shapes(
-        np.array([eq.phi for eq in shapes]),
+        np.array([eq.x for eq in shapes]),
         np.array([eq.multipliers for eq in shapes]),
         truth.deviation,
     )
@@ -117,10 +117,10 @@ def simulate(truth: Truth, rng: np.random.Generator) -> list[MeasuredPose] | Non
     if not converged.all():
         return None
     measured = []
-    for pose, z in zip(published.poses(), sweep.shapes_seen(moved, truth.p, rest), strict=True):
+    for pose, z in zip(published.poses(), sweep.seen(moved, truth.p, rest), strict=True):
         s = np.sort(rng.uniform(0.01, 0.99, POINTS)) * published.LENGTH
         factor = np.linalg.cholesky(truth.noise.covariance(s, np.ones(POINTS)))
-        points = NodeCurve.of(model.chain, z).at(s) + factor @ rng.standard_normal((POINTS, 2))
+        points = NodeCurve.of(published.LENGTH, z).at(s) + factor @ rng.standard_normal((POINTS, 2))
         measured.append(MeasuredPose(pose, points))
     return measured
 
@@ -133,7 +133,7 @@ def bound(fit: Fit, truth: Truth) -> tuple[float, FloatArray]:
     unknowns = fit.problem.unknowns
     problem = BatchProblem(unknowns, fit.problem.history, truth.noise, TOLERANCES, truth.roughness)
     theta = unknowns.pack(truth.p, truth.coefficients)
-    start = Shapes(fit.point.shapes.phi, fit.point.shapes.lam, truth.deviation)
+    start = Shapes(fit.point.shapes.x, fit.point.shapes.lam, truth.deviation)
     shapes, converged = problem.sweep.solve(start, truth.p, unknowns.rest(theta))
     if not converged.all():
         raise DloError("the true parameters have no equilibria near the fitted ones")

@@ -15,6 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from dlo_casadi import __version__
+from dlo_casadi.durable import make_folder, write_file
 from paper.content import Part
 
 SCHEMA = "dlo-paper/1"
@@ -28,7 +29,7 @@ def write(folder: Path, parts: Iterable[Part], order: Iterable[str]) -> dict[str
     dict
         What is in paper.json.
     """
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    make_folder(folder / "figures")
     kept = earlier(folder / "paper.json")
     for part in parts:
         plain = asdict(part)
@@ -36,12 +37,12 @@ def write(folder: Path, parts: Iterable[Part], order: Iterable[str]) -> dict[str
         for section in plain["sections"]:
             for picture in section["pictures"]:
                 name = f"{picture['name']}.svg"
-                (folder / "figures" / name).write_text(picture.pop("svg"))
+                write_file(folder / "figures" / name, picture.pop("svg"))
         kept[part.name] = plain
     found = {name: kept[name] for name in order if name in kept}
     result = {"schema": SCHEMA, "parts": found}
-    (folder / "paper.json").write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
-    (folder / "index.html").write_text(page(folder, list(found.values())))
+    write_file(folder / "paper.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    write_file(folder / "index.html", page(folder, list(found.values())))
     return result
 
 

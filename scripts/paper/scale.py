@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, CompiledSolver, Pose
+from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
-from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing
@@ -58,10 +58,11 @@ def simulated(poses: int) -> list[MeasuredPose]:
         if shape.status != "ok":
             continue
         pose = Pose((0.0, 0.0), end, branch="ccw", name=f"{len(out)}")
-        arguments = (shape.headings, shape.lam, model.nominal, rest, pose.vector)
-        z = np.array(model.shape(*arguments, np.zeros(len(DEVIATIONS)))).ravel()
+        shapes = Shapes.declared(shape.headings[None, :, None], shape.lam[None])
+        given = Given.of(model.nominal, rest, pose.vector[None])
+        z = model.assembly.curve(shapes, given)[0]
         s = np.linspace(0.01, 0.99, POINTS) * published.LENGTH
-        points = NodeCurve.of(model.chain, z).at(s) + STD * rng.standard_normal((POINTS, 2))
+        points = NodeCurve.of(published.LENGTH, z).at(s) + STD * rng.standard_normal((POINTS, 2))
         out.append(MeasuredPose(pose, points))
     return out
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from dlo_casadi import CableModel, CompiledSolver, Pose, solve_equilibrium
+from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.initial import arc_headings
-from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.report.canvas import BLACK, GREY, VERMILLION
 from paper import published
 from paper.content import Claim, Part, Section, Table, Target, drawing, duration, mm
@@ -115,8 +115,9 @@ def _seen(
     model: CableModel, rest: FloatArray, pose: Pose, phi: FloatArray, lam: FloatArray
 ) -> NodeCurve:
     """Curve of given headings."""
-    arguments = (phi, lam, model.nominal, rest, pose.vector, np.zeros(len(DEVIATIONS)))
-    return NodeCurve.of(model.chain, np.array(model.shape(*arguments)).ravel())
+    given = Given.of(model.nominal, rest, pose.vector[None])
+    shapes = Shapes.declared(phi[None, :, None], lam[None])
+    return NodeCurve.of(published.LENGTH, model.assembly.curve(shapes, given)[0])
 
 
 def by_ipopt(element: Method, n: int) -> float:
@@ -164,7 +165,7 @@ def cobyla(pose: Pose, n: int) -> FloatArray:
     h = model.chain.h
     k_theta, weight = published.STIFFNESS / h, published.MASS / n * 9.81
     end = np.array(pose.end)
-    start = arc_headings(model.chain.heading_places, published.LENGTH, np.zeros(2), end, 1)
+    start = arc_headings(model.chain.places, published.LENGTH, np.zeros(2), end, 1)
 
     def energy(theta: FloatArray) -> float:
         rise = h * np.sin(np.cumsum(theta))

@@ -13,13 +13,17 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from ompl import base as ob
-from ompl import geometric as og
-from ompl import util as ou
 from plan import HERE, clearance, draw, example, read_scene
 
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.codegen.shapes import Shape
+
+try:
+    from ompl import base as ob
+    from ompl import geometric as og
+    from ompl import util as ou
+except ModuleNotFoundError:
+    sys.exit("error: planning from Python needs OMPL's package.\n  Try: pip install ompl")
 
 
 class Leader:

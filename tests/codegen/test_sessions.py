@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config, read_yaml
 from dlo_casadi.effects import EFFECTS, ClampAngle
 from dlo_casadi.equilibrium import solve_equilibrium
-from dlo_casadi.model import DEVIATIONS
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import conditions
 

@@ -1,6 +1,6 @@
 """Whole sessions by fit.py against the truth that an independent simulator put into them.
 
-The other sessions are checked by scripts/check_bench.py, which takes longer.
+Declared models of the others: tests/session/test_truth.py; scripts/check_bench.py does all.
 """
 
 from __future__ import annotations

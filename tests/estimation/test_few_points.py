@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from test_gauss_newton import CABLE, STD, measured_from
 
 from dlo_casadi.diagnosis.diagnose import _p_with_closed_noise
@@ -32,7 +33,21 @@ def test_noise_of_few_points(points):
     assert not fit.noise.declared
     assert 3 <= fit.noise.slow_dof < 8 * points
     assert abs(fit.value("bending_stiffness") - EI) < 3 * fit.std("bending_stiffness")
-    assert 0 <= structure_of(fit, noise_degrees(fit)).p_value <= 1
+    # Nothing is missing, so that it is uniform: one seed in two hundred falls below.
+    assert structure_of(fit, noise_degrees(fit)).p_value > 0.005
+
+
+@pytest.mark.parametrize(("factor", "low", "high"), [(1.0, 0.005, 1.0), (1 / 3, 0.0, 1e-6)])
+def test_the_residual_of_a_declared_noise_is_tested_against_chi_square(factor, low, high):
+    """Of noise three times the declared one the statistic is nine times the degrees of freedom."""
+    fit = fitted(12, std=factor * STD)
+    found = structure_of(fit, noise_degrees(fit))
+    assert low < found.p_value < high
+    assert found.p_value == pytest.approx(chi2.sf(found.statistic, found.dof))
+    # Mean of chi-square, and three of its standard deviations, sqrt(2 / dof) each.
+    assert factor**2 * found.statistic / found.dof == pytest.approx(
+        1, abs=3 * (2 / found.dof) ** 0.5
+    )
 
 
 def test_fewer_points_than_unknowns():

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.effects import (
     AxialStretch,
     BendingSoftening,
@@ -28,7 +29,7 @@ from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Shapes, Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import DEVIATIONS, CableModel
+from dlo_casadi.model import CableModel
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 STD = 3e-4  # m

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from dlo_casadi.chain import Chain
+
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.noise import (
     NoiseModel,

@@ -135,7 +135,7 @@ def test_the_solver_of_a_folder_of_results(written, tmp_path, capsys):
     assert len(files["solver_hash"]) >= 16
     (tmp_path / "file").touch()
     assert main([*command, str(tmp_path / "file")]) == 2
-    assert "cannot be written: File exists" in capsys.readouterr().err
+    assert "file cannot be written: it is a file" in capsys.readouterr().err
 
 
 def test_the_candidates_are_printed_in_their_order(outcome):

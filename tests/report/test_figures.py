@@ -114,13 +114,13 @@ def test_poses_fill_a_grid(count, grid):
 
 def test_magnified_deviations_are_multiples_of_the_true_ones(outcome):
     """Of a curve magnified k times, the points are k times as far away as of the curve."""
-    pose, std = outcome.poses[0], outcome.measurement.std
+    pose = outcome.poses[0]
     shape = outcome.stage("initial").shapes[pose.name]
 
-    distance = [np.hypot(*(pose.points - magnified(pose, shape, std, k)).T) for k in (5, 10)]
+    distance = [np.hypot(*(pose.points - magnified(pose, shape, k)).T) for k in (5, 10)]
     assert distance[1] == pytest.approx(2 * distance[0])
     # Normals of 201 drawn points: exact to a thousandth.
-    assert distance[0] == pytest.approx(5 * std * np.abs(shape.residual), rel=1e-3)
+    assert distance[0] == pytest.approx(5 * np.abs(shape.residual), rel=1e-3)
 
 
 def test_lines_are_drawn_over_the_part_of_a_photograph_with_the_cable(outcome, tmp_path):

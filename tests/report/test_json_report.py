@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from dlo_casadi.report.json_report import all_warnings, finite, report_dict, report_text
-from dlo_casadi.session.outcome import ParameterEstimate, RestCurvatureEstimate, Stage
+from dlo_casadi.session.outcome import (
+    BranchShape,
+    ParameterEstimate,
+    RestCurvatureEstimate,
+    Stage,
+)
 
 KEYS = {
     "schema": str,
@@ -54,6 +59,7 @@ def test_every_key_of_the_schema_is_there(outcome):
         "kind",
         "poses_fit",
         "poses_held_out",
+        "held_out_missing",
         "points",
         "std",
         "std_source",
@@ -63,7 +69,17 @@ def test_every_key_of_the_schema_is_there(outcome):
     names = ["initial", "stiffness_only", "algorithm1", "batch"]
     assert [entry["name"] for entry in report["stages"]] == names
     for entry in report["stages"]:
-        assert set(entry) == {"name", "rmse_fit", "rmse_held_out", "chi2_per_dof", "parameters"}
+        assert set(entry) == {
+            "name",
+            "rmse_fit",
+            "rmse_held_out",
+            "rmse_fit_measured_branch",
+            "rmse_held_out_measured_branch",
+            "other_branch",
+            "held_out",
+            "chi2_per_dof",
+            "parameters",
+        }
         stiffness = entry["parameters"]["bending_stiffness"]
         assert {"value", "std", "interval_95", "identifiable"} <= set(stiffness)
         assert set(entry["parameters"]["rest_curvature"]) == {"s", "value", "std"}
@@ -78,6 +94,18 @@ def test_the_numbers_are_those_of_the_outcome(outcome):
     low, high = batch["parameters"]["bending_stiffness"]["interval_95"]
     assert low < outcome.fit.p[0] < high
     assert batch["parameters"]["rest_curvature"]["value"] == found.rest_curvature.value.tolist()
+
+
+def test_a_pose_on_another_branch_is_there_with_both_errors(outcome):
+    batch = outcome.stage("batch")
+    name, shape = next(iter(batch.shapes.items()))
+    shapes = batch.shapes | {name: replace(shape, measured_branch=BranchShape(1e-4, "cw"))}
+    found = replace(outcome, stages=(*outcome.stages[:-1], replace(batch, shapes=shapes)))
+
+    entry = report_dict(found)["stages"][-1]
+    row = {"rmse": shape.rmse, "rmse_measured_branch": 1e-4, "branch": "cw"}
+    assert entry["other_branch"] == {name: row}
+    assert entry["held_out"] == {"predicted": 3, "declared": 3, "missing": []}
 
 
 def test_a_stage_that_did_not_run_is_null_with_a_warning(outcome):

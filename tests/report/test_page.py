@@ -241,7 +241,7 @@ def test_lines_lie_where_the_camera_sees_them(photographed):
         # Written with two decimals; the camera step measured them at these pixels.
         assert coordinates(lines["measured"].points) == pytest.approx(pose.pixels, abs=0.02)
         stage = photographed.stage("batch")
-        near = beside(pose, stage.shapes[pose.name], photographed.measurement.std)
+        near = beside(pose, stage.shapes[pose.name])
         assert coordinates(lines["after"].near) == pytest.approx(pose.to_pixels(near), abs=0.006)
 
 
@@ -261,6 +261,20 @@ def test_centre_lines_are_drawn_on_a_board_of_one_scale(outcome):
     measured = next(line for line in drawn[0].lines if line.kind == "measured")
     expected = 1e3 * outcome.poses[0].points * [1, -1]
     assert coordinates(measured.points) == pytest.approx(expected, abs=0.006)
+
+
+def test_a_line_beside_the_points_lies_on_its_prediction(outcome):
+    """Whatever noise the last stage has, and the stage that is drawn had."""
+    noisier = replace(outcome.measurement, std=2 * outcome.measurement.std)
+    for picture in pictures(replace(outcome, measurement=noisier)):
+        before = next(line for line in picture.lines if line.kind == "before")
+        near = coordinates(before.near)[10:-10]  # beyond its ends a line has no normal
+        curve = coordinates(before.points)
+        chord, gap = np.diff(curve, axis=0), near[:, None] - curve[:-1]
+        share = np.clip((gap * chord).sum(axis=2) / (chord**2).sum(axis=1), 0, 1)
+        away = np.linalg.norm(gap - share[..., None] * chord, axis=2).min(axis=1)
+        # Points are written to 0.1 mm; the prior's deviations, drawn twice, are millimetres off.
+        assert away.max() < 0.1
 
 
 def test_a_pose_that_could_not_be_read_says_why(outcome):

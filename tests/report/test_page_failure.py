@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_writer import tree
 
-from dlo_casadi.errors import DloError, EstimationError, MeasurementError
+from dlo_casadi.errors import DloError, EstimationError, MeasurementError, OutputError
 from dlo_casadi.report import writer
 from dlo_casadi.report.page import GENERATOR
 from dlo_casadi.report.page_failure import failure_page, hints, write_failure_page
@@ -120,7 +120,7 @@ def test_without_a_configuration_there_is_no_page(tmp_path):
 
 def test_a_page_that_cannot_be_written_does_not_hide_the_error(outcome, tmp_path, monkeypatch):
     def refuse(*_):
-        raise PermissionError(13, "Permission denied")
+        raise OutputError("cannot be written: Permission denied")
 
     monkeypatch.setattr(writer, "write_failure_page", refuse)
     error = DloError("broken")
@@ -132,7 +132,7 @@ def test_a_page_that_cannot_be_written_does_not_hide_the_error(outcome, tmp_path
 def test_a_page_of_that_name_from_elsewhere_is_not_replaced(outcome, tmp_path):
     (tmp_path / "failed.html").write_text("<p>mine")
     with (
-        pytest.raises(DloError, match=r"holds failed.html that no earlier fit has written"),
+        pytest.raises(DloError, match=r"holds failed.html from elsewhere"),
         ResultsFolder(tmp_path, outcome.config),
     ):
         pass
@@ -146,7 +146,7 @@ def test_a_page_is_whole_or_not_there(outcome, tmp_path, monkeypatch):
     def stop(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dlo_casadi.report.page_failure.os.replace", stop)
-    with pytest.raises(OSError, match="No space"):
+    monkeypatch.setattr("os.replace", stop)
+    with pytest.raises(OutputError, match="No space"):
         write_failure_page(tmp_path / "failed.html", outcome.config, DloError("second"))
     assert tree(tmp_path) == before

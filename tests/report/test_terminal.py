@@ -7,6 +7,8 @@ from rich.console import Console
 from test_figures import EFFECT, LOAD
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
+from dlo_casadi.report.page_data import stage_rows
+from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.terminal import (
     describe,
     plus_minus,
@@ -15,7 +17,7 @@ from dlo_casadi.report.terminal import (
     structure_lines,
     unidentified,
 )
-from dlo_casadi.session.outcome import ParameterEstimate
+from dlo_casadi.session.outcome import BranchShape, ParameterEstimate
 
 
 def said(outcome):
@@ -120,6 +122,25 @@ def test_a_proposal_says_how_often_to_measure(std, words):
     proposal = {"expected_difference_m": 1e-4, "expected_difference_std": std}
 
     assert separation_text(proposal).endswith(words)
+
+
+def test_poses_on_another_branch_have_a_row_and_a_fact(outcome):
+    batch = outcome.stage("batch")
+    name, shape = next(iter(batch.shapes.items()))
+    other = BranchShape(2.5e-4, "cw")
+    shapes = batch.shapes | {name: replace(shape, measured_branch=other)}
+    stage = replace(batch, shapes=shapes, rmse_fit=0.243, rmse_fit_measured_branch=2.6e-4)
+    found = replace(outcome, stages=(*outcome.stages[:-1], stage))
+
+    text = said(found)
+    assert "243 mm" in text
+    assert "on the measured branch 0.26 mm" in text
+    assert "on the measured branch" not in said(outcome)
+    (row,) = [row for row in stage_rows(found) if row["label"] == "on the measured branch"]
+    assert row["fit"] == "0.26 mm"
+    assert name in row["note"]
+    facts = {picture.name: picture.facts for picture in pictures(found)}[name]
+    assert facts[-2][2] == "on the measured branch 0.25 mm (branch: cw)"
 
 
 def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):

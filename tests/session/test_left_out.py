@@ -1,13 +1,17 @@
 """Poses that cannot be used are left out of a fit, and named with the reason."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.measurements import read_centerline, write_centerline
+from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.session import run_session
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.measure import read_inputs
@@ -32,6 +36,13 @@ def session(tmp_path):
         return load_config(path)
 
     return load
+
+
+def summary_text(outcome):
+    """What the terminal says, spaces collapsed."""
+    console = Console(width=120, file=io.StringIO())
+    print_summary(console, outcome)
+    return " ".join(console.file.getvalue().split())
 
 
 def left_out(config):
@@ -61,6 +72,29 @@ def test_a_missing_file_is_told_once(session):
     (line,) = reading_warnings(read_inputs(config, lambda *_: None), config.skipped)
     assert line.startswith("nothing is left out: ")
     assert "nothing.csv does not exist" in line
+
+
+def test_held_out_poses_that_no_error_counts_are_told(session):
+    """One cannot be reached, the file of another is gone; a third is as it was."""
+
+    def change(poses):
+        for k, pose in enumerate(poses):
+            pose["role"] = "held_out" if k in (1, 2, 3) else "fit"
+        poses[1]["end"] = [0.6, 0.1]
+        poses[2]["file"] = "nothing.csv"
+
+    outcome = run_session(session(change))
+
+    held_out = outcome.held_out(outcome.stage("batch"))
+    assert (held_out.predicted, held_out.declared) == (1, 3)
+    assert set(held_out.missing) == {"pose_02", "nothing"}
+    (said,) = [line for line in outcome.warnings if line.startswith("held out and in no error")]
+    assert "pose_02" in said
+    assert said.endswith("2 of 3 held-out poses")
+    assert "1 of 3 held out" in summary_text(outcome)
+    assert "mm (1 of 3)" in summary_text(outcome)
+    report = report_dict(outcome)["stages"][-1]["held_out"]
+    assert (report["predicted"], report["declared"]) == (1, 3)
 
 
 def changed_line(tmp_path, name, change):

@@ -6,7 +6,7 @@ import pytest
 from drawing import SCALE, arc, draw, square_view, to_pixels
 from scipy.spatial import cKDTree
 
-from dlo_casadi.errors import VisionError
+from dlo_casadi.errors import OutputError, VisionError
 from dlo_casadi.vision import (
     Board,
     Workings,
@@ -74,7 +74,7 @@ def test_the_steps_of_a_cable_that_is_not_found():
 
 
 def test_a_picture_that_cannot_be_written(tmp_path):
-    with pytest.raises(VisionError, match="cannot be written: No such file"):
+    with pytest.raises(OutputError, match="cannot be written: No such file"):
         write_picture(tmp_path / "no" / "a.jpg", draw(CABLE))
 
 

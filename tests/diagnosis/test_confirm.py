@@ -1,0 +1,79 @@
+"""What is declared as fixed stays so when an effect is added or dropped."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dlo_casadi.diagnosis.candidates import candidates
+from dlo_casadi.diagnosis.confirm import refit_with
+from dlo_casadi.diagnosis.diagnose import _drop
+from dlo_casadi.diagnosis.pull import _Search
+from dlo_casadi.diagnosis.screening import Screen
+from dlo_casadi.effects import Cable, LumpedMass, UnknownPull
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.fit import fit_model, refine_mesh
+from dlo_casadi.estimation.gauss_newton import Tolerances
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model import CableModel
+
+NOISE = 3e-4
+PLAIN = CableModel(Cable(0.5, 0.03, 0.006, 0.01), 12, n_rest=5)
+DECLARED = PLAIN.with_effect(LumpedMass())
+FIXED = {"lumped_mass.mass": 5e-3, "lumped_mass.position": 0.2}  # kg, m; nominal: 0 and L / 4
+
+
+@pytest.fixture(scope="module")
+def base():
+    """A cable that tapers and carries a known weight, fitted without the taper."""
+    taper = next(c for c in candidates(PLAIN, None, 1) if c.name == "stiffness_gradient")
+    truth = taper.add_to(DECLARED)
+    p = np.array([0.01, *FIXED.values(), 0.4])
+    poses = [Pose((0.0, 0.0), (x, y)) for x, y in ((0.3, 0.0), (0.2, -0.2), (0.35, 0.1))]
+    rng = np.random.default_rng(0)
+    s = np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
+    measured = [
+        MeasuredPose(shape_pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2)))
+        for shape_pose, shape in zip(
+            poses, predict_poses(truth, p, np.zeros(truth.chain.n_cells), poses), strict=True
+        )
+    ]
+    values = DECLARED.nominal.copy()
+    values[1:] = list(FIXED.values())
+    return fit_model(
+        DECLARED, measured, Tolerances(), NOISE, free=["bending_stiffness"], values=values
+    )
+
+
+def kept(fit):
+    return {name: fit.value(name) for name in FIXED if name in fit.model.names}
+
+
+def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
+    listed = [c for c in candidates(base.model, None, 3) if c.name == "stiffness_gradient"]
+    (screened,) = Screen(base, listed).run(np.inf)
+
+    larger = refit_with(base, screened)
+
+    assert kept(larger) == FIXED
+    assert set(larger.problem.unknowns.names[:2]) == {
+        "bending_stiffness",
+        "stiffness_gradient.slope",
+    }
+    slope, std = (f("stiffness_gradient.slope") for f in (larger.value, larger.std))
+    assert abs(slope - 0.4) < 3 * std
+    smaller = _drop(larger, listed[0])
+    assert kept(smaller) == FIXED
+    assert "lumped_mass.mass" not in smaller.problem.unknowns.names
+
+
+def test_a_fixed_effect_stays_on_another_mesh_and_beside_an_unknown_pull(base):
+    assert kept(refine_mesh(base, 16)) == FIXED
+    search = _Search(base, base.model.with_effect(UnknownPull()), "unknown_pull.position")
+    unknowns = search.held_at(0.5).unknowns
+    found = SimpleNamespace(
+        model=unknowns.model, value=lambda name: unknowns.fixed[unknowns.model.names.index(name)]
+    )
+    assert kept(found) == FIXED
+    assert not unknowns.free[1:3].any()
