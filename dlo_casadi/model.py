@@ -258,6 +258,14 @@ class CableModel:
         return ends
 
     @cached_property
+    def held(self) -> ca.Function:
+        """(p, ends, deviation) -> where the ends really are (6,), length without load [m]."""
+        ends = self._held
+        where = ca.vertcat(ends.start, ends.end, ends.start_heading, ends.end_heading)
+        length = self.cable.length * self._stretch
+        return ca.Function("held", [self._p, self._ends, self._deviation], [where, length])
+
+    @cached_property
     def _stretch(self) -> ca.SX:
         factor = ca.SX(1)
         for effect, local in self._slot(Kinematics):

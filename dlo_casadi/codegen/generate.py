@@ -19,7 +19,7 @@ from dlo_casadi.codegen.program import c_number
 from dlo_casadi.codegen.split import Split
 from dlo_casadi.durable import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.effects import MeasurementEffect, StateEffect
-from dlo_casadi.equilibrium import total_dead_load
+from dlo_casadi.equilibrium import resting_headings, total_dead_load
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -110,13 +110,9 @@ def _extra(split: Split) -> list[float]:
 
 def _resting(split: Split) -> FloatArray:
     """Headings (n_x,) of the cable at rest, counted from its start [rad]."""
-    chain = split.model.chain
-    cells = chain.cells
-    turn = np.concatenate([[0.0], np.cumsum(split.rest * np.diff(cells, axis=1).ravel())])
-    edges = np.concatenate([cells[:1, 0], cells[:, 1]])
-    inner = np.interp(chain.heading_places, edges, turn)
-    head = [0.0] * split.first
-    return np.concatenate([head, inner, [turn[-1]] * (split.n_x - split.first - split.n_phi)])
+    inner = resting_headings(split.model.chain, split.rest)
+    behind = split.n_x - split.first - split.n_phi
+    return np.concatenate([[0.0] * split.first, inner, [inner[-1]] * behind])
 
 
 def numbers_of(split: Split, groups: list[Group]) -> list[float]:

@@ -199,15 +199,10 @@ class Split:
     @cached_property
     def offsets(self) -> FloatArray:
         """Held minus declared ends (6,): end and headings are where boundary effects put them."""
-        model = self.model
-        held = model._held
-        where = ca.vertcat(held.start, held.end, held.start_heading, held.end_heading)
-        function = ca.Function(
-            "held",
-            [model._ends, model._p, model._deviation],
-            [where, ca.densify(ca.jacobian(where, model._ends))],
-        )
-        offset, slope = function(0, self.p, 0)
+        ends = ca.SX.sym("ends", 6)
+        where, _ = self.model.held(self.p, ends, 0)
+        function = ca.Function("held", [ends], [where, ca.densify(ca.jacobian(where, ends))])
+        offset, slope = function(0)
         if not np.array_equal(np.array(slope), np.eye(6)) or np.any(np.array(offset)[:2]):
             raise DloError("a boundary effect does more than shift the end or turn the clamps")
         return np.array(offset).ravel()
@@ -226,8 +221,7 @@ class Split:
     @cached_property
     def length(self) -> float:
         """Length of the unloaded cable [m]."""
-        model = self.model
-        return model.cable.length * float(ca.Function("f", [model._p], [model._stretch])(self.p))
+        return float(self.model.held(self.p, 0, 0)[1])
 
     @cached_property
     def slots(self) -> list[Slot]:

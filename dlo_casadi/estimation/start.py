@@ -45,7 +45,7 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
         else Sweep(model.with_mesh(chain.n, "arc"), problem.sweep.poses)
     )
     flat = np.zeros(chain.n_cells)
-    phi = np.array([guesses(model, item.pose, flat)[0] for item in problem.measured])
+    phi = np.array([guesses(model, model.nominal, flat, item.pose)[0] for item in problem.measured])
     feet: list[FloatArray] = []
     for j in used:
         places = chord_places(problem.measured[j], chain.length)

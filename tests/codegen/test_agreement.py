@@ -33,6 +33,7 @@ VALUES = {
     "rest_curvature_drift": (0.1,),
 }
 BOUNDARIES = [("pinned", "pinned"), ("clamped", "clamped"), ("clamped", "free")]
+HALF_HELD = [("clamped", "pinned"), ("pinned", "clamped")]
 
 
 def problem(names, element="arc", start="pinned", end="pinned", n=12):
@@ -58,9 +59,6 @@ def difference(names, element, start, end, n=12):
         )
         expected = solve_equilibrium(model, p, rest, pose)
         shape = solver.solve(place, headings=CLAMPS)
-        assert shape.energy <= expected.energy + 1e-9 * abs(expected.energy) + 1e-12
-        if shape.energy < expected.energy - 1e-7 * abs(expected.energy):
-            continue  # a better equilibrium
         worst = max(worst, np.abs(shape.points - expected.points).max())
         assert shape.energy == pytest.approx(expected.energy, rel=1e-7)
         assert shape.lam == pytest.approx(expected.lam, rel=1e-6, abs=1e-6)
@@ -87,3 +85,8 @@ def test_effect(name, element):
 def test_all_effects_together(element, start, end):
     names = [n for n in VALUES if n != "clamp_angle" or (start, end) == ("clamped", "clamped")]
     assert difference(names, element, start, end, n=6) < 1e-8  # more take long to generate
+
+
+@pytest.mark.parametrize(("start", "end"), HALF_HELD)
+def test_one_clamp(start, end):
+    assert difference(["lumped_mass"], "quadratic", start, end, n=10) < 1e-8
