@@ -50,6 +50,8 @@ class Pose:
     branch : "ccw" or "cw", optional
         Which way the cable turns from start to end: the sign of `Equilibrium.turn`.
     name : str
+    camera_center : (float, float, float), optional [m]
+        Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
     """
 
     start: tuple[float, float]
@@ -58,12 +60,22 @@ class Pose:
     end_heading: float | None = None
     branch: Branch | None = None
     name: str = "pose"
+    camera_center: tuple[float, float, float] | None = None
+
+    @property
+    def ends(self) -> FloatArray:
+        """Start, end [m], start heading, end heading [rad] (6,)."""
+        end = self.end if self.end is not None else (0.0, 0.0)
+        return np.array([*self.start, *end, self.start_heading or 0.0, self.end_heading or 0.0])
 
     @property
     def vector(self) -> FloatArray:
-        """The model's argument `ends` (6,)."""
-        end = self.end if self.end is not None else (0.0, 0.0)
-        return np.array([*self.start, *end, self.start_heading or 0.0, self.end_heading or 0.0])
+        """The model's argument `pose` (9,): the ends, then what `effects.Sight` says of the camera.
+
+        Its centre (x, y, z) enters as (x, y, 1) / z: zeros for none, which sees from infinity.
+        """
+        x, y, z = self.camera_center or (0.0, 0.0, np.inf)
+        return np.concatenate([self.ends, np.array([x, y, 1.0]) / z])
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from dlo_casadi.effects import (
     Load,
     MeasurementEffect,
     SectionLaw,
+    Sight,
     StateEffect,
 )
 from dlo_casadi.errors import DloError
@@ -45,6 +46,8 @@ STIFFNESS_PRIOR_STD = float(np.log(1e3))
 # What may be different in every pose, in the order of `deviation`: where the ends deviate from
 # what is declared [m, rad], and a force of unknown cause [N].
 DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading", "pull_x", "pull_y")
+# Numbers that declare one pose: its ends (6) and its camera (3), see `equilibrium.Pose.vector`.
+POSE_SIZE = 9
 
 
 def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -202,9 +205,18 @@ class CableModel:
         return ca.SX.sym("kappa_0", self.chain.n_cells)
 
     @cached_property
+    def _pose(self) -> ca.SX:
+        """What is declared of one pose, see `equilibrium.Pose.vector`."""
+        return ca.SX.sym("pose", POSE_SIZE)
+
+    @property
     def _ends(self) -> ca.SX:
         """Start (2), end (2), start heading, end heading as declared."""
-        return ca.SX.sym("ends", 6)
+        return self._pose[:6]
+
+    @property
+    def _sight(self) -> Sight:
+        return Sight(self._pose[:2], self._pose[6:8], self._pose[8])
 
     @cached_property
     def _deviation(self) -> ca.SX:
@@ -403,10 +415,10 @@ class CableModel:
 
         min V(coordinates) s.t. conditions = 0. The coordinates are the headings, for an
         extensible cable one a_e per element with the axial strain sqrt(C) a_e and the energy
-        h a_e^2 / 2, and for quadratic elements their bows. The parameters stack p, rest, ends,
+        h a_e^2 / 2, and for quadratic elements their bows. The parameters stack p, rest, pose,
         deviation.
         """
-        parameters = ca.vertcat(self._p, self._rest, self._ends, self._deviation)
+        parameters = ca.vertcat(self._p, self._rest, self._pose, self._deviation)
         axial = ca.SX.sym("axial", self.n if self.extensible else 0)
         bow = ca.SX.sym("bow", self.n if self.bowed else 0)
         ratio = self._stretch + ca.sqrt(self._compliance) * axial if self.extensible else None
@@ -425,7 +437,7 @@ class CableModel:
 
     @property
     def _arguments(self) -> list[ca.SX]:
-        return [self._phi, self._lam, self._p, self._rest, self._ends, self._deviation]
+        return [self._phi, self._lam, self._p, self._rest, self._pose, self._deviation]
 
     @cached_property
     def _stationarity(self) -> ca.SX:
@@ -435,7 +447,7 @@ class CableModel:
 
     @cached_property
     def kkt(self) -> ca.Function:
-        """(phi, lam, p, rest, ends, deviation) -> stationarity (N,), its Jacobian (N, N)."""
+        """(phi, lam, p, rest, pose, deviation) -> stationarity (N,), its Jacobian (N, N)."""
         unknowns = ca.vertcat(self._phi, self._lam)
         matrix = ca.jacobian(self._stationarity, unknowns)
         return ca.Function(
@@ -466,14 +478,14 @@ class CableModel:
         point, slope, heading = ca.SX.sym("point", 2), ca.SX.sym("slope", 2), ca.SX.sym("heading")
         image = point
         for effect, local in maps:
-            image = effect.observe(image, heading, self._ends[:2], local)
+            image = effect.observe(image, heading, self._sight, local)
         pushed = ca.jtimes(image, point, slope) if maps else slope
-        move = ca.Function("move", [point, slope, heading, self._p, self._ends], [image, pushed])
+        move = ca.Function("move", [point, slope, heading, self._p, self._pose], [image, pushed])
         headings = curve.node_headings
         slopes = curve.node_slopes if self.chain.nodal else ca.SX.zeros(self.n + 1, 2)
         for i in range(self.n + 1):
             position, direction = move(
-                nodes[i, :].T, slopes[i, :].T, headings[i], self._p, self._ends
+                nodes[i, :].T, slopes[i, :].T, headings[i], self._p, self._pose
             )
             rows.append(ca.horzcat(position.T, direction.T))
         table = ca.vertcat(*rows)
@@ -507,10 +519,10 @@ class CableModel:
 
     @cached_property
     def strain(self) -> ca.Function:
-        """(phi, ends, deviation, p) -> curvature per cell (n_cells,) [1/m]."""
+        """(phi, pose, deviation, p) -> curvature per cell (n_cells,) [1/m]."""
         curve = self._curve()
         return ca.Function(
-            "strain", [self._phi, self._ends, self._deviation, self._p], [curve.strain]
+            "strain", [self._phi, self._pose, self._deviation, self._p], [curve.strain]
         )
 
     @property

@@ -38,6 +38,7 @@ NAMES = {
     "creep": ("rest_curvature_drift", ("rate",)),
     "stiff_section": ("stiff_section", ("start", "end", "factor")),
     "extens": ("axial_stretch", ("axial_stiffness",)),
+    "standoff": ("standoff_error", ("distance",)),
     "clamp_error": ("clamp_angle", ("start_heading_error", "end_heading_error")),
 }
 

@@ -359,7 +359,15 @@ def test_what_photographs_need(tmp_path):
         ("0.012", "-0.012", "standoff: must not be smaller than 0"),
         ("[[900, 0", "[[-900, 0", "positive fx and fy"),
         (", [0, 0, 1]]", "]", "camera.matrix has only 2 of its values"),
-        ("1]]}", "1]], distortion: [0.1]}", "distortion: found 1 numbers; OpenCV knows 4, 5"),
+        ("[[900, 0,", "[[900, 3,", "camera.matrix: must read .*fx, 0, cx"),
+        *(
+            (
+                "1]]}",
+                f"1]], distortion: {[0.1] * n}}}",
+                f"distortion: found {n} numbers; OpenCV knows 4, 5",
+            )
+            for n in (1, 6, 13, 15)
+        ),
     ],
 )
 def test_mistakes_in_board_and_camera(tmp_path, old, new, message):

@@ -24,6 +24,8 @@ from dlo_casadi.effects import (
     RestCurvatureDrift,
     SectionLaw,
     SideLoad,
+    Sight,
+    StandoffError,
     StartSpring,
     StiffnessGradient,
     StiffSection,
@@ -32,7 +34,8 @@ from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.model import DEVIATIONS, CableModel
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
-ENDS = np.array([0.1, 0.05, 0.5, -0.1, 0.4, -0.2])  # start, end [m], headings [rad]
+# Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).
+POSE = Pose((0.1, 0.05), (0.5, -0.1), 0.4, -0.2, camera_center=(0.6, -0.4, 2.0)).vector
 STILL = np.zeros(len(DEVIATIONS))
 SLOTS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
 UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad"}
@@ -66,7 +69,7 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
 
 
 def state(model: CableModel, headings: str) -> tuple[np.ndarray, ...]:
-    """Arguments phi, lam, (p), rest, ends, deviation; p is put in by the caller."""
+    """Arguments phi, lam, (p), rest, pose, deviation; p is put in by the caller."""
     rng = np.random.default_rng(1)
     phi = rng.normal(scale=0.5, size=model.chain.n_headings)
     lam = rng.normal(size=model.n_conditions)
@@ -78,7 +81,7 @@ def state(model: CableModel, headings: str) -> tuple[np.ndarray, ...]:
 
 def outputs(model: CableModel, name: str, p: np.ndarray, headings: str = "random"):
     phi, lam, rest = state(model, headings)
-    found = getattr(model, name)(phi, lam, p, rest, ENDS, STILL)
+    found = getattr(model, name)(phi, lam, p, rest, POSE, STILL)
     return [np.array(block) for block in found]
 
 
@@ -184,15 +187,15 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, element):
     turned = replace(model, gravity=gravity)
     p = own_parameters(model, "off")
     phi, lam, rest = state(model, "random")
-    start, end = ENDS[:2], ENDS[2:4]
-    ends = np.concatenate([turn @ start + shift, turn @ end + shift, ENDS[4:] + angle])
-    energy, nodes = model.energy(phi, lam, p, rest, ENDS, STILL)
+    start, end = POSE[:2], POSE[2:4]
+    ends = np.concatenate([turn @ start + shift, turn @ end + shift, POSE[4:6] + angle, POSE[6:]])
+    energy, nodes = model.energy(phi, lam, p, rest, POSE, STILL)
     new_energy, new_nodes = turned.energy(phi + angle, turn @ lam, p, rest, ends, STILL)
     fall = -CABLE.mass * np.array(gravity) @ shift  # the weight has been moved, too
     # Rounding of a few dozen terms of order one.
     assert float(new_energy) - fall == pytest.approx(float(energy), abs=1e-11)
     np.testing.assert_allclose(np.array(new_nodes), np.array(nodes) @ turn.T + shift, atol=1e-11)
-    balance, _ = model.kkt(phi, lam, p, rest, ENDS, STILL)
+    balance, _ = model.kkt(phi, lam, p, rest, POSE, STILL)
     new_balance, _ = turned.kkt(phi + angle, turn @ lam, p, rest, ends, STILL)
     headings = model.chain.n_headings
     np.testing.assert_allclose(
@@ -208,7 +211,7 @@ def energies(effects: tuple[Effect, ...], p: list[float], gravity=(0.0, -9.81), 
     model = CableModel(CABLE, n=5, element=element, effects=effects, gravity=gravity)
     phi, lam, rest = state(model, "random")
     full = np.array([CABLE.bending_stiffness, *p])
-    energy, nodes = model.energy(phi, lam, full, rest, ENDS, STILL)
+    energy, nodes = model.energy(phi, lam, full, rest, POSE, STILL)
     return float(energy), np.array(nodes)
 
 
@@ -304,8 +307,8 @@ def test_springs_pull_towards_their_heading():
         bare = CableModel(CABLE, n=5)
         phi, lam, rest = state(model, "random")
         p = np.array([0.05, 0.7, -0.4])
-        with_it, _ = model.energy(phi, lam, p, rest, ENDS, STILL)
-        without, _ = bare.energy(phi, lam, p[:1], rest, ENDS, STILL)
+        with_it, _ = model.energy(phi, lam, p, rest, POSE, STILL)
+        without, _ = bare.energy(phi, lam, p[:1], rest, POSE, STILL)
         exact = 0.7 * (phi[index] + 0.4) ** 2 / 2
         assert float(with_it - without) == pytest.approx(exact, abs=1e-12)
 
@@ -331,13 +334,45 @@ def test_clamp_angles_of_one_end_only():
     assert model.names == ("bending_stiffness", "clamp_angle.end_heading_error")
 
 
+def seen_from(camera_center, start=(0.0, 0.0)) -> Sight:
+    vector = ca.SX(ca.DM(Pose(start, camera_center=camera_center).vector))
+    return Sight(vector[:2], vector[6:8], vector[8])
+
+
+@pytest.mark.parametrize("distance", [-0.03, 0.0, 0.004])
+def test_a_standoff_error_follows_the_ray_to_the_declared_plane(distance):
+    """Where the straight line from the camera through the cable's point meets z = 0."""
+    camera, point = np.array([0.3, -0.9, 1.4]), np.array([0.5, 0.2, distance])
+    ray = point - camera
+    met = camera - ray * camera[2] / ray[2]
+    seen = StandoffError().observe(
+        ca.SX(ca.DM(point[:2])), ca.SX(0), seen_from(tuple(camera)), {"distance": ca.SX(distance)}
+    )
+    np.testing.assert_allclose([*number(seen), 0.0], met, atol=1e-15)
+
+
+def test_a_camera_at_infinity_sees_no_standoff():
+    point = ca.SX(ca.DM([0.5, 0.2]))
+    seen = StandoffError().observe(point, ca.SX(0), seen_from(None), {"distance": ca.SX(0.01)})
+    np.testing.assert_array_equal(number(seen), [0.5, 0.2])
+
+
+def test_over_the_start_fixture_a_standoff_error_is_a_scale():
+    """By z / (z - d): the two cannot be told apart there."""
+    point, start = ca.SX(ca.DM([0.5, 0.2])), (0.1, 0.05)
+    sight = seen_from((*start, 1.5), start)
+    seen = StandoffError().observe(point, ca.SX(0), sight, {"distance": ca.SX(0.02)})
+    scaled = ImageScale().observe(point, ca.SX(0), sight, {"factor": ca.SX(1.5 / 1.48)})
+    np.testing.assert_allclose(number(seen), number(scaled), rtol=1e-14)
+
+
 def test_measurement_maps():
     """Scale about the start; radial distortion about the image centre, by hand."""
-    point, start = ca.SX(ca.DM([0.5, 0.2])), ca.SX(ca.DM([0.1, 0.0]))
-    scaled = ImageScale().observe(point, ca.SX(0.3), start, {"factor": ca.SX(1.1)})
+    point, sight = ca.SX(ca.DM([0.5, 0.2])), seen_from(None, start=(0.1, 0.0))
+    scaled = ImageScale().observe(point, ca.SX(0.3), sight, {"factor": ca.SX(1.1)})
     np.testing.assert_allclose(number(scaled), [0.54, 0.22], rtol=1e-14)
     lens = ImageDistortion(center=(0.2, -0.2))
-    moved = lens.observe(point, ca.SX(0.3), start, {"coefficient": ca.SX(0.4)})
+    moved = lens.observe(point, ca.SX(0.3), sight, {"coefficient": ca.SX(0.4)})
     # Arm (0.3, 0.4), length 0.5: factor 1 + 0.4 * 0.25 = 1.1.
     np.testing.assert_allclose(number(moved), [0.53, 0.24], rtol=1e-14)
 

@@ -80,8 +80,8 @@ class Split:
         position = ca.SX.zeros(0) if model.end == "free" else lam
         multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
         declared = ca.vertcat(x[0], x[self.n_x - 1]) - ca.DM(self.offsets[4:])
-        ends = ca.vertcat(start, ca.SX.zeros(2), declared)
-        return [phi, multipliers, ca.DM(self.p), rest, ends, ca.DM.zeros(len(DEVIATIONS))]
+        pose = ca.vertcat(start, ca.SX.zeros(2), declared, ca.SX.zeros(3))
+        return [phi, multipliers, ca.DM(self.p), rest, pose, ca.DM.zeros(len(DEVIATIONS))]
 
     @cached_property
     def _program(self) -> Program:
@@ -212,10 +212,10 @@ class Split:
         """Curvature per bend of each cell (n_x - 1,) [1/m]: kappa_j = w_j (x_(j+1) - x_j)."""
         model = self.model
         x = ca.SX.sym("x", self.n_x)
-        phi, _, p, _, ends, deviation = self._arguments(
+        phi, _, p, _, pose, deviation = self._arguments(
             x, ca.SX.zeros(2), ca.SX.zeros(model.chain.n_cells), ca.SX.zeros(2)
         )
-        strain = model.strain(phi, ends, deviation, p)
+        strain = model.strain(phi, pose, deviation, p)
         return np.array(ca.evalf(ca.jacobian(strain, x)[:, 1:])).diagonal().copy()
 
     @cached_property

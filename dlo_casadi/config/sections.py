@@ -133,12 +133,12 @@ class Camera(Section):
     matrix: tuple[Row, Row, Row]
     """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel]."""
     distortion: tuple[Number, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """Distortion coefficients k1, k2, p1, p2, k3."""
+    """OpenCV's 4, 5, 8, 12 or 14 coefficients k1, k2, p1, p2, k3, k4, ...; [] for none."""
 
     @model_validator(mode="after")
     def _plausible(self) -> Camera:
-        (fx, _, _), (below, fy, _), last = self.matrix
-        if fx <= 0.0 or fy <= 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
+        (fx, skew, _), (below, fy, _), last = self.matrix
+        if fx <= 0.0 or fy <= 0.0 or skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
             text = "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
             raise Contradiction(Problem(("matrix",), text))
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):

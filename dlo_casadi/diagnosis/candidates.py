@@ -67,6 +67,7 @@ def candidates(
     n_poses: int,
     exclude: Sequence[str] = (),
     directions: tuple[float, float] = (0.0, 0.0),
+    camera: bool = False,
 ) -> list[Candidate]:
     """List all effects that may be missing in a model.
 
@@ -83,10 +84,12 @@ def candidates(
         Effects that the user does not want to be tried.
     directions : (float, float) [rad]
         Mean headings at start and end.
+    camera : bool
+        Whether it is known from where the photographs were taken.
     """
     found = []
     for name in EFFECTS:
-        if name in exclude or not _applies(name, model, center, n_poses):
+        if name in exclude or not _applies(name, model, center, n_poses, camera):
             continue
         effect = _make(name, model, center)
         present = any(other.label == effect.label for other in model.effects)
@@ -106,11 +109,13 @@ def candidates(
 
 
 def _applies(
-    name: str, model: CableModel, center: tuple[float, float] | None, n_poses: int
+    name: str, model: CableModel, center: tuple[float, float] | None, n_poses: int, camera: bool
 ) -> bool:
     """Whether an effect makes sense for these boundaries and this camera."""
     if name == "image_distortion":
         return center is not None
+    if name == "standoff_error":
+        return camera
     if name == "clamp_angle":
         return "clamped" in (model.start, model.end)
     if name == "start_spring":

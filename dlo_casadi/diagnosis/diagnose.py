@@ -225,7 +225,9 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
     """Score tests of all candidates at a fit, best first."""
     phi = fit.point.shapes.phi
     directions = (float(phi[:, 0].mean()), float(phi[:, -1].mean()))
-    listed = candidates(fit.model, center, len(fit.problem.history), exclude, directions)
+    history = fit.problem.history
+    camera = any(item.pose.camera_center is not None for item in history)
+    listed = candidates(fit.model, center, len(history), exclude, directions, camera)
     return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
 
 

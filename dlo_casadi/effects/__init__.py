@@ -13,6 +13,7 @@ from dlo_casadi.effects.effect import (
     Load,
     MeasurementEffect,
     SectionLaw,
+    Sight,
     StateEffect,
 )
 from dlo_casadi.effects.end_offset import EndOffset
@@ -25,6 +26,7 @@ from dlo_casadi.effects.lumped_mass import LumpedMass
 from dlo_casadi.effects.point_force import PointForce
 from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
 from dlo_casadi.effects.side_load import SideLoad
+from dlo_casadi.effects.standoff_error import StandoffError
 from dlo_casadi.effects.stiff_section import StiffSection
 from dlo_casadi.effects.stiffness_gradient import StiffnessGradient
 from dlo_casadi.effects.unknown_pull import UnknownPull
@@ -48,6 +50,7 @@ EFFECTS: dict[str, type[Effect]] = {
         RestCurvatureDrift,
         ImageScale,
         ImageDistortion,
+        StandoffError,
     )
 }
 
@@ -75,6 +78,8 @@ __all__ = [
     "RestCurvatureDrift",
     "SectionLaw",
     "SideLoad",
+    "Sight",
+    "StandoffError",
     "StartSpring",
     "StateEffect",
     "StiffSection",

@@ -70,6 +70,25 @@ class EndConditions:
 
 
 @dataclass(frozen=True)
+class Sight:
+    """From where the points of a pose are measured: symbols of one pose.
+
+    Parameters
+    ----------
+    start : (2,) [m]
+        The start fixture.
+    camera : (2,) [1]
+        The camera's centre (x, y) over its distance z from the cable's declared plane.
+    nearness : scalar [1/m]
+        1/z. Both are zero where no camera is known: it then sees from infinity, straight on.
+    """
+
+    start: ca.SX
+    camera: ca.SX
+    nearness: ca.SX
+
+
+@dataclass(frozen=True)
 class Effect:
     """Something that acts on a cable. Subclasses fill the slot that gives them their base.
 
@@ -179,15 +198,13 @@ class MeasurementEffect(Effect):
 
     slot: ClassVar[str] = "measurement"
 
-    def observe(self, point: ca.SX, heading: ca.SX, start: ca.SX, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Where the camera believes the true point (2,) [m] to be. Maps apply in order.
 
         Parameters
         ----------
         heading : scalar [rad]
             Direction of the cable at the point.
-        start : (2,) [m]
-            The start fixture.
         """
         raise TypeError(f"{self.name} has no measurement map")
 

@@ -30,7 +30,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import NodeCurve, normal_rows
 from dlo_casadi.estimation.sweep import Shapes
-from dlo_casadi.model import DEVIATIONS
+from dlo_casadi.model import DEVIATIONS, POSE_SIZE
 
 FloatArray = NDArray[np.floating]
 
@@ -151,14 +151,14 @@ class _BatchNlp:
         unknowns, model = problem.unknowns, problem.unknowns.model
         theta = ca.SX.sym("theta", unknowns.size)
         own = ca.SX.sym("own", self.stride)
-        ends = ca.SX.sym("ends", 6)
+        pose = ca.SX.sym("pose", POSE_SIZE)
         phi, lam, dev, rest = self._split(own)
         deviation = ca.SX.zeros(len(DEVIATIONS))
         for k, column in enumerate(self.columns):
             deviation[column] = dev[k] * problem.deviation_std[k]
         if not model.has_state:
             rest = unknowns.symbolic_rest(theta)
-        arguments = [phi, lam * self.force, unknowns.symbolic_p(theta), rest, ends, deviation]
+        arguments = [phi, lam * self.force, unknowns.symbolic_p(theta), rest, pose, deviation]
         scale = np.concatenate(
             [
                 np.full(self.n_phi, 1 / (self.force * model.cable.length)),
@@ -171,7 +171,7 @@ class _BatchNlp:
         if model.has_state:
             after = model.next_rest(*arguments)[0] / model.cable.curvature_scale
         both = ca.vertcat(own, theta)
-        given = [own, theta, ends]
+        given = [own, theta, pose]
         self.value = ca.Function("value", given, [balance, z, after])
         blocks = [ca.densify(ca.jacobian(block, both)) for block in (balance, z, after)]
         self.slope = ca.Function("slope", given, blocks)
