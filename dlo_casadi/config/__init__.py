@@ -35,6 +35,7 @@ from dlo_casadi.config.sections import (
 )
 
 __all__ = [
+    "MESH",
     "REST_COEFFICIENTS",
     "Board",
     "Boundary",
@@ -48,7 +49,6 @@ __all__ = [
     "EstimationOptions",
     "Experiment",
     "Images",
-    "MESH",
     "ModelOptions",
     "Place",
     "Pose",

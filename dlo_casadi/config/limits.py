@@ -88,7 +88,8 @@ def implausible_sizes(
     """Find sizes [m], [kg], [N m^2] of a cable that no cable has, by their key."""
     problems: list[Problem] = []
     if length not in LENGTH:
-        hint = f"did you mean {length / 1e3:g}? " if length > LENGTH.most else ""
+        meant = length / 1e3  # of millimetres
+        hint = f"did you mean {meant:g}? " if meant in LENGTH else ""
         text = f"{length:g} m: units are SI, {hint}{LENGTH}"
         problems.append(Problem(("length",), text))
     elif diameter > length:
@@ -101,9 +102,10 @@ def implausible_sizes(
         problems += Range(_THINNEST, length, "m").problems(("diameter",), diameter)
     heaviest = min(_HEAVIEST, _HEAVIEST_PER_METRE * length)
     if mass > heaviest:
+        meant = mass / 1e3  # of grams
+        hint = f"did you mean {meant:g}? " if meant <= heaviest else ""
         text = (
-            f"{mass:g} kg for {length:g} m: units are SI, did you mean {mass / 1e3:g}? "
-            f"At most {heaviest:g} kg is possible"
+            f"{mass:g} kg for {length:g} m: units are SI, {hint}at most {heaviest:g} kg is possible"
         )
         problems.append(Problem(("mass",), text))
     elif mass < _LIGHTEST:

@@ -94,9 +94,7 @@ class Cable(Section):
 
     @model_validator(mode="after")
     def _plausible(self) -> Cable:
-        problems = implausible_sizes(
-            self.length, self.mass, self.diameter, self.bending_stiffness
-        )
+        problems = implausible_sizes(self.length, self.mass, self.diameter, self.bending_stiffness)
         if self.youngs_modulus is not None and self.bending_stiffness is None:
             stiffness = self.prior_bending_stiffness
             problems += STIFFNESS.problems(

@@ -12,11 +12,11 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkProcess
 from typing import Any
 
-# Data of one process [bytes]; of processor time [s] an input may take, and of any time, in which
-# one that waits for ever must be noticed on a machine with other work, too.
+# Data of one process [bytes]; processor time of an input [s], which other work on the machine does
+# not stretch; and time by the clock, for one that waits for ever.
 MOST_MEMORY = 2 * 10**9
 MOST_SECONDS = 10.0
-_MOST_WAITING = 120.0
+_MOST_WAITING = 600.0
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -34,7 +34,7 @@ def watched(
 ) -> Iterator[tuple[Any, str, str]]:
     """Do the work in `jobs` processes; yield (item, outcome, text) in the order of their ends.
 
-    Outcomes are those of `work`, and "hang" or "crash".
+    Outcomes are those of `work`, and "hang", "memory" or "crash".
     """
     context = multiprocessing.get_context("fork")
     waiting = iter(items)
@@ -103,7 +103,11 @@ def _serve(
             item = connection.recv()
         except EOFError:
             return
-        connection.send(work(item))
+        try:
+            found = work(item)
+        except MemoryError as error:
+            found = "memory", str(error)
+        connection.send(found)
 
 
 def _processor_time(pid: int | None) -> float:

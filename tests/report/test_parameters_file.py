@@ -10,7 +10,7 @@ import pytest
 from small_sessions import BENCH, small
 
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
-from dlo_casadi.effects import ImageDistortion, RestCurvatureDrift
+from dlo_casadi.effects import BendingSoftening, ImageDistortion, RestCurvatureDrift
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -24,6 +24,7 @@ from dlo_casadi.report.parameters_file import (
     parameters_text,
 )
 from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import solved_by_ipopt
 from dlo_casadi.session.measure import read_poses
 
 
@@ -218,7 +219,10 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
         (lambda d: d.update(n=math.inf), "n must be a whole number, found inf: 2 to 2000 elements"),
         (lambda d: d.update(n=10**9), "n must be a whole number, found 1000000000: 2 to 2000"),
         (lambda d: d.update(n=20.5), "n must be a whole number, found 20.5"),
-        (lambda d: d.update(n_rest=100_000), "n_rest must be a whole number, found 100000: 4 to 64"),
+        (
+            lambda d: d.update(n_rest=100_000),
+            "n_rest must be a whole number, found 100000: 4 to 64",
+        ),
         (
             lambda d: d["cable"].update(bending_stiffness=1e-300),
             "cable.bending_stiffness: 1e-300 N m^2: 1e-12 to 1e+09 N m^2 is possible",
@@ -227,8 +231,14 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
             lambda d: d["cable"].update(length=1e-300),
             "cable.length: 1e-300 m: units are SI, 0.001 to 100 m is possible",
         ),
-        (lambda d: d.update(gravity=[0, 1e30]), "gravity: 1e+30 m/s^2: 0 to 10000 m/s^2 is possible"),
-        (lambda d: d["effects"][0].update(center=[0, 0]), "effects.0.center: length_error knows label"),
+        (
+            lambda d: d.update(gravity=[0, 1e30]),
+            "gravity: 1e+30 m/s^2: 0 to 10000 m/s^2 is possible",
+        ),
+        (
+            lambda d: d["effects"][0].update(center=[0, 0]),
+            "effects.0.center: length_error knows label",
+        ),
         (lambda d: d["effects"][0].update(label=[1]), "effects.0.label: something like '' belongs"),
     ],
 )
@@ -265,6 +275,15 @@ def test_values_at_their_bounds_are_read_as_they_were_written(outcome, tmp_path,
         model, p, _, metadata = load_parameters(path)
         assert dict(zip(model.names, p, strict=True)) == values  # every digit
         assert not metadata.edited
+
+
+def test_a_fit_that_ends_at_a_bound_can_be_read(outcome, tmp_path):
+    """IPOPT widens bounds by 1e-8 of them; here the softness would be -5e-10 m."""
+    fit, _ = fitted("short_clean", BendingSoftening(), n=10)
+    fit = solved_by_ipopt(fit)
+    assert fit.converged
+    assert fit.value("bending_softening.softness") == 0.0
+    assert np.array_equal(load_parameters(as_file(fit, outcome, tmp_path / "p.yaml")).p, fit.p)
 
 
 def test_a_missing_file_is_a_clear_error(tmp_path):
