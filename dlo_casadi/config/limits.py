@@ -55,18 +55,19 @@ STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
 GRAVITY = Range(0.0, 1.0e4, "m/s^2")
 # A frame whose origin is farther away is that of a map; of 1e3 m, doubles resolve 1e-13 m.
 COORDINATE = Range(-1.0e3, 1.0e3, "m")
-# Light has waves of 5e-7 m; a tenth of it is beyond any camera. Upwards: the cable's length.
+# A fifth of the wavelength of green light, beyond any camera. Upwards: the cable's length.
 _FINEST_STD = 1.0e-7
 # A nanometre over a metre is what interferometers resolve.
 _FINEST_TOLERANCE = 1.0e-9
 # A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
 PIXELS = Range(-1.0e6, 1.0e6, "px")
 FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
-# 1 for a fish-eye lens, in whose picture the terms cancel; a million is a slip.
+# Terms of a wide lens that cancel one another reach hundreds; a million is a slip.
 DISTORTION = Range(-1.0e6, 1.0e6, "")
 # A marker of a tenth of a millimetre has no pixels; ten metres are the side of a house.
 MARKER = Range(1.0e-4, 10.0, "m")
-# Elements: two have a middle; 2000 elements of a metre are shorter than the cable is thick.
+# Two elements have a joint between them; of a metre, 2000 are half a millimetre each, less than a
+# cable is thick.
 MESH = Range(2, 2000, "elements")
 # Cubic splines need four coefficients. A line of 240 points has four between two knots of 64; the
 # covariance that a result holds grows with their square.
