@@ -34,7 +34,7 @@ from dlo_casadi.effects import (
     StateEffect,
 )
 from dlo_casadi.errors import DloError
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.parameters import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.rest import RestCurvature
 
 StartKind = Literal["pinned", "clamped"]
@@ -137,8 +137,8 @@ class CableModel:
             "bending_stiffness",
             "N m^2",
             nominal=self.cable.bending_stiffness,
-            lower=1e-12,
-            upper=1e9,
+            lower=STIFFNESS_BOUNDS[0],
+            upper=STIFFNESS_BOUNDS[1],
             prior_std=STIFFNESS_PRIOR_STD,
             log=True,
         )

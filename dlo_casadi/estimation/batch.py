@@ -274,6 +274,8 @@ class _BatchNlp:
                 "ipopt.mu_init": 1e-6,
                 "ipopt.bound_push": 1e-9,
                 "ipopt.bound_frac": 1e-9,
+                # IPOPT widens bounds by 1e-8; what it returns must lie within them.
+                "ipopt.honor_original_bounds": "yes",
                 "ipopt.nlp_scaling_method": "none",
             },
         )
