@@ -79,7 +79,8 @@ def candidates(
     center : (float, float) or None [m]
         Middle of the photographs; None if there are none.
     n_poses : int
-        In the session's history; a drift needs two.
+        That are fitted. What a pose leaves behind, and how a force changes with the shape, takes
+        two to be seen: in one, a tether is a point force.
     exclude : sequence of str
         Effects that the user does not want to be tried.
     directions : (float, float) [rad]
@@ -125,6 +126,8 @@ def _applies(
         return model.end == "pinned"
     if name == "end_offset":
         return model.end != "free"
+    if name == "tether":
+        return n_poses > 1
     if issubclass(EFFECTS[name], StateEffect):
         return n_poses > 1 and model.rest.n_coefficients > 0
     return True

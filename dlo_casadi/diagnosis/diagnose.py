@@ -237,6 +237,11 @@ class _Search:
         return cross_validate(self.declared)
 
     @property
+    def error(self) -> float:
+        """Cross-validated error of the declared model [m], 0 where it tells nothing."""
+        return self.validation.rmse if self.validation.complete else 0.0
+
+    @property
     def astray(self) -> bool:
         """Whether the declared model cannot follow the poses that are left out."""
         return self.several and not self.validation.complete
@@ -334,7 +339,7 @@ class _Search:
         if not added and not fit.noise.declared:
             fit = settle(fit)
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
-        limit = max(UNSEEN * fit.noise.std, self.validation.rmse / 2)
+        limit = max(UNSEEN * fit.noise.std, self.error / 2)
         unpredicted = bool(added) and validation.rmse > limit
         unexplained = structure.p_value < self.significance or unpredicted
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
@@ -355,7 +360,7 @@ class _Search:
         explain. And all go if one force in each pose explains more than they do.
         """
         floor = found.fit.noise.std**2 + found.fit.fixture_error**2
-        after, before = (max(x.rmse**2 - floor, 0.0) for x in (found.validation, self.validation))
+        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.rmse, self.error))
         if after <= LEFT * before and not self._needless(found, pull):
             return found
         return self._ended(self.declared, [], found.ranked)
@@ -382,7 +387,7 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
     problem, shapes = fit.problem, fit.point.shapes
     directions = (float(shapes.phi[:, 0].mean()), float(shapes.phi[:, -1].mean()))
     bend = float(np.abs(problem.sweep.bends(shapes, fit.p, fit.rest)).max())
-    listed = candidates(fit.model, center, len(problem.history), exclude, directions, bend)
+    listed = candidates(fit.model, center, len(problem.used), exclude, directions, bend)
     return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
 
 
