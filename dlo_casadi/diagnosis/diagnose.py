@@ -47,7 +47,8 @@ BIC_APART = 10.0
 # noise, and than half of what it was without them.
 UNSEEN = 2.0
 # Of the mean square error that the declared model makes beyond the noise, what effects beside an
-# unexplained residual may leave.
+# unexplained residual may leave. Measured, without their cause: a force for a drift leaves 0.38,
+# a gradient, a scale and an offset for stretch 0.89; softening of a real glass-fibre strip 0.08.
 LEFT = 0.1
 
 
