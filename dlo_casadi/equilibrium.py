@@ -458,7 +458,7 @@ def _from_start(
         points=np.array(nodes),
         energy=float(energy),
         lam=end_force,
-        lam_start=total_dead_load(model, p) - end_force,
+        lam_start=np.array(model.start_force(phi, lam, *given)).ravel(),
         moments=moments,
         multipliers=lam,
         bound_multipliers=found.bound_lam,

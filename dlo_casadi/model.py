@@ -6,7 +6,8 @@ Every stage differentiates the same expression
 
 with the energy V of bending, weight and loads, the end conditions c = 0, and, for a cable of axial
 compliance C, the tension N_e = -(1/h) dL/d(length ratio of element e), which is exact for dead
-loads. An equilibrium is a stationary point; the chain's coordinates stay the headings alone.
+loads and leaves out terms of second order in the strain for others. An equilibrium is a stationary
+point; the chain's coordinates stay the headings alone.
 """
 
 from __future__ import annotations
@@ -536,7 +537,7 @@ class CableModel:
         curvature = self._curve().strain
         rest = self._rest
         for effect, local in self._slot(StateEffect):
-            rest = effect.next_rest(rest, curvature, local)
+            rest = effect.next_rest(rest, curvature, self.cable, local)
         blocks = [
             ca.densify(ca.jacobian(rest, symbol)) for symbol in (self._phi, self._rest, self._p)
         ]
@@ -548,6 +549,22 @@ class CableModel:
         lagrangian, curve = self._lagrangian
         work = ca.dot(self._lam, self._conditions(curve))
         return ca.Function("energy", self._arguments, [lagrangian - work, curve.nodes])
+
+    @cached_property
+    def start_force(self) -> ca.Function:
+        """Same arguments -> force (2,) [N] of the cable on its start, whatever the loads.
+
+        Minus the slope of the energy by the start's place, the end held: of the Lagrangian, with
+        headings and multipliers kept.
+        """
+        lagrangian, _ = self._lagrangian
+        slope = ca.gradient(lagrangian, self._ends)[:2]
+        return ca.Function("start_force", self._arguments, [ca.densify(-slope)])
+
+    @property
+    def shape_dependent_loads(self) -> tuple[str, ...]:
+        """Names of effects whose forces depend on the shape."""
+        return tuple(effect.name for effect, _ in self._slot(Load) if not effect.dead)
 
     @cached_property
     def dead_load(self) -> ca.Function:

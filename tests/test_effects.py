@@ -20,6 +20,7 @@ from dlo_casadi.effects import (
     ImageScale,
     Kinematics,
     LumpedMass,
+    PlasticSet,
     PointForce,
     RestCurvatureDrift,
     SectionLaw,
@@ -29,6 +30,7 @@ from dlo_casadi.effects import (
     StartSpring,
     StiffnessGradient,
     StiffSection,
+    Tether,
 )
 from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.model import DEVIATIONS, CableModel
@@ -225,6 +227,9 @@ def test_energy_of_loads(element):
     assert mass - none == pytest.approx(0.3 * 9.81 * nodes[2, 1], abs=1e-12)
     force, _ = energies((PointForce(),), [0.4, -0.7, s], element=element)
     assert force - none == pytest.approx(-0.4 * nodes[2, 0] + 0.7 * nodes[2, 1], abs=1e-12)
+    tether, _ = energies((Tether(),), [3.0, s, 0.2, 0.7], element=element)
+    stretched = np.array([0.2, 0.7]) - nodes[2]
+    assert tether - none == pytest.approx(1.5 * stretched @ stretched, abs=1e-12)
     # A side load q acts like gravity q L / m along x.
     side, _ = energies((SideLoad(),), [0.6], element=element)
     wind = (0.6 * CABLE.length / CABLE.mass, -9.81)
@@ -249,6 +254,54 @@ def test_loads_add_and_a_tilt_turns_every_weight():
     ]
     together, _ = energies(parts, values)
     assert together - none == pytest.approx(sum(alone), abs=1e-12)
+
+
+@ALL
+def test_reactions_carry_the_weight_and_the_pull_of_a_tether(element):
+    model = CableModel(CABLE, n=20, element=element, effects=(Tether(),))
+    anchor = np.array([0.3, 0.4])
+    p = np.array([0.05, 5.0, 0.4, *anchor])
+    found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), Pose((0.1, 0.0), (0.6, 0.1)))
+    loads = 5.0 * (anchor - found.points[10]) - [0.0, 9.81 * CABLE.mass]
+    # Bows enter the spring's energy to second order: k L bow^4, with bows of 0.01 rad.
+    np.testing.assert_allclose(found.lam + found.lam_start, loads, atol=1e-6)
+
+
+@ALL
+def test_a_tether_to_its_clamp_buckles_a_cable_at_eulers_load(element):
+    """A force k L at the tip, always towards the clamp: pi^2 EI / L^2  [Timoshenko and Gere]."""
+    model = CableModel(CABLE, 20, element, "clamped", "free", (0.0, 0.0), (Tether(),))
+    pose = Pose((0.0, 0.0), start_heading=0.0)
+    critical = np.pi**2 * 0.05 / CABLE.length**3
+    straight = np.zeros(model.chain.n_headings)
+    for share, stable in ((0.98, True), (1.02, False)):  # links: (pi / 20)^2 / 12 = 0.2 % off
+        p = np.array([0.05, share * critical, CABLE.length, 0.0, 0.0])
+        rest = np.zeros(model.chain.n_cells)
+        assert solve_equilibrium(model, p, rest, pose, phi_init=straight).stable is stable
+
+
+def test_a_soft_tether_to_a_far_anchor_is_a_point_force():
+    """Between its own parameters and those of its score test: f = k a, a within reach."""
+    effect, force = Tether(), {"fx": -0.6, "fy": 0.8, "position": 0.3}
+    far = effect.of_linear(CABLE, {"stiffness": 0.0, **force})
+    assert np.hypot(far["anchor_x"], far["anchor_y"]) == pytest.approx(10 * CABLE.length)
+    near = effect.of_linear(CABLE, {"stiffness": 2.0, **force})
+    assert (near["anchor_x"], near["anchor_y"]) == pytest.approx((-0.3, 0.4))
+    pose = Pose((0.0, 0.0), (0.5, 0.1))
+
+    def nodes(effect, values):
+        model = CableModel(CABLE, n=10, effects=(effect,))
+        p = np.array([0.05, *(values[q.name] for q in effect.parameters(CABLE))])
+        return solve_equilibrium(model, p, np.zeros(10), pose).points
+
+    moved = nodes(PointForce(), force)
+    none = nodes(PointForce(), {**force, "fx": 0.0, "fy": 0.0})
+    # The cable is within L of the origin, the anchor 10 L away.
+    gap = np.abs(nodes(effect, far) - moved).max()
+    assert gap < 0.1 * np.abs(moved - none).max()
+    np.testing.assert_allclose(
+        nodes(effect.linear(), {"stiffness": 0.0, **force}), moved, atol=1e-9
+    )
 
 
 # ---- section laws ------------------------------------------------------------------------------
@@ -379,8 +432,26 @@ def test_measurement_maps():
 
 def test_drift_moves_the_rest_curvature_towards_the_bend():
     rest, curvature = ca.SX(ca.DM([1.0, -2.0])), ca.SX(ca.DM([3.0, 2.0]))
-    after = RestCurvatureDrift().next_rest(rest, curvature, {"rate": ca.SX(0.25)})
+    after = RestCurvatureDrift().next_rest(rest, curvature, CABLE, {"rate": ca.SX(0.25)})
     np.testing.assert_allclose(number(after), [1.5, -1.0], rtol=1e-14)
+
+
+def test_a_plastic_set_is_what_a_bend_exceeds_the_yield_by():
+    bend = np.array([-7.0, -3.0, -1.0, 0.0, 1.0, 3.0, 7.0])
+    rest = ca.SX(ca.DM(np.linspace(-1.0, 2.0, 7)))
+
+    def left(limit):
+        params = {"yield_curvature": ca.SX(limit), "share": ca.SX(0.25)}
+        after = PlasticSet().next_rest(rest, rest + ca.DM(bend), CABLE, params)
+        return number(after - rest)
+
+    excess = np.sign(bend) * np.maximum(np.abs(bend) - 2.0, 0.0)
+    # Kinks rounded over d = 0.01 turns per length: d^2 / (4 |x|) = 0.0015 1/m at x = 1 1/m from
+    # either of them.
+    np.testing.assert_allclose(left(2.0), 0.25 * excess, atol=2 * 0.0015)
+    np.testing.assert_allclose(left(2.0), -left(2.0)[::-1], atol=1e-14)
+    # Without a yield curvature it is a drift, exactly.
+    np.testing.assert_allclose(left(0.0), 0.25 * bend, atol=1e-14)
 
 
 def test_an_effect_without_its_slot_says_so():

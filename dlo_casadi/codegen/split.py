@@ -68,6 +68,13 @@ class Split:
                 f"p has {len(self.p)} and rest {len(self.rest)} entries; the model has "
                 f"{len(model.parameters)} parameters and {model.chain.n_cells} cells"
             )
+        if model.shape_dependent_loads:
+            names = " and ".join(model.shape_dependent_loads)
+            raise DloError(
+                f"no solver can be generated for a cable with {names}: the force depends on the "
+                "shape, and the solver's elements know their neighbours only.\n"
+                "  Try: dlo predict, or dlo_casadi.predict, which know it."
+            )
         links = model.element == "link"
         self.first = int(links and model.start == "clamped")
         self.n_phi = model.chain.n_headings

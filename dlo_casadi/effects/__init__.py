@@ -23,12 +23,14 @@ from dlo_casadi.effects.image_distortion import ImageDistortion
 from dlo_casadi.effects.image_scale import ImageScale
 from dlo_casadi.effects.length_error import LengthError
 from dlo_casadi.effects.lumped_mass import LumpedMass
+from dlo_casadi.effects.plastic_set import PlasticSet
 from dlo_casadi.effects.point_force import PointForce
 from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
 from dlo_casadi.effects.side_load import SideLoad
 from dlo_casadi.effects.standoff_error import StandoffError
 from dlo_casadi.effects.stiff_section import StiffSection
 from dlo_casadi.effects.stiffness_gradient import StiffnessGradient
+from dlo_casadi.effects.tether import Tether
 from dlo_casadi.effects.unknown_pull import UnknownPull
 
 EFFECTS: dict[str, type[Effect]] = {
@@ -36,6 +38,7 @@ EFFECTS: dict[str, type[Effect]] = {
     for effect in (
         LumpedMass,
         PointForce,
+        Tether,
         SideLoad,
         GravityTilt,
         StiffnessGradient,
@@ -48,6 +51,7 @@ EFFECTS: dict[str, type[Effect]] = {
         ClampAngle,
         EndOffset,
         RestCurvatureDrift,
+        PlasticSet,
         ImageScale,
         ImageDistortion,
         StandoffError,
@@ -74,6 +78,7 @@ __all__ = [
     "Load",
     "LumpedMass",
     "MeasurementEffect",
+    "PlasticSet",
     "PointForce",
     "RestCurvatureDrift",
     "SectionLaw",
@@ -84,5 +89,6 @@ __all__ = [
     "StateEffect",
     "StiffSection",
     "StiffnessGradient",
+    "Tether",
     "UnknownPull",
 ]

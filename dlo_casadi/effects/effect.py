@@ -113,6 +113,18 @@ class Effect:
         """Parameters with units, bounds and the nominal value at which the effect vanishes."""
         raise TypeError(f"{type(self).__name__} declares no parameters")
 
+    def linear(self) -> Effect:
+        """Return the same effect, of the same label, in parameters for its score test.
+
+        Those are another choice where a parameter tells nothing at the value at which the effect
+        vanishes although the effect is linear in several at once.
+        """
+        return self
+
+    def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
+        """Own parameters from those of `linear`."""
+        return dict(values)
+
 
 class SectionLaw(Effect):
     """Slot `section`: how much the section resists bending. Section laws multiply."""
@@ -169,6 +181,8 @@ class Load(Effect):
     """Slot `load`: forces with a potential. Loads add; all share one gravity."""
 
     slot: ClassVar[str] = "load"
+    # Whether the forces stay the same whatever the shape.
+    dead: ClassVar[bool] = True
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
         """Return the direction and size of gravity (2,) [m/s^2] that every weight feels."""
@@ -214,6 +228,6 @@ class StateEffect(Effect):
 
     slot: ClassVar[str] = "state"
 
-    def next_rest(self, rest: ca.SX, curvature: ca.SX, params: Params) -> ca.SX:
+    def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Rest curvature (n_cells,) [1/m] after a pose of this curvature has been held."""
         raise TypeError(f"{self.name} has no law of the state")

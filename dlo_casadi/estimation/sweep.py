@@ -187,6 +187,12 @@ class Sweep:
         last = self.rests(shapes, p, rest)[-1]
         return self._after(self.m - 1, shapes, p, last)[0][:, 0]
 
+    def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """Curvature minus the rest curvature that each pose finds (m, n_cells) [1/m]."""
+        strain, rests = self.model.strain, self.rests(shapes, p, rest)
+        given = zip(shapes.phi, self._ends, shapes.deviation, strict=True)
+        return np.array([np.array(strain(*pose, p)).ravel() for pose in given]) - rests
+
     def _carry(
         self, shapes: Shapes, p: FloatArray, rests: FloatArray
     ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
