@@ -34,7 +34,8 @@ class Shapes:
     ----------
     x : (m, n_nodes, coordinates)
         States of the nodes: of a planar cable, headings [rad].
-    lam : (m, n_conditions)
+    lam : (m, n_border)
+        Multipliers of the end conditions; places and pulls of springs.
     deviation : (m, len(DEVIATIONS))
         What is different in every pose, see DEVIATIONS.
     """
@@ -57,24 +58,24 @@ class Shapes:
 class Given:
     """What the equilibria of m poses depend on.
 
-    `p` (m, n_parameters), `rest` (m, n_cells) [1/m], `ends` (m, 6) as declared.
+    `p` (m, n_parameters), `rest` (m, n_cells) [1/m], `poses` (m, POSE_SIZE) as declared.
     """
 
     p: FloatArray
     rest: FloatArray
-    ends: FloatArray
+    poses: FloatArray
 
     @classmethod
-    def of(cls, p: FloatArray, rest: FloatArray, ends: FloatArray) -> Given:
+    def of(cls, p: FloatArray, rest: FloatArray, poses: FloatArray) -> Given:
         """Parameters and rest curvature of each pose, or the same for all."""
-        m = len(ends)
+        m = len(poses)
         return cls(
-            np.broadcast_to(p, (m, p.shape[-1])), np.broadcast_to(rest, (m, rest.shape[-1])), ends
+            np.broadcast_to(p, (m, p.shape[-1])), np.broadcast_to(rest, (m, rest.shape[-1])), poses
         )
 
     def subset(self, index: Any) -> Given:
         """Those of some of the poses."""
-        return Given(self.p[index], self.rest[index], self.ends[index])
+        return Given(self.p[index], self.rest[index], self.poses[index])
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class Assembly:
     def __init__(self, model: CableModel) -> None:
         self.model = model
         self.chain, self.node = model.chain, model.chain.kind.node
-        self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_conditions
+        self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
         self._slots = self.chain.n_slots
         self._next = np.minimum(np.arange(self._slots) + 1, self.n - 1)
         self._own_rest = self.chain.rest_of_slots
@@ -168,7 +169,7 @@ class Assembly:
     def _call_ends(self, name: str, shapes: Shapes, given: Given) -> list[FloatArray]:
         """A function of both ends: outputs (m, rows, columns)."""
         both = np.concatenate([shapes.x[:, :1], shapes.x[:, -1:]], axis=2)
-        others = (shapes.lam, given.p, given.ends, shapes.deviation)
+        others = (shapes.lam, given.p, given.poses, shapes.deviation)
         rows = [both, *(one[:, None] for one in others)]
         return [out[:, 0] for out in self._mapped(name, 1)(*rows)]
 
@@ -244,7 +245,7 @@ class Assembly:
     def nodes(self, shapes: Shapes, given: Given) -> FloatArray:
         """True places (m, n + 1, 2) [m] of the element boundaries."""
         (advance,) = self._call_slots("slot_curve", shapes, given)
-        return self._stations(advance[..., 0], given.ends[:, :2])[0]
+        return self._stations(advance[..., 0], given.poses[:, :2])[0]
 
     def curve(self, shapes: Shapes, given: Given) -> FloatArray:
         """Measured places, and slopes dr/ds of smooth elements, (m, n + 1, 2 or 4)."""
@@ -256,10 +257,10 @@ class Assembly:
         self, name: str, advance: FloatArray, shapes: Shapes, given: Given
     ) -> list[FloatArray]:
         m, count = len(shapes.x), self.chain.n + 1
-        places, ratio = self._stations(advance, given.ends[:, :2])
+        places, ratio = self._stations(advance, given.poses[:, :2])
         x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
         p, ends = (
-            np.broadcast_to(a[:, None], (m, count, a.shape[1])) for a in (given.p, given.ends)
+            np.broadcast_to(a[:, None], (m, count, a.shape[1])) for a in (given.p, given.poses)
         )
         return self._mapped(name, count)(places, ratio, x, p, ends)
 
@@ -270,6 +271,11 @@ class Assembly:
             "station_slopes", advance[..., 0], shapes, given
         )
         return CurveSlopes(self, rows[..., 0], by_moving, by_others, by_station, by_p)
+
+    def start_force(self, shapes: Shapes, given: Given) -> FloatArray:
+        """Force (m, 2) [N] of the cable on whatever holds its start."""
+        rows = (shapes.lam, given.p, given.poses, shapes.deviation)
+        return self._mapped("start_force", 1)(*(row[:, None] for row in rows))[0][:, 0, :, 0]
 
     # ---- state and strain ------------------------------------------------------------------------
 

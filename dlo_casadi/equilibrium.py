@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import DEVIATIONS, Given, Shapes
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.initial import arc_headings, clamped_headings
+from dlo_casadi.initial import arc_headings, arc_into_clamps, limited, wrapped
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
+from dlo_casadi.rod.chain import Chain
 from dlo_casadi.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
 
+# Sign of the turning from start to end on a branch.
+SIGNS: dict[Branch, int] = {"ccw": 1, "cw": -1}
 # No joint bends by more than this between neighbouring headings (Eq. 8; joints only).
 JOINT_BOUND = np.pi / 2
 # Largest violation of an end condition [m or rad] of an accepted equilibrium.
@@ -48,8 +51,10 @@ class Pose:
     start_heading, end_heading : float [rad] or None
         Directions of clamped ends, continuous along the cable.
     branch : "ccw" or "cw", optional
-        Which way a pinned cable turns from start to end.
+        Which way the cable turns from start to end: the sign of `Equilibrium.turn`.
     name : str
+    camera_center : (float, float, float), optional [m]
+        Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
     """
 
     start: tuple[float, float]
@@ -58,12 +63,22 @@ class Pose:
     end_heading: float | None = None
     branch: Branch | None = None
     name: str = "pose"
+    camera_center: tuple[float, float, float] | None = None
+
+    @property
+    def ends(self) -> FloatArray:
+        """Start, end [m], start heading, end heading [rad] (6,)."""
+        end = self.end if self.end is not None else (0.0, 0.0)
+        return np.array([*self.start, *end, self.start_heading or 0.0, self.end_heading or 0.0])
 
     @property
     def vector(self) -> FloatArray:
-        """The model's argument `ends` (6,)."""
-        end = self.end if self.end is not None else (0.0, 0.0)
-        return np.array([*self.start, *end, self.start_heading or 0.0, self.end_heading or 0.0])
+        """The model's argument `pose` (9,): the ends, then what `effects.Sight` says of the camera.
+
+        Its centre (x, y, z) enters as (x, y, 1) / z: zeros for none, which sees from infinity.
+        """
+        x, y, z = self.camera_center or (0.0, 0.0, np.inf)
+        return np.concatenate([self.ends, np.array([x, y, 1.0]) / z])
 
 
 @dataclass(frozen=True)
@@ -83,8 +98,8 @@ class Equilibrium:
         Force of the cable on whatever holds its start.
     moments : (2,) [N m]
         Of the cable on its clamps (start, end); zero at pins.
-    multipliers : (n_conditions,)
-        All multipliers, in the order of `model.condition_names`.
+    multipliers : (n_border,)
+        Of the end conditions, places and pulls of springs: in the order of `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
         Of the joint bounds; zero where a joint bends freely.
     curvature : (n_cells,) [1/m]
@@ -128,6 +143,15 @@ class Equilibrium:
         return np.concatenate([self.phi[:1], np.diff(self.phi)])
 
     @property
+    def turn(self) -> float:
+        """Last minus first heading [rad], counter-clockwise positive."""
+        return float(self.phi[-1] - self.phi[0])
+
+    def turns(self, branch: Branch | None) -> bool:
+        """Whether the cable turns as the branch says; always for None."""
+        return branch is None or SIGNS[branch] * self.turn > 0
+
+    @property
     def stable(self) -> bool:
         """Whether the energy has a strict minimum here under the end conditions."""
         return self.status is Status.STABLE
@@ -148,6 +172,8 @@ def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
 # Minima of the potential and of the Lagrangian that lie within this are the same one [rad].
 NEARBY = 0.05
 NEWTON_STEPS = 8
+# In 690 solves of random problems of all boundaries IPOPT took 7 iterations (median), at most 84.
+IPOPT_ITERATIONS = 300
 # A joint so near to its bound is at it [rad].
 AT_BOUND = 1e-6
 
@@ -172,8 +198,7 @@ def _solver(key: int, holder: _Held) -> ca.Function:
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
             "ipopt.tol": 1e-11,
-            "ipopt.max_iter": 300,
-            "ipopt.max_cpu_time": 20.0,
+            "ipopt.max_iter": IPOPT_ITERATIONS,
         },
     )
 
@@ -205,48 +230,102 @@ def stats_of(solver: ca.Function) -> dict[str, Any]:
     return stats
 
 
-def guesses(model: CableModel, pose: Pose, rest: FloatArray) -> list[FloatArray]:
-    """First guesses of the headings, by boundary and branch.
-
-    Pinned: the two arcs of the cable's length through both ends (one, if the pose names its
-    branch) and the rest shape turned into the chord. Clamped: headings between the clamps with
-    three bows. A free end: along the start's direction, and hanging down.
-    """
-    chain = model.chain
-    places = chain.places
-    start = np.array(pose.start)
+def resting_headings(chain: Chain, rest: FloatArray) -> FloatArray:
+    """Headings (n_nodes,) of the cable at rest, counted from its start [rad]."""
     cells = chain.cells
     turn = np.concatenate([[0.0], np.cumsum(rest * np.diff(cells, axis=1).ravel())])
     edges = np.concatenate([cells[:1, 0], cells[:, 1]])
-    bent = np.interp(places, edges, turn)
-    down = np.arctan2(model.gravity[1], model.gravity[0]) if any(model.gravity) else 0.0
-    if pose.end is None:
-        first = pose.start_heading if pose.start_heading is not None else down
-        falling = down + (first - down + np.pi) % (2 * np.pi) - np.pi
-        fall = first + (down - falling) * (1 - np.exp(-4 * places / chain.length))
-        return [first + bent, fall, np.full_like(places, first)]
-    end = np.array(pose.end)
-    if model.start == "pinned" and model.end == "pinned":
-        sides = {"ccw": (1,), "cw": (-1,), None: (1, -1)}[pose.branch]
-        arcs = [arc_headings(places, chain.length, start, end, side) for side in sides]
-        chord = np.arctan2(end[1] - start[1], end[0] - start[0])
-        own = np.array([np.cos(bent).mean(), np.sin(bent).mean()])
-        return [*arcs, bent + chord - np.arctan2(own[1], own[0])]
-    heads = (
-        pose.start_heading if model.start == "clamped" else None,
-        pose.end_heading if model.end == "clamped" else None,
+    return np.interp(chain.places, edges, turn)
+
+
+def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> list[FloatArray]:
+    """First guesses of the headings, in the order in which they are tried.
+
+    Pinned at both ends:
+
+    1. the arc of the cable's length through both ends that turns counter-clockwise, and
+    2. the one that turns clockwise; a pose that names its branch swaps them;
+    3. the rest shape turned into the chord, if it turns by more than 0.05 rad;
+    4. a loop in the middle of a straight cable, counter-clockwise, and
+    5. clockwise; both if the rest shape turns by more than 1 rad and the loop has 4.5 elements.
+
+    With a clamp at one end or at both:
+
+    1. the counter-clockwise arc, bent into the headings of the clamps (`arc_into_clamps`), and
+    2. the clockwise one; a pose that names its branch swaps them;
+    3. and 4. the same on the other way around, where the nearer one bends by more than 1.5 rad.
+
+    With a free end:
+
+    1. the rest shape from the start on;
+    2. the cable falling down from the start's direction;
+    3. straight on.
+
+    In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings.
+    The generated solver tries the same ones: codegen/templates/guesses.c.in.
+
+    Parameters
+    ----------
+    p : (n_parameters,)
+    rest : (n_cells,) [1/m]
+    """
+    chain = model.chain
+    ends, length = model.held(p, pose.ends, 0)
+    start, end, headings = np.array(ends).reshape(3, 2)
+    u, chord = chain.places / chain.length, (end - start) / float(length)
+    held = tuple(side == "clamped" for side in (model.start, model.end))
+    clamps = (
+        float(headings[0]) if held[0] else None,
+        float(headings[1]) if held[1] else None,
     )
-    return [
-        clamped_headings(places, chain.length, end - start, *heads, bow) for bow in (0.0, 1.5, -1.5)
-    ]
+    bent = resting_headings(chain, rest)
+    sides = (-1, 1) if pose.branch == "cw" else (1, -1)
+    if model.end == "free":
+        found = _hanging(model, u, bent, clamps[0])
+    elif any(held):
+        pairs = [arc_into_clamps(u, chord, clamps, side) for side in sides]
+        found = [near for near, _ in pairs] + [far for _, far in pairs if far is not None]
+    else:
+        found = [arc_headings(u, 1.0, np.zeros(2), chord, side) for side in sides]
+        found += _curved(chain.n, u, bent, chord)
+    out = [limited(phi) for phi in found]
+    for phi in out:
+        phi[[0, -1]] = np.where(held, headings, phi[[0, -1]])
+    return out
 
 
-def check_reach(model: CableModel, pose: Pose, stretch: float = 1.0) -> None:
+def _hanging(
+    model: CableModel, u: FloatArray, bent: FloatArray, first: float | None
+) -> list[FloatArray]:
+    """Guesses for a cable with a free end; `first` is the clamp's heading."""
+    down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
+    if first is None:
+        first = down
+    fall = wrapped(down - first) * (1 - np.exp(-4 * u))
+    return [first + bent, first + fall, np.full_like(u, first)]
+
+
+def _curved(n: int, u: FloatArray, bent: FloatArray, chord: FloatArray) -> list[FloatArray]:
+    """Guesses for a cable of n elements between two pins that is curved at rest."""
+    direction, slack = np.arctan2(chord[1], chord[0]), 1 - float(np.hypot(*chord))
+    turning = np.ptp(bent)
+    found = []
+    if turning > 0.05:
+        bent = limited(bent)
+        found.append(bent + direction - np.arctan2(np.sin(bent).sum(), np.cos(bent).sum()))
+    if turning > 1.0 and slack * n > 4.5:
+        looped = 2 * np.pi * np.clip((u - 0.5) / slack + 0.5, 0.0, 1.0)
+        found += [direction + looped, direction - looped]
+    return found
+
+
+def check_reach(model: CableModel, p: FloatArray, pose: Pose) -> None:
     """Raise EquilibriumError when the end is farther away than the cable is long."""
     if pose.end is None or model.extensible:
         return
-    distance = float(np.hypot(*(np.array(pose.end) - np.array(pose.start))))
-    length = model.cable.length * stretch
+    ends, true_length = model.held(p, pose.ends, 0)
+    start, end, _ = np.array(ends).reshape(3, 2)
+    distance, length = float(np.hypot(*(end - start))), float(true_length)
     if distance >= length:
         raise EquilibriumError(
             f"no equilibrium: the end ({pose.end[0]:.4f}, {pose.end[1]:.4f}) m is {distance:.4f} m "
@@ -269,9 +348,10 @@ def solve_equilibrium(
 
         min V(phi)   s.t.   r(L) = end, clamped headings, |phi_(i+1) - phi_i| <= pi/2
 
-    Of the equilibria that the first guesses lead to, the stable one of lowest energy is returned;
-    of those on the branch that the pose names, where there is one. With `phi_init`, the one that
-    it leads to.
+    Of the equilibria that the first guesses lead to (see `guesses`), the stable one of lowest
+    energy is returned, an unstable one where no other is found. A pose that names its branch
+    gets one of that branch or none; between two pins the first stable one, as a rule that of the
+    branch's own arc. With `phi_init`, the equilibrium that it leads to.
 
     Parameters
     ----------
@@ -286,7 +366,8 @@ def solve_equilibrium(
     Raises
     ------
     EquilibriumError
-        If the end is out of reach or not finite, or no start leads to an equilibrium.
+        If the end is out of reach or not finite, no start leads to an equilibrium, or none to one
+        on the branch that the pose names.
 
     References
     ----------
@@ -300,25 +381,40 @@ def solve_equilibrium(
             pose.name,
             pose.end,
         )
-    named = dict(zip(model.names, p, strict=True))
-    stretch = 1 + named.get("length_error.length_difference", 0.0) / model.cable.length
-    check_reach(model, pose, stretch)
-    starts = [phi_init] if phi_init is not None else guesses(model, pose, rest)
-    found = [_from_start(model, p, rest, pose, start) for start in starts]
-    found = [eq for eq in found if eq.status is not Status.FAILED]
-    if pose.branch is not None:
-        sign = 1 if pose.branch == "ccw" else -1
-        on_branch = [eq for eq in found if sign * (eq.phi[-1] - eq.phi[0]) > 0]
-        found = on_branch or found
+    check_reach(model, p, pose)
+    starts = [phi_init] if phi_init is not None else guesses(model, p, rest, pose)
+    first_suffices = pose.branch is not None and (model.start, model.end) == ("pinned", "pinned")
+    found: list[Equilibrium] = []
+    for phi in starts:
+        eq = _from_start(model, p, rest, pose, phi)
+        if eq.status is Status.FAILED:
+            continue
+        found.append(eq)
+        if first_suffices and eq.stable and eq.turns(pose.branch):
+            break
+    where = "its end free" if pose.end is None else f"its end at {pose.end} m"
     if not found:
-        where = "its end free" if pose.end is None else f"its end at {pose.end} m"
         raise EquilibriumError(
             f"no equilibrium found from {len(starts)} first guesses with {where}.\n"
             "  Try: a finer mesh (model.n), or check the stiffness and the headings.",
             pose.name,
             pose.end,
         )
-    return min(found, key=lambda eq: (not eq.stable, eq.energy))
+    found.sort(key=lambda eq: (not eq.stable, eq.energy))
+    lowest = found[0]
+    for eq in found:
+        if eq.turns(pose.branch) and eq.stable is lowest.stable:
+            return eq
+    there = next((f"branch {branch}" for branch in SIGNS if lowest.turns(branch)), "neither branch")
+    kind = "stable equilibrium" if lowest.stable else "equilibrium"
+    raise EquilibriumError(
+        f"no {kind} found on the branch {pose.branch} from {len(starts)} first guesses with "
+        f"{where}: the lowest one, of {lowest.energy:.4g} J, turns by {lowest.turn:+.3g} rad from "
+        f"start to end ({there}).\n"
+        "  Try: the other branch, or none.",
+        pose.name,
+        pose.end,
+    )
 
 
 def _from_start(
@@ -329,21 +425,21 @@ def _from_start(
     solver = _solver(id(model), _Held(model))
     deviation = np.zeros(len(DEVIATIONS))
     given = Given.of(p, rest, pose.vector[None])
-    x0 = np.concatenate([phi, np.zeros(model.n_inner * chain.n_slots)])
-    bounds = np.zeros(model.n_conditions + chain.n_nodes - 1)
-    bounds[model.n_conditions :] = JOINT_BOUND
+    x0 = np.concatenate([phi, np.zeros(2 * model.n_springs + model.n_inner * chain.n_slots)])
+    bounds = np.zeros(model.n_multipliers + chain.n_nodes - 1)
+    bounds[model.n_multipliers :] = JOINT_BOUND
     parameters = np.concatenate([p, rest, pose.vector, deviation])
     out = solver(x0=x0, p=parameters, lbg=-bounds, ubg=bounds)
     stats = stats_of(solver)
     multipliers = np.array(out["lam_g"]).ravel()
-    start = Shapes(
-        np.array(out["x"]).ravel()[None, : chain.n_nodes, None],
-        multipliers[None, : model.n_conditions],
-        deviation[None],
-    )
+    coordinates, places = np.array(out["x"]).ravel(), 2 * model.n_springs
+    border = np.zeros(model.n_border)
+    border[model.are_multipliers] = multipliers[: model.n_multipliers]
+    border[~model.are_multipliers] = coordinates[chain.n_nodes : chain.n_nodes + places]
+    start = Shapes(coordinates[None, : chain.n_nodes, None], border[None], deviation[None])
     # Whatever IPOPT says of its end (on fine meshes of stiff cables its tolerance lies below
     # rounding), what counts is whether the shape that is returned balances.
-    found = _balanced(model, start, multipliers[model.n_conditions :], given)
+    found = _balanced(model, start, multipliers[model.n_multipliers :], given)
     energy = float(model.assembly.energy(found.shapes, given)[0])
     if not found.holds or not np.isfinite(energy):
         status = Status.FAILED
@@ -356,7 +452,7 @@ def _from_start(
         points=model.assembly.nodes(found.shapes, given)[0],
         energy=energy,
         lam=end_force,
-        lam_start=total_dead_load(model, p) - end_force,
+        lam_start=model.assembly.start_force(found.shapes, given)[0],
         moments=moments,
         multipliers=found.shapes.lam[0],
         bound_multipliers=found.bound_lam,
@@ -400,9 +496,9 @@ def _balanced(
             now = replace(
                 now,
                 x=model.chain.kind.node.moved(now.x, step.x[..., 0]),
-                lam=now.lam + step.y[:, : model.n_conditions, 0],
+                lam=now.lam + step.y[:, : model.n_border, 0],
             )
-            pulls = pulls + step.y[0, model.n_conditions :, 0]
+            pulls = pulls + step.y[0, model.n_border :, 0]
             if size < 1e-12:
                 break
         if not np.any(pulls * np.sign(bound) < 0):
@@ -416,7 +512,7 @@ def _balanced(
     inside = bool(np.abs(_bends(model, now)).max() < JOINT_BOUND + AT_BOUND)
     holds = imbalance <= BALANCE * float(matrix.scale[0]) and residual <= END_TOLERANCE
     stable = np.isfinite(matrix.scale[0]) and (
-        int(matrix.factor().negative[0]) == model.n_conditions + len(held)
+        int(matrix.factor().negative[0]) == model.n_multipliers + len(held)
     )
     return _Balance(now, bound_lam, residual, holds and inside, bool(stable))
 
@@ -447,7 +543,7 @@ def _bordered(
 
 def split_multipliers(model: CableModel, lam: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Force on the end's holder (2,) [N] and moments of clamped headings (start, end) [N m]."""
-    named = dict(zip(model.condition_names, lam, strict=True))
+    named = dict(zip(model.border_names, lam, strict=True))
     force = np.array([named.get("end_position_x", 0.0), named.get("end_position_y", 0.0)])
     moments = np.array([named.get("start_heading", 0.0), named.get("end_heading", 0.0)])
     return force, moments

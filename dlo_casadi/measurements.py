@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from dlo_casadi.config.problems import show
 from dlo_casadi.durable import write_file
 from dlo_casadi.errors import MeasurementError
 
@@ -17,6 +18,9 @@ HEADER = ["x_m", "y_m"]
 
 _LONGEST = 100.0
 """Length of a centre-line [m] from which on it is not in metres."""
+
+_LARGEST = 20_000_000
+"""Bytes of a file: half a million points, measured to take two seconds."""
 
 _SAME_POINT = 1e-9
 """Distance [m] below which two points in a row are one."""
@@ -102,23 +106,35 @@ def write_centerline(path: str | Path, points: npt.ArrayLike) -> None:
 def _parse(source: Path) -> npt.NDArray[np.float64]:
     """Read header and numbers; (K, 2) with K >= 0."""
     try:
-        lines = source.read_text(encoding="utf-8-sig").splitlines()
+        with source.open("rb") as file:
+            content = file.read(_LARGEST + 1)
+        lines = content.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise MeasurementError("is not a text file", pose=source.name) from None
     except OSError as error:
         raise MeasurementError(f"cannot be read: {error.strerror}", pose=source.name) from None
+    if len(content) > _LARGEST:
+        raise MeasurementError(
+            f"is larger than {_LARGEST} bytes; keep every tenth point, a few hundred suffice",
+            pose=source.name,
+        )
 
-    rows = [
-        (number, [cell.strip() for cell in next(csv.reader([line]))])
-        for number, line in enumerate(lines, start=1)
-        if line.strip()
-    ]
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            cells = next(csv.reader([line]), [])
+        except csv.Error as error:
+            raise MeasurementError(
+                f"line {number}: {error}; two numbers x,y belong here", pose=source.name
+            ) from None
+        if any(cell.strip() for cell in cells) or len(cells) > 1:
+            rows.append((number, [cell.strip() for cell in cells]))
     if not rows:
         raise MeasurementError("is empty; a header x_m,y_m and points belong here", source.name)
     number, header = rows[0]
     if header != HEADER:
         raise MeasurementError(
-            f"line {number}: the header must be x_m,y_m (metres), found {lines[number - 1]!r}",
+            f"line {number}: the header must be x_m,y_m (metres), found {show(lines[number - 1])}",
             pose=source.name,
         )
     return np.array([_point(source, *row) for row in rows[1:]]).reshape(-1, 2)
@@ -127,7 +143,8 @@ def _parse(source: Path) -> npt.NDArray[np.float64]:
 def _point(source: Path, number: int, cells: list[str]) -> tuple[float, float]:
     if len(cells) != 2:
         raise MeasurementError(
-            f"line {number}: two numbers x,y belong here, found {len(cells)}: {','.join(cells)!r}",
+            f"line {number}: two numbers x,y belong here, found {len(cells)}: "
+            f"{show(','.join(cells))}",
             pose=source.name,
         )
     values = []
@@ -136,12 +153,12 @@ def _point(source: Path, number: int, cells: list[str]) -> tuple[float, float]:
             values.append(float(cell))
         except ValueError:
             raise MeasurementError(
-                f"line {number}: {cell!r} is not a number", pose=source.name
+                f"line {number}: {show(cell)} is not a number", pose=source.name
             ) from None
         if not math.isfinite(values[-1]):
             raise MeasurementError(
-                f"line {number}: {cell!r} is not a finite number; leave out the points that were "
-                "not measured, gaps are allowed",
+                f"line {number}: {show(cell)} is not a finite number; leave out the points that "
+                "were not measured, gaps are allowed",
                 pose=source.name,
             )
     return values[0], values[1]

@@ -30,10 +30,12 @@ from dlo_casadi.effects import (
     MeasurementEffect,
     PointForceAt,
     SectionLaw,
+    Sight,
+    SpringAt,
     StateEffect,
 )
 from dlo_casadi.errors import DloError
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.parameters import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.rest import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
 from dlo_casadi.rod.element import Cell, Slot
@@ -45,6 +47,8 @@ FloatArray = NDArray[np.floating]
 BENDING_STIFFNESS = "bending_stiffness"
 # ln(1000): a prior of the stiffness may be off by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
+# Numbers that declare one pose: its ends (6) and its camera (3), see `equilibrium.Pose.vector`.
+POSE_SIZE = 9
 
 
 @dataclass(frozen=True)
@@ -151,8 +155,8 @@ class CableModel:
             BENDING_STIFFNESS,
             "N m^2",
             nominal=self.cable.bending_stiffness,
-            lower=1e-12,
-            upper=1e9,
+            lower=STIFFNESS_BOUNDS[0],
+            upper=STIFFNESS_BOUNDS[1],
             prior_std=STIFFNESS_PRIOR_STD,
             log=True,
         )
@@ -211,9 +215,18 @@ class CableModel:
         return ca.SX.sym("p", len(self.parameters))
 
     @cached_property
+    def _pose(self) -> ca.SX:
+        """What is declared of one pose, see `equilibrium.Pose.vector`."""
+        return ca.SX.sym("pose", POSE_SIZE)
+
+    @property
     def _ends(self) -> ca.SX:
         """Start (2), end (2), start heading, end heading as declared."""
-        return ca.SX.sym("ends", 6)
+        return self._pose[:6]
+
+    @property
+    def _sight(self) -> Sight:
+        return Sight(self._pose[:2], self._pose[6:8], self._pose[8])
 
     @cached_property
     def _deviation(self) -> ca.SX:
@@ -222,7 +235,8 @@ class CableModel:
 
     @cached_property
     def _lam(self) -> ca.SX:
-        return ca.SX.sym("lam", self.n_conditions)
+        """Border: multipliers of the end conditions, then place and pull of each spring."""
+        return ca.SX.sym("lam", self.n_border)
 
     @cached_property
     def _nodes(self) -> tuple[ca.SX, ca.SX]:
@@ -244,6 +258,42 @@ class CableModel:
     def n_conditions(self) -> int:
         """Number of end conditions."""
         return len(self.condition_names)
+
+    @property
+    def n_springs(self) -> int:
+        """Number of springs from places of the cable."""
+        return sum(effect.n_springs for effect in self.effects if isinstance(effect, Load))
+
+    @property
+    def n_border(self) -> int:
+        """Number of unknowns of the whole pose: `border_names`."""
+        return len(self.border_names)
+
+    @cached_property
+    def border_names(self) -> tuple[str, ...]:
+        """Names of the unknowns beside the nodes: end conditions' multipliers, then springs'.
+
+        A spring's place y [m] is an unknown of its own, held on the cable by its pull [N]: so that
+        no node knows more than its neighbours, see `SpringAt`.
+        """
+        own = ("place_x", "place_y", "pull_x", "pull_y")
+        springs = [f"spring_{k}.{name}" for k in range(self.n_springs) for name in own]
+        return (*self.condition_names, *springs)
+
+    @property
+    def n_multipliers(self) -> int:
+        """How many of them are multipliers: negative eigenvalues of the tangent at a minimum."""
+        return self.n_conditions + 2 * self.n_springs
+
+    @cached_property
+    def are_multipliers(self) -> NDArray[np.bool_]:
+        """Which of the border's unknowns are multipliers (n_border,); the others are places."""
+        return np.array([".place_" not in name for name in self.border_names], dtype=bool)
+
+    def _spring_unknowns(self, k: int) -> tuple[ca.SX, ca.SX]:
+        """Place and pull of a spring."""
+        own = self._lam[self.n_conditions + 4 * k : self.n_conditions + 4 * (k + 1)]
+        return own[:2], own[2:]
 
     @cached_property
     def condition_names(self) -> tuple[str, ...]:
@@ -276,6 +326,14 @@ class CableModel:
         for effect, local in self._filling(BoundaryEffect):
             ends = effect.conditions(ends, local)
         return ends
+
+    @cached_property
+    def held(self) -> ca.Function:
+        """(p, ends, deviation) -> where the ends really are (6,), length without load [m]."""
+        ends = self._held
+        where = ca.vertcat(ends.start, ends.end, ends.start_heading, ends.end_heading)
+        length = self.cable.length * self._stretch
+        return ca.Function("held", [self._p, self._ends, self._deviation], [where, length])
 
     @cached_property
     def _stretch(self) -> ca.SX:
@@ -325,6 +383,11 @@ class CableModel:
             for effect, local in self._filling(Load)
             for force in effect.forces(self._gravity, local)
         ]
+
+    @cached_property
+    def _springs(self) -> list[SpringAt]:
+        """Springs from places of the cable."""
+        return [spring for effect, local in self._filling(Load) for spring in effect.springs(local)]
 
     @cached_property
     def _total_load(self) -> ca.SX:
@@ -388,25 +451,29 @@ class CableModel:
 
     @cached_property
     def _shares(self) -> ca.SX:
-        """Shares of a slot up to which the forces on single places have it advance, 0 to 1."""
-        return ca.SX.sym("share", len(self._forces))
+        """Shares of a slot up to the places of the forces, then of the springs, 0 to 1."""
+        return ca.SX.sym("share", len(self._forces) + self.n_springs)
 
     @cached_property
     def shares(self) -> ca.Function:
-        """(p, place) -> the shares of a slot (n_forces,)."""
+        """(p, place) -> the shares of a slot (n_forces + n_springs,)."""
         start = self._place[0]
-        found = [
-            ca.fmin(ca.fmax((force.position - start) / self.chain.h, 0), 1)
-            for force in self._forces
-        ]
+        positions = [local.position for local in self._forces]
+        positions += [local.position for local in self._springs]
+        found = [ca.fmin(ca.fmax((s - start) / self.chain.h, 0), 1) for s in positions]
         return ca.Function("shares", [self._p, self._place], [ca.vertcat(ca.SX.zeros(0), *found)])
 
     def _with_shares(self, expressions: list[ca.SX]) -> list[ca.SX]:
         return ca.substitute(expressions, [self._shares], [self.shares(self._p, self._place)])
 
-    def _pull(self, advance: ca.SX) -> ca.SX:
-        """Work of the end's multipliers along a slot [J]."""
-        return ca.SX(0) if self.end == "free" else ca.dot(self._lam[:2], advance)
+    def _pull(self, slot: Slot) -> ca.SX:
+        """Work of the multipliers of places, the end's and the springs', along a slot [J]."""
+        kind = self.chain.kind
+        work = ca.SX(0) if self.end == "free" else ca.dot(self._lam[:2], kind.advance(slot))
+        shares = ca.vertsplit(self._shares)[len(self._forces) :] if self.n_springs else []
+        for k, share in enumerate(shares):
+            work += ca.dot(self._spring_unknowns(k)[1], kind.advance(slot, share))
+        return work
 
     @cached_property
     def _terms(self) -> _SlotTerms:
@@ -432,7 +499,7 @@ class CableModel:
         kind, h = self.chain.kind, self.chain.h
         ratio, inner = ca.SX.sym("ratio"), ca.SX.sym("inner", kind.n_inner)
         slot = self._slot(ratio, inner, inner**2)
-        plain = self._slot_energy(slot) + self._pull(kind.advance(slot))
+        plain = self._slot_energy(slot) + self._pull(slot)
 
         def rigid(expression: ca.SX) -> ca.SX:
             return ca.substitute(expression, ratio, self._stretch)
@@ -462,9 +529,12 @@ class CableModel:
         gaps = [] if self.end == "free" else [held.start - held.end]
         gaps += [first - held.start_heading] if self.start == "clamped" else []
         gaps += [last - held.end_heading] if self.end == "clamped" else []
-        total = ca.dot(self._lam, ca.vertcat(*gaps)) if gaps else ca.SX(0)
+        total = ca.dot(self._lam[: self.n_conditions], ca.vertcat(*gaps)) if gaps else ca.SX(0)
         for effect, local in self._filling(BoundaryEffect):
             total += effect.energy(first, last, local)
+        for k, spring in enumerate(self._springs):
+            place, pull = self._spring_unknowns(k)
+            total += spring.energy(place) + ca.dot(pull, held.start - place)
         return total - ca.dot(self._total_load, held.start)
 
     @property
@@ -474,8 +544,9 @@ class CableModel:
 
     @cached_property
     def slot_potential(self) -> ca.Function:
-        """(x, lam, p, rest, place, deviation, inner) -> energy [J] to minimise, advance [m].
+        """(x, lam, p, rest, place, deviation, inner) -> energy [J] to minimise, and conditions.
 
+        The slot's share (n_border,) of the conditions on places is the slope by the multipliers.
         The unknowns inside are, for an extensible cable, a_e with the axial strain sqrt(C) a_e and
         the energy h a_e^2 / 2, and the element's own.
         """
@@ -488,21 +559,10 @@ class CableModel:
         slot = self._slot(ratio, inner, inner**2)
         energy = kind.expanded(slot, self._slot_energy(slot)) + self.chain.h * axial**2 / 2
         own = ca.reshape(unknowns[self.n_inner - kind.n_inner :], inner.shape)
-        outputs = ca.substitute([energy, kind.advance(slot)], [inner], [own])
+        reached = ca.gradient(self._pull(slot), self._lam)
+        outputs = ca.substitute([energy, reached], [inner], [own])
         arguments = [*self._slot_arguments, unknowns]
         return self._here("slot_potential", arguments, self._with_shares(outputs))
-
-    def true_length(self, p: FloatArray) -> float:
-        """Length [m] of the unloaded cable, whatever effects change it."""
-        function = ca.Function("length", [self._p], [self.cable.length * self._stretch])
-        return float(function(p))
-
-    def end_offsets(self, p: FloatArray) -> FloatArray:
-        """Held minus declared start (2), end (2) [m] and headings of start and end [rad] (6,)."""
-        held = self._held
-        where = ca.vertcat(held.start, held.end, held.start_heading, held.end_heading)
-        arguments = [self._ends, self._p, self._deviation]
-        return np.array(ca.Function("held", arguments, [where])(0, p, 0)).ravel()
 
     # ---- functions of a slot, an end, a node ---------------------------------------------------
 
@@ -514,7 +574,7 @@ class CableModel:
     @property
     def _end_arguments(self) -> list[ca.SX]:
         x, _ = self._nodes
-        return [x, self._lam, self._p, self._ends, self._deviation]
+        return [x, self._lam, self._p, self._pose, self._deviation]
 
     @property
     def _moving(self) -> ca.SX:
@@ -538,7 +598,7 @@ class CableModel:
 
     @cached_property
     def at_ends(self) -> ca.Function:
-        """(x, lam, p, ends, deviation) of the first and last node -> as `slot`."""
+        """(x, lam, p, pose, deviation) of the first and last node -> as `slot`."""
         return self._derivatives("at_ends", self._at_ends, self._end_arguments)
 
     def _mixed(self, name: str, value: ca.SX, arguments: list[ca.SX], by: ca.SX) -> ca.Function:
@@ -585,11 +645,11 @@ class CableModel:
         image = point
         maps = self._filling(MeasurementEffect)
         for effect, local in maps:
-            image = effect.observe(image, heading, self._ends[:2], local)
+            image = effect.observe(image, heading, self._sight, local)
         rows = image
         if kind.smooth:
             rows = ca.vertcat(image, ca.jtimes(image, point, slope) if maps else slope)
-        arguments = [point, ratio, x, self._p, self._ends]
+        arguments = [point, ratio, x, self._p, self._pose]
         return arguments, rows, ca.vertcat(point, ratio, delta)
 
     @cached_property
@@ -623,10 +683,25 @@ class CableModel:
         slot = self._slot(self._stretch, ca.SX.zeros(kind.n_inner), ca.SX(0))
         curvature, mean = kind.strain(slot), self._rest[0]
         for effect, local in self._filling(StateEffect):
-            mean = effect.next_rest(mean, curvature, local)
+            mean = effect.next_rest(mean, curvature, self.cable, local)
         by = (self._nodes[1], self._rest[0], self._p)
         blocks = [ca.jacobian(mean, symbols) for symbols in by]
         return self._here("slot_state", self._slot_arguments, [mean, *blocks])
+
+    @cached_property
+    def start_force(self) -> ca.Function:
+        """(lam, p, pose, deviation) -> force (2,) [N] of the cable on its start.
+
+        Minus the slope of the Lagrangian by the start's place, nodes and multipliers kept.
+        """
+        slope = ca.gradient(self._at_ends, self._pose)[:2]
+        arguments = self._end_arguments[1:]
+        return ca.Function("start_force", arguments, [ca.densify(-slope)])
+
+    @property
+    def shape_dependent_loads(self) -> tuple[str, ...]:
+        """Names of effects whose forces depend on the shape."""
+        return tuple(effect.name for effect, _ in self._filling(Load) if not effect.dead)
 
     @cached_property
     def dead_load(self) -> ca.Function:

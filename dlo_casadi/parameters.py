@@ -7,6 +7,11 @@ from math import inf, isfinite
 
 from dlo_casadi.errors import DloError
 
+# Bounds of a bending stiffness [N m^2]: below a carbon fibre's, above a steel bar's.
+STIFFNESS_BOUNDS = (1e-12, 1e9)
+# So many typical changes from its nominal value a parameter without bounds may be declared.
+_FARTHEST = 1e6
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -53,6 +58,12 @@ class Parameter:
             )
         if self.log and self.nominal <= 0:
             raise DloError(f"parameter {self.name}: a logarithmic parameter must be positive")
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """From where to where a declared value may lie: finite, where a bound is not."""
+        away = _FARTHEST * self.scale
+        return max(self.lower, self.nominal - away), min(self.upper, self.nominal + away)
 
     def with_prior(self, std: float) -> Parameter:
         """Return the same parameter with a prior of this standard deviation."""

@@ -152,14 +152,15 @@ def predict(
         Directions of clamped ends, continuous along the cable; those that all poses of the
         session shared by default.
     branch : "ccw" or "cw", optional
-        Which way a pinned cable turns from start to end.
+        Which way the cable turns from start to end.
 
     Raises
     ------
     ConfigError
         If the file cannot be used.
     EquilibriumError
-        If the pose has no equilibrium, e.g. because the end is out of reach.
+        If the pose has no equilibrium, e.g. because the end is out of reach, or none is found on
+        the branch.
     DloError
         If the ends are not held as the cable's boundary asks, or are no finite numbers.
     """

@@ -7,24 +7,25 @@ from itertools import pairwise
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from dlo_casadi.assembly import DEVIATIONS
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import POSE_SIZE, CableModel
 
 
 @dataclass(frozen=True)
 class PoseSymbols:
     """What a pose's expressions depend on.
 
-    `x` (n_nodes coordinates,), `lam` (n_conditions,), `p` (n_parameters,), `rest` (n_cells,) [1/m],
-    `ends` (6,), `deviation` (len(DEVIATIONS),).
+    `x` (n_nodes coordinates,), `lam` (n_border,), `p` (n_parameters,), `rest` (n_cells,) [1/m],
+    `pose` (POSE_SIZE,), `deviation` (len(DEVIATIONS),).
     """
 
     x: ca.SX
     lam: ca.SX
     p: ca.SX
     rest: ca.SX
-    ends: ca.SX
+    pose: ca.SX
     deviation: ca.SX
 
     @classmethod
@@ -33,10 +34,10 @@ class PoseSymbols:
         chain = model.chain
         return cls(
             ca.SX.sym("x", chain.n_nodes * chain.kind.node.coordinates),
-            ca.SX.sym("lam", model.n_conditions),
+            ca.SX.sym("lam", model.n_border),
             ca.SX.sym("p", len(model.parameters)),
             ca.SX.sym("kappa_0", chain.n_cells),
-            ca.SX.sym("ends", 6),
+            ca.SX.sym("pose", POSE_SIZE),
             ca.SX.sym("deviation", len(DEVIATIONS)),
         )
 
@@ -45,7 +46,7 @@ class PoseSymbols:
 class Potential:
     """A minimisation over one pose: symbols (coordinates, parameters), energy [J], conditions.
 
-    The parameters stack p, rest curvature of the cells, ends, deviation.
+    The parameters stack p, rest curvature of the cells, pose, deviation.
     """
 
     coordinates: ca.SX
@@ -57,21 +58,23 @@ class Potential:
 def potential(model: CableModel) -> Potential:
     """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
 
-    The coordinates are the nodes', then the unknowns inside the slots.
+    The coordinates are the nodes', the places of springs, then the unknowns inside the slots.
     """
     s, chain = PoseSymbols.of(model), model.chain
     inner = ca.SX.sym("inner", model.n_inner, chain.n_slots)
     energy, gradient, _ = model.at_ends(*_end_arguments(model, s))
     conditions = gradient[2 * chain.kind.node.increment :]
     for j, arguments in enumerate(_slot_arguments(model, s)):
-        own, advance = model.slot_potential(*arguments, inner[:, j])
-        energy += own
-        if model.end != "free":
-            conditions[:2] += advance
-    zero = ca.SX.zeros(model.n_conditions)
-    energy, conditions = ca.substitute([energy, conditions], [s.lam], [zero])
-    parameters = ca.vertcat(s.p, s.rest, s.ends, s.deviation)
-    return Potential(ca.vertcat(s.x, ca.vec(inner)), parameters, energy, conditions)
+        own, reached = model.slot_potential(*arguments, inner[:, j])
+        energy, conditions = energy + own, conditions + reached
+    multipliers = np.flatnonzero(model.are_multipliers).tolist()
+    places = np.flatnonzero(~model.are_multipliers).tolist()
+    zero = ca.SX.zeros(len(multipliers))
+    given = [energy, conditions[multipliers]]
+    energy, conditions = ca.substitute(given, [s.lam[multipliers]], [zero])
+    parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
+    coordinates = ca.vertcat(s.x, s.lam[places], ca.vec(inner))
+    return Potential(coordinates, parameters, energy, conditions)
 
 
 def balance(model: CableModel, s: PoseSymbols) -> ca.SX:
@@ -103,10 +106,10 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
         *((a + b) / 2 for a, b in pairwise(ratios)),
         ratios[-1],
     ]
-    point, rows = s.ends[:2], []
+    point, rows = s.pose[:2], []
     for i, (first, last) in enumerate(layout.stations):
         both = ca.vertcat(s.x[first * c : (first + 1) * c], s.x[last * c : (last + 1) * c])
-        rows.append(model.station(point, ratios[i], both, s.p, s.ends))
+        rows.append(model.station(point, ratios[i], both, s.p, s.pose))
         if i < chain.n:
             point = point + steps[i][:2]
     return ca.vertcat(*rows)
@@ -122,7 +125,7 @@ def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
 def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
     c = model.chain.kind.node.coordinates
     both = ca.vertcat(s.x[:c], s.x[s.x.numel() - c :])
-    return [both, s.lam, s.p, s.ends, s.deviation]
+    return [both, s.lam, s.p, s.pose, s.deviation]
 
 
 def _slot_arguments(model: CableModel, s: PoseSymbols) -> list[list[ca.SX]]:

@@ -36,8 +36,10 @@ NAMES = {
     "softening": ("bending_softening", ("curvature_scale",)),
     "length": ("length_error", ("length_difference",)),
     "creep": ("rest_curvature_drift", ("rate",)),
+    "tether": ("tether", ("position", "stiffness", "anchor_x", "anchor_y")),
     "stiff_section": ("stiff_section", ("start", "end", "factor")),
     "extens": ("axial_stretch", ("axial_stiffness",)),
+    "standoff": ("standoff_error", ("distance",)),
     "clamp_error": ("clamp_angle", ("start_heading_error", "end_heading_error")),
 }
 
@@ -50,7 +52,7 @@ def config_of(name: str) -> Path:
 
 
 def true_effects(name: str) -> dict[str, dict[str, float]]:
-    """Effects that are in a session, by their names here; a tether is on nobody's list."""
+    """Effects that are in a session, by their names here."""
     truth = yaml.safe_load((TRUTH / name / "truth.yaml").read_text())
     found: dict[str, dict[str, float]] = {}
     for key, value in truth["effects"].items():
@@ -60,12 +62,10 @@ def true_effects(name: str) -> dict[str, dict[str, float]]:
                 found["start_spring"] = {"stiffness": k0, "heading": h0}
             if k1:
                 found["end_spring"] = {"stiffness": k1, "heading": h1}
-        elif key in NAMES:
+        else:
             effect, parameters = NAMES[key]
             values = value if isinstance(value, list) else [value]
             found[effect] = dict(zip(parameters, values, strict=True))
-        else:
-            found[key] = {}
     return found
 
 
@@ -185,7 +185,7 @@ def run_one(name: str, without_true_effect: bool) -> dict:
     """Run one session and compare."""
     config = load_config(config_of(name))
     if without_true_effect:
-        hidden = tuple(n for n in true_effects(name) if n != "tether")
+        hidden = tuple(true_effects(name))
         config = replace(config, diagnosis=config.diagnosis.model_copy(update={"exclude": hidden}))
     return compare(name, run_session(config))
 

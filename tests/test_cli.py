@@ -1,5 +1,6 @@
 """The commands: what they print, write and return."""
 
+import io
 import json
 import signal
 import subprocess
@@ -8,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from dlo_casadi.cli import fit as fit_command
 from dlo_casadi.cli import main
 from dlo_casadi.cli.predict import plain_numbers
+from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import dump_yaml, read_yaml
 
 ROOT = Path(__file__).parents[1]
@@ -65,6 +68,23 @@ def test_fit_prints_tables_and_progress_apart(run):
     assert "Results: results/rope" in text
     assert "read the poses:" in done.stderr
     assert "write the results:" in done.stderr
+
+
+def test_what_may_take_long_is_told_first(config, monkeypatch, capsys):
+    many = config.with_name("many.yaml")
+    many.write_text(config.read_text().replace("n: 20", "n: 300"))
+    monkeypatch.setattr(fit_command, "run_session", lambda *_: 1 / 0)
+
+    assert main(["fit", str(many), "--output", str(many.with_name("out"))]) == 1
+    assert "warning: model.n: 300 elements take minutes" in capsys.readouterr().err
+
+
+def test_names_with_the_markup_of_the_terminal_are_shown_as_they_are():
+    console = Console(force_terminal=True, record=True, file=io.StringIO())
+    with Watch(console) as watch:
+        watch.step("read [/b].csv", 0, 1)
+        watch.warn(["[/b] is odd"])
+    assert "warning: [/b] is odd" in console.export_text()
 
 
 def test_predict_prints_what_the_file_says(run, capsys):

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from dlo_casadi.config import Centerlines, Config, Images, dump_yaml, load_config, read_yaml
-from dlo_casadi.effects import EFFECTS
+from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -31,11 +31,16 @@ experiment:
     - {file: b.csv, start: [0, 0], end: [0.4, 0.1], role: fit}
     - {file: c.csv, start: [0, 0], end: [0.3, 0.1], role: held_out}
 """
+YOUNG = "youngs_modulus: 4.55e8"
 BOARD = (
     "board: {dictionary: DICT_4X4_50, marker_size: 0.08, standoff: 0.012, "
     "marker_centers: {0: [0, 0], 1: [1, 0]}}"
 )
 CAMERA = "camera: {matrix: [[900, 0, 600], [0, 900, 300], [0, 0, 1]]}"
+# Every line holds ten of the line above.
+LAUGHS = "l0: &l0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"l{k}: &l{k} [{', '.join([f'*l{k - 1}'] * 10)}]\n" for k in range(1, 9)
+)
 REFERENCE = "reference: {pixels: [[0, 0], [9, 0]], points: [[0, 0], [1, 0]]}"
 
 
@@ -238,7 +243,21 @@ def test_a_long_list_of_mistakes_is_cut(tmp_path):
         ("cable:\n\tlength: 1\n", r"line 2: not valid YAML: .*indent with spaces"),
         ("a: 1\n---\nb: 2\n", "not valid YAML: but found another document"),
         ("a: !!python/object:os.system 1\n", "line 1: not valid YAML: could not determine"),
-        ("&a [*a]\n", "belongs at the top"),
+        ("a: 1\nb: &b [{c: *b}]\n", "line 2: .*it contains itself"),
+        ("a:\n- 1" + 5000 * "0", "line 2: .*'1000.* cannot be read as int. Try: a number of"),
+        (
+            "a: !!float abc",
+            "line 1: .*'abc' cannot be read as float.*without a tag such as !!float",
+        ),
+        ("a: !!timestamp x", "line 1: .*'x' cannot be read as timestamp"),
+        ("a: !!timestamp 2024-99-99", "line 1: .*cannot be read as timestamp"),
+        ("a: !!bool maybe", "line 1: .*'maybe' cannot be read as bool"),
+        ("a:\n  - " + 40 * "[" + 40 * "]", "line 2: lists and mappings more than 30 levels deep"),
+        (5000 * "[" + 5000 * "]", "lists and mappings more than 30 levels deep"),
+        ('a: "\\0"', r"line 1: '\\x00' holds '\\x00', which is no text"),
+        ('a: "x\\ud800"', r"line 1: .* holds '\\ud800', which is no text"),
+        ("a: [" + 300_000 * "0,", "larger than 500000 bytes"),
+        (LAUGHS, r"line 6: 1.11e\+06 values, once its aliases .* written out; at most"),
     ],
 )
 def test_a_file_that_is_no_mapping(tmp_path, text, message):
@@ -279,6 +298,114 @@ def test_unknown_effects_are_named_with_their_line(tmp_path, options, line, mess
         load(tmp_path, text=GOOD + options + "\n")
     assert caught.value.line == line
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "message"),
+    [
+        ("length: 0.8", "length: 1e-300", 3, "1e-300 m: units are SI, 0.001 to 100 m is possible"),
+        ("length: 0.8", "length: 1e308", 3, "1e.308 m: units are SI, 0.001 to 100 m is possible"),
+        ("mass: 0.23", "mass: 1e-300", 4, "no cable is lighter than 1e-10 kg; .*gravity: .0, 0"),
+        (
+            "mass: 0.23",
+            "mass: 1e308",
+            4,
+            "1e.308 kg for 0.8 m: units are SI, at most 80 kg is possible",
+        ),
+        ("1.28e-2", "1e-300", 5, "1e-300 m: 1e-06 to 0.8 m is possible"),
+        (YOUNG, "bending_stiffness: 1e-300", 6, "1e-300 N m.2: 1e-12 to 1e.09 N m.2 is possible"),
+        (YOUNG, "bending_stiffness: 1e308", 6, "1e.308 N m.2: 1e-12 to 1e.09 N m.2 is possible"),
+        (YOUNG, "youngs_modulus: 1e300", 6, "is possible for EI = E pi d.4 / 64"),
+        ("-9.81", "-1e30", 8, "gravity: 1e.30 m/s.2: 0 to 10000 m/s.2 is possible"),
+        ("3e-4", "1e-12", 10, "std: 1e-12 m: 1e-07 to 0.8 m is possible; without it"),
+        ("3e-4", "1e30", 10, "std: 1e.30 m: 1e-07 to 0.8 m is possible"),
+        ("[0, 0]", "[0, 1e308]", 12, "start: 1e.308 m: -1000 to 1000 m is possible"),
+    ],
+)
+def test_a_value_that_nothing_has_is_refused_with_the_range(tmp_path, old, new, line, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        load(tmp_path, (old, new))
+    text = str(caught.value)
+    assert f"test.yaml, line {line}: " in text or f"\n  line {line}: " in text
+
+
+@pytest.mark.parametrize("value", ["1e-30", "1e30"])
+@pytest.mark.parametrize(
+    ("key", "most"),
+    [("length", "0.24 m"), ("end", "0.24 m"), ("heading", "0.9 rad"), ("scale", "0.3")],
+)
+def test_a_tolerance_lies_within_the_bounds_of_what_takes_it_up(tmp_path, key, value, most):
+    """The bounds of length_error, end_offset, clamp_angle and image_scale for 0.8 m."""
+    tolerances = f"  tolerances: {{{key}: {value}}}\n"
+    message = rf"line 11: tolerances.{key}: {float(value):g}.*: 1e-09 to {most} is possible"
+    with pytest.raises(ConfigError, match=message.replace("+", r"\+")):
+        load(tmp_path, ("  poses:", tolerances + "  poses:"))
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "message"),
+    [
+        ("lumped_mass", "mass: -1", "-1 kg: 0 to 0.69 kg is possible"),
+        ("lumped_mass", "mass: 1e6", "1e+06 kg: 0 to 0.69 kg is possible"),
+        ("lumped_mass", "position: 0.81", "0.81 m: 0 to 0.8 m is possible"),
+        ("stiff_section", "factor: 0", "0: 0.02 to 100 is possible"),
+    ],
+)
+def test_a_declared_effect_lies_within_its_own_bounds(tmp_path, effect, parameter, message):
+    """Three times the cable's 0.23 kg, its 0.8 m."""
+    options = f"model:\n  effects:\n    - {{name: {effect}, parameters: {{{parameter}}}}}\n"
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, text=GOOD + options)
+    assert caught.value.line == 17
+    assert f"{effect}.{parameter.split(':')[0]}: {message}" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_no_parameter_of_an_effect_takes_any_number(tmp_path, name):
+    for q in EFFECTS[name]().parameters(Cable(0.8, 0.23, 0.0128, 0.6)):
+        options = f"model: {{effects: [{{name: {name}, parameters: {{{q.name}: 1e300}}}}]}}\n"
+        with pytest.raises(ConfigError, match=rf"{name}.{q.name}: 1e\+300.* is possible"):
+            load(tmp_path, text=GOOD + options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("model: {n: 1}", "model.n: must not be smaller than 2, found 1; 2 to 2000 is possible"),
+        ("model: {n: 3000}", "model.n: must not be larger than 2000, found 3000; 2 to 2000"),
+        (
+            "estimation: {rest_curvature_coefficients: 100000}",
+            "must not be larger than 64, found 100000; 4 to 64 is possible",
+        ),
+    ],
+)
+def test_counts_have_a_range(tmp_path, options, message):
+    with pytest.raises(ConfigError, match="line 15: .*" + message):
+        load(tmp_path, text=GOOD + options)
+
+
+@pytest.mark.parametrize(
+    ("options", "warning"),
+    [
+        ("model: {n: 2}", "2 quadratic elements are so coarse that the mesh's own error can look"),
+        ("model: {n: 12, element: link}", "12 link elements are so coarse"),
+        ("model: {n: 2000}", "2000 elements take minutes and much memory"),
+        ("estimation: {algorithm1_inner: cobyla, algorithm1_n: 200}", "COBYLA takes about 400 s"),
+    ],
+)
+def test_what_is_unwise_is_a_warning_with_its_consequence(tmp_path, options, warning):
+    assert any(warning in text for text in load(tmp_path, text=GOOD + options).warnings)
+
+
+def test_names_that_no_file_system_takes(tmp_path):
+    """255 bytes are the limit of a name; results add to the name of a pose."""
+    with pytest.raises(ConfigError, match=r"line 12: pose 1 .*at most 200 bytes long"):
+        load(tmp_path, ("a.csv", 5000 * "x" + ".csv"))
+    config = load(tmp_path, ("a.csv", 60 * ("x" * 99 + "/") + "a.csv"))
+    assert "cannot be read: File name too long" in config.skipped[0].reason
+    for name, reason in (("a.csv/x.csv", "x.csv does not exist"), (".", "is no file; a photo")):
+        config = load(tmp_path, ("file: a.csv", f"file: {name}"))
+        assert reason in config.skipped[0].reason
 
 
 def test_every_effect_can_be_declared(tmp_path):
@@ -354,12 +481,25 @@ def test_what_photographs_need(tmp_path):
         ("DICT_4X4_50", "4X4_50", "no dictionary '4X4_50'; did you mean 'DICT_4X4_50'?"),
         ("1: [1, 0]", "50: [1, 0]", "DICT_4X4_50 has no marker 50: its ids end at 49"),
         ("1: [1, 0]", "1: [0.01, 0]", "markers 0 and 1 are 0.01 m apart, closer than their size"),
+        ("1: [1, 0]", "1: [1e30, 0]", r"marker_centers.1: 1e\+30 m: -1000 to 1000 m is possible"),
+        ("0.08", "1e-30", "marker_size: 1e-30 m: 0.0001 to 10 m is possible"),
+        ("[[900, 0, 6", "[[900, 0, 1e3", r"matrix: 1e\+300 px: -1e\+06 to 1e\+06 px is possible"),
+        ("[[900", "[[1e300", r"matrix: 1e\+300 px: 1 to 1e\+06 px is possible"),
+        ("1]]}", "1]], distortion: [1e99, 0, 0, 0]}", r"distortion: 1e\+99: -1e\+06 to 1e\+06"),
         ("1: [1, 0]", "one: [1, 0]", "a whole number belongs here, found 'one'"),
         ("{0: [0, 0], 1: [1, 0]}", "{}", "marker_centers: at least 1 belongs here"),
         ("0.012", "-0.012", "standoff: must not be smaller than 0"),
         ("[[900, 0", "[[-900, 0", "positive fx and fy"),
         (", [0, 0, 1]]", "]", "camera.matrix has only 2 of its values"),
-        ("1]]}", "1]], distortion: [0.1]}", "distortion: found 1 numbers; OpenCV knows 4, 5"),
+        ("[[900, 0,", "[[900, 3,", "camera.matrix: must read .*fx, 0, cx"),
+        *(
+            (
+                "1]]}",
+                f"1]], distortion: {[0.1] * n}}}",
+                f"distortion: found {n} numbers; OpenCV knows 4, 5",
+            )
+            for n in (1, 6, 13, 15)
+        ),
     ],
 )
 def test_mistakes_in_board_and_camera(tmp_path, old, new, message):
@@ -380,7 +520,7 @@ def test_reference_points_are_two(tmp_path):
     ("old", "new", "warning"),
     [
         ("4.55e8", "455", "youngs_modulus 455 Pa is softer than any cable"),
-        ("1.28e-2", "1.0e-5", "times as dense as water"),
+        ("1.28e-2", "1.0e-4", "times as dense as water"),
         ("length: 0.8", "length: 81", "81 m long, but its ends are never more than 0.5"),
         ("-9.81", "-9810", "gravity is 9810 m/s"),
         ("3e-4", "0.3", "std 0.3 m is large"),

@@ -21,19 +21,24 @@ from dlo_casadi.effects import (
     ImageScale,
     Kinematics,
     LumpedMass,
+    PlasticSet,
     PointForce,
     RestCurvatureDrift,
     SectionLaw,
     SideLoad,
+    Sight,
+    StandoffError,
     StartSpring,
     StiffnessGradient,
     StiffSection,
+    Tether,
 )
 from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.model import CableModel
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
-ENDS = np.array([0.1, 0.05, 0.5, -0.1, 0.4, -0.2])  # start, end [m], headings [rad]
+# Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).
+POSE = Pose((0.1, 0.05), (0.5, -0.1), 0.4, -0.2, camera_center=(0.6, -0.4, 2.0)).vector
 STILL = np.zeros(len(DEVIATIONS))
 SLOTS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
 UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad"}
@@ -67,7 +72,7 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
 
 
 def state(model: CableModel, headings: str) -> tuple[np.ndarray, ...]:
-    """Arguments phi, lam, (p), rest, ends, deviation; p is put in by the caller."""
+    """Arguments phi, lam, (p), rest, pose, deviation; p is put in by the caller."""
     rng = np.random.default_rng(1)
     phi = rng.normal(scale=0.5, size=model.chain.n_headings)
     lam = rng.normal(size=model.n_conditions)
@@ -79,7 +84,7 @@ def state(model: CableModel, headings: str) -> tuple[np.ndarray, ...]:
 
 def outputs(model: CableModel, name: str, p: np.ndarray, headings: str = "random"):
     phi, lam, rest = state(model, headings)
-    found = getattr(model, name)(phi, lam, p, rest, ENDS, STILL)
+    found = getattr(model, name)(phi, lam, p, rest, POSE, STILL)
     return [np.array(block) for block in found]
 
 
@@ -185,15 +190,15 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, element):
     turned = replace(model, gravity=gravity)
     p = own_parameters(model, "off")
     phi, lam, rest = state(model, "random")
-    start, end = ENDS[:2], ENDS[2:4]
-    ends = np.concatenate([turn @ start + shift, turn @ end + shift, ENDS[4:] + angle])
-    energy, nodes = model.energy(phi, lam, p, rest, ENDS, STILL)
+    start, end = POSE[:2], POSE[2:4]
+    ends = np.concatenate([turn @ start + shift, turn @ end + shift, POSE[4:6] + angle, POSE[6:]])
+    energy, nodes = model.energy(phi, lam, p, rest, POSE, STILL)
     new_energy, new_nodes = turned.energy(phi + angle, turn @ lam, p, rest, ends, STILL)
     fall = -CABLE.mass * np.array(gravity) @ shift  # the weight has been moved, too
     # Rounding of a few dozen terms of order one.
     assert float(new_energy) - fall == pytest.approx(float(energy), abs=1e-11)
     np.testing.assert_allclose(np.array(new_nodes), np.array(nodes) @ turn.T + shift, atol=1e-11)
-    balance, _ = model.kkt(phi, lam, p, rest, ENDS, STILL)
+    balance, _ = model.kkt(phi, lam, p, rest, POSE, STILL)
     new_balance, _ = turned.kkt(phi + angle, turn @ lam, p, rest, ends, STILL)
     headings = model.chain.n_headings
     np.testing.assert_allclose(
@@ -209,7 +214,7 @@ def energies(effects: tuple[Effect, ...], p: list[float], gravity=(0.0, -9.81), 
     model = CableModel(CABLE, n=5, element=element, effects=effects, gravity=gravity)
     phi, lam, rest = state(model, "random")
     full = np.array([CABLE.bending_stiffness, *p])
-    energy, nodes = model.energy(phi, lam, full, rest, ENDS, STILL)
+    energy, nodes = model.energy(phi, lam, full, rest, POSE, STILL)
     return float(energy), np.array(nodes)
 
 
@@ -223,6 +228,9 @@ def test_energy_of_loads(element):
     assert mass - none == pytest.approx(0.3 * 9.81 * nodes[2, 1], abs=1e-12)
     force, _ = energies((PointForce(),), [0.4, -0.7, s], element=element)
     assert force - none == pytest.approx(-0.4 * nodes[2, 0] + 0.7 * nodes[2, 1], abs=1e-12)
+    tether, _ = energies((Tether(),), [3.0, s, 0.2, 0.7], element=element)
+    stretched = np.array([0.2, 0.7]) - nodes[2]
+    assert tether - none == pytest.approx(1.5 * stretched @ stretched, abs=1e-12)
     # A side load q acts like gravity q L / m along x.
     side, _ = energies((SideLoad(),), [0.6], element=element)
     wind = (0.6 * CABLE.length / CABLE.mass, -9.81)
@@ -247,6 +255,54 @@ def test_loads_add_and_a_tilt_turns_every_weight():
     ]
     together, _ = energies(parts, values)
     assert together - none == pytest.approx(sum(alone), abs=1e-12)
+
+
+@ALL
+def test_reactions_carry_the_weight_and_the_pull_of_a_tether(element):
+    model = CableModel(CABLE, n=20, element=element, effects=(Tether(),))
+    anchor = np.array([0.3, 0.4])
+    p = np.array([0.05, 5.0, 0.4, *anchor])
+    found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), Pose((0.1, 0.0), (0.6, 0.1)))
+    loads = 5.0 * (anchor - found.points[10]) - [0.0, 9.81 * CABLE.mass]
+    # Bows enter the spring's energy to second order: k L bow^4, with bows of 0.01 rad.
+    np.testing.assert_allclose(found.lam + found.lam_start, loads, atol=1e-6)
+
+
+@ALL
+def test_a_tether_to_its_clamp_buckles_a_cable_at_eulers_load(element):
+    """A force k L at the tip, always towards the clamp: pi^2 EI / L^2  [Timoshenko and Gere]."""
+    model = CableModel(CABLE, 20, element, "clamped", "free", (0.0, 0.0), (Tether(),))
+    pose = Pose((0.0, 0.0), start_heading=0.0)
+    critical = np.pi**2 * 0.05 / CABLE.length**3
+    straight = np.zeros(model.chain.n_headings)
+    for share, stable in ((0.98, True), (1.02, False)):  # links: (pi / 20)^2 / 12 = 0.2 % off
+        p = np.array([0.05, share * critical, CABLE.length, 0.0, 0.0])
+        rest = np.zeros(model.chain.n_cells)
+        assert solve_equilibrium(model, p, rest, pose, phi_init=straight).stable is stable
+
+
+def test_a_soft_tether_to_a_far_anchor_is_a_point_force():
+    """Between its own parameters and those of its score test: f = k a, a within reach."""
+    effect, force = Tether(), {"fx": -0.6, "fy": 0.8, "position": 0.3}
+    far = effect.of_linear(CABLE, {"stiffness": 0.0, **force})
+    assert np.hypot(far["anchor_x"], far["anchor_y"]) == pytest.approx(10 * CABLE.length)
+    near = effect.of_linear(CABLE, {"stiffness": 2.0, **force})
+    assert (near["anchor_x"], near["anchor_y"]) == pytest.approx((-0.3, 0.4))
+    pose = Pose((0.0, 0.0), (0.5, 0.1))
+
+    def nodes(effect, values):
+        model = CableModel(CABLE, n=10, effects=(effect,))
+        p = np.array([0.05, *(values[q.name] for q in effect.parameters(CABLE))])
+        return solve_equilibrium(model, p, np.zeros(10), pose).points
+
+    moved = nodes(PointForce(), force)
+    none = nodes(PointForce(), {**force, "fx": 0.0, "fy": 0.0})
+    # The cable is within L of the origin, the anchor 10 L away.
+    gap = np.abs(nodes(effect, far) - moved).max()
+    assert gap < 0.1 * np.abs(moved - none).max()
+    np.testing.assert_allclose(
+        nodes(effect.linear(), {"stiffness": 0.0, **force}), moved, atol=1e-9
+    )
 
 
 # ---- section laws ------------------------------------------------------------------------------
@@ -305,8 +361,8 @@ def test_springs_pull_towards_their_heading():
         bare = CableModel(CABLE, n=5)
         phi, lam, rest = state(model, "random")
         p = np.array([0.05, 0.7, -0.4])
-        with_it, _ = model.energy(phi, lam, p, rest, ENDS, STILL)
-        without, _ = bare.energy(phi, lam, p[:1], rest, ENDS, STILL)
+        with_it, _ = model.energy(phi, lam, p, rest, POSE, STILL)
+        without, _ = bare.energy(phi, lam, p[:1], rest, POSE, STILL)
         exact = 0.7 * (phi[index] + 0.4) ** 2 / 2
         assert float(with_it - without) == pytest.approx(exact, abs=1e-12)
 
@@ -332,21 +388,71 @@ def test_clamp_angles_of_one_end_only():
     assert model.names == ("bending_stiffness", "clamp_angle.end_heading_error")
 
 
+def seen_from(camera_center, start=(0.0, 0.0)) -> Sight:
+    vector = ca.SX(ca.DM(Pose(start, camera_center=camera_center).vector))
+    return Sight(vector[:2], vector[6:8], vector[8])
+
+
+@pytest.mark.parametrize("distance", [-0.03, 0.0, 0.004])
+def test_a_standoff_error_follows_the_ray_to_the_declared_plane(distance):
+    """Where the straight line from the camera through the cable's point meets z = 0."""
+    camera, point = np.array([0.3, -0.9, 1.4]), np.array([0.5, 0.2, distance])
+    ray = point - camera
+    met = camera - ray * camera[2] / ray[2]
+    seen = StandoffError().observe(
+        ca.SX(ca.DM(point[:2])), ca.SX(0), seen_from(tuple(camera)), {"distance": ca.SX(distance)}
+    )
+    np.testing.assert_allclose([*number(seen), 0.0], met, atol=1e-15)
+
+
+def test_a_camera_at_infinity_sees_no_standoff():
+    point = ca.SX(ca.DM([0.5, 0.2]))
+    seen = StandoffError().observe(point, ca.SX(0), seen_from(None), {"distance": ca.SX(0.01)})
+    np.testing.assert_array_equal(number(seen), [0.5, 0.2])
+
+
+def test_over_the_start_fixture_a_standoff_error_is_a_scale():
+    """By z / (z - d): the two cannot be told apart there."""
+    point, start = ca.SX(ca.DM([0.5, 0.2])), (0.1, 0.05)
+    sight = seen_from((*start, 1.5), start)
+    seen = StandoffError().observe(point, ca.SX(0), sight, {"distance": ca.SX(0.02)})
+    scaled = ImageScale().observe(point, ca.SX(0), sight, {"factor": ca.SX(1.5 / 1.48)})
+    np.testing.assert_allclose(number(seen), number(scaled), rtol=1e-14)
+
+
 def test_measurement_maps():
     """Scale about the start; radial distortion about the image centre, by hand."""
-    point, start = ca.SX(ca.DM([0.5, 0.2])), ca.SX(ca.DM([0.1, 0.0]))
-    scaled = ImageScale().observe(point, ca.SX(0.3), start, {"factor": ca.SX(1.1)})
+    point, sight = ca.SX(ca.DM([0.5, 0.2])), seen_from(None, start=(0.1, 0.0))
+    scaled = ImageScale().observe(point, ca.SX(0.3), sight, {"factor": ca.SX(1.1)})
     np.testing.assert_allclose(number(scaled), [0.54, 0.22], rtol=1e-14)
     lens = ImageDistortion(center=(0.2, -0.2))
-    moved = lens.observe(point, ca.SX(0.3), start, {"coefficient": ca.SX(0.4)})
+    moved = lens.observe(point, ca.SX(0.3), sight, {"coefficient": ca.SX(0.4)})
     # Arm (0.3, 0.4), length 0.5: factor 1 + 0.4 * 0.25 = 1.1.
     np.testing.assert_allclose(number(moved), [0.53, 0.24], rtol=1e-14)
 
 
 def test_drift_moves_the_rest_curvature_towards_the_bend():
     rest, curvature = ca.SX(ca.DM([1.0, -2.0])), ca.SX(ca.DM([3.0, 2.0]))
-    after = RestCurvatureDrift().next_rest(rest, curvature, {"rate": ca.SX(0.25)})
+    after = RestCurvatureDrift().next_rest(rest, curvature, CABLE, {"rate": ca.SX(0.25)})
     np.testing.assert_allclose(number(after), [1.5, -1.0], rtol=1e-14)
+
+
+def test_a_plastic_set_is_what_a_bend_exceeds_the_yield_by():
+    bend = np.array([-7.0, -3.0, -1.0, 0.0, 1.0, 3.0, 7.0])
+    rest = ca.SX(ca.DM(np.linspace(-1.0, 2.0, 7)))
+
+    def left(limit):
+        params = {"yield_curvature": ca.SX(limit), "share": ca.SX(0.25)}
+        after = PlasticSet().next_rest(rest, rest + ca.DM(bend), CABLE, params)
+        return number(after - rest)
+
+    excess = np.sign(bend) * np.maximum(np.abs(bend) - 2.0, 0.0)
+    # Kinks rounded over d = 0.01 turns per length: d^2 / (4 |x|) = 0.0015 1/m at x = 1 1/m from
+    # either of them.
+    np.testing.assert_allclose(left(2.0), 0.25 * excess, atol=2 * 0.0015)
+    np.testing.assert_allclose(left(2.0), -left(2.0)[::-1], atol=1e-14)
+    # Without a yield curvature it is a drift, exactly.
+    np.testing.assert_allclose(left(0.0), 0.25 * bend, atol=1e-14)
 
 
 def test_an_effect_without_its_slot_says_so():

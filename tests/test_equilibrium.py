@@ -1,6 +1,7 @@
 """Equilibria against closed forms, the paper's table, an independent integrator and balances."""
 
 import csv
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,7 +13,15 @@ from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import AxialStretch, Cable, EndSpring, LumpedMass, PointForce
+from dlo_casadi.effects import (
+    AxialStretch,
+    Cable,
+    EndOffset,
+    EndSpring,
+    LengthError,
+    LumpedMass,
+    PointForce,
+)
 from dlo_casadi.equilibrium import Equilibrium, Pose, Status, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model import CableModel
@@ -358,6 +367,45 @@ def test_two_branches_of_a_stiff_curved_cable():
     assert free.energy == pytest.approx(along.energy, abs=1e-9)  # the lower of the two
 
 
+LIMP = Cable(0.8, 0.2, 0.01, 0.005)
+
+
+@pytest.mark.parametrize(("kind", "headings"), [("pinned", (None, None)), ("clamped", (-1.0, 1.0))])
+def test_a_branch_without_an_equilibrium_is_refused_and_the_other_named(kind, headings):
+    """A limp cable hangs: it turns counter-clockwise, and does not stand up."""
+    model = CableModel(LIMP, 12, start=kind, end=kind)
+    ends = {"start": (0.0, 0.0), "end": (0.5, 0.0), "name": "pose_03"}
+    pose = Pose(**ends, start_heading=headings[0], end_heading=headings[1])
+    hung = solve(model, 0.005, pose)
+    assert solve(model, 0.005, replace(pose, branch="ccw")).phi == pytest.approx(hung.phi)
+    message = (
+        r"pose_03: no stable equilibrium found on the branch cw .* with its end at \(0.5, 0.0\) m: "
+        rf"the lowest one, of {hung.energy:.4g} J, turns by \+{hung.turn:.3g} rad .*\(branch ccw\)"
+    )
+    with pytest.raises(EquilibriumError, match=message):
+        solve(model, 0.005, replace(pose, branch="cw"))
+
+
+@pytest.mark.parametrize(("branch", "sign"), [("ccw", 1), ("cw", -1)])
+def test_a_branch_beside_one_clamp_is_the_lowest_that_turns_so(branch, sign):
+    """The pinned end may come round on either side; the cable itself takes the lower way."""
+    model = CableModel(LIMP, 12, start="clamped", end="pinned")
+    pose = Pose((0.0, 0.0), (0.5, 0.0), start_heading=-1.0)
+    held = solve(model, 0.005, replace(pose, branch=branch))
+    assert held.stable
+    assert sign * held.turn > 0
+    assert solve(model, 0.005, pose).energy <= held.energy
+
+
+def test_the_other_way_around_a_clamp_is_found():
+    """A limp cable between clamps: 0.157 J folded up to a joint's bound, half of that unfolded."""
+    model = CableModel(Cable(1.0, 0.1, 0.005, 3e-3), 20, start="clamped", end="clamped")
+    held = solve(model, 3e-3, Pose((0.0, 0.0), (-0.695, -0.071), -1.74, 1.17))
+    assert held.stable
+    assert not held.bound_multipliers.any()
+    assert held.energy < 0.08
+
+
 # ---- special poses -----------------------------------------------------------------------------
 
 
@@ -418,7 +466,6 @@ def test_a_joint_at_its_bound_is_reported():
 @pytest.mark.parametrize(
     ("end", "headings"),
     [
-        ((-0.695, -0.071), (-1.74, 1.17)),
         ((-0.770, 0.096), (-0.56, 0.21)),
         ((-0.543, 0.743), (-1.38, -0.38)),
     ],
@@ -458,6 +505,18 @@ def test_the_smallest_radius_is_that_at_a_clamp(element):
 def test_a_pose_that_is_not_finite_is_named():
     with pytest.raises(EquilibriumError, match=r"pose_08: .*not finite: start \(0.0, 0.0\) m"):
         solve(CableModel(HEAVY, 8), 0.1, Pose((0.0, 0.0), (0.6, np.nan), name="pose_08"))
+
+
+@pytest.mark.parametrize("label", ["", "wrong_label", "spool"])
+def test_a_longer_cable_reaches_farther_whatever_its_effect_is_called(label):
+    """Two length errors multiply; the end fixture is where it really is."""
+    effects = (LengthError(label), LengthError("other"), EndOffset())
+    model = CableModel(HEAVY, 8, effects=effects)
+    p = np.array([0.1, 0.04, 0.02, -0.01, 0.0])  # 0.8 m (1 + 0.04 / 0.8) (1 + 0.02 / 0.8)
+    held = solve_equilibrium(model, p, np.zeros(8), Pose((0.0, 0.0), (0.87, 0.0)))
+    assert held.points[-1] == pytest.approx([0.86, 0.0], abs=1e-8)
+    with pytest.raises(EquilibriumError, match=r"is 0.8620 m from the start.*is 0.8610 m long"):
+        solve_equilibrium(model, p, np.zeros(8), Pose((0.0, 0.0), (0.872, 0.0)))
 
 
 def test_unreachable_pose_is_named_with_numbers():

@@ -87,6 +87,9 @@ def test_repeated_points_spaces_and_blank_lines(tmp_path):
         ("x_m,y_m\n0,0\n1,here\n", "line 3: 'here' is not a number"),
         ("x_m,y_m\n0,0\n0,5,1,2\n", "line 3: two numbers x,y belong here, found 4: '0,5,1,2'"),
         ("x_m,y_m\n0,0\n1\n", "line 3: two numbers x,y belong here, found 1"),
+        ("x_m,y_m\n0,0\n1," + 200_000 * "1" + "\n", "line 3: field larger than field limit"),
+        ("x_m,y_m\n0,0\n1," + 9000 * "x" + "\n", r"line 3: 'x+\.\.\. is not a number$"),
+        ("x_m,y_m\n" + 3_000_000 * "0.1,0.2", "is larger than 20000000 bytes; keep every tenth"),
         ("x_m,y_m\n0,0\n300,0\n508,101\n", r"531.2 m long: are the points in metres\?"),
     ],
 )

@@ -49,6 +49,7 @@ def main(argv: Sequence[str]) -> int:
         Watch(Console(stderr=True), chosen.quiet) as watch,
         open_executor(chosen.jobs) as executor,
     ):
+        watch.warn(config.warnings)
         outcome = run_session(config, watch, executor)
         if folder is not None:
             folder.write(outcome)

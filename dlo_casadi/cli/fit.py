@@ -58,6 +58,7 @@ def main(argv: Sequence[str]) -> int:
         Watch(Console(stderr=True), chosen.quiet) as watch,
         open_executor(chosen.jobs) as executor,
     ):
+        watch.warn(config.warnings)
         outcome = run_session(config, watch, executor)
         watch.step("write the results", 0, 1)
         folder.write(outcome)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rich.console import Console
@@ -49,7 +50,7 @@ class Watch:
                 SpinnerColumn(finished_text="+"),
                 TextColumn("{task.description}"),
                 BarColumn(bar_width=24),
-                TextColumn("{task.fields[detail]}"),
+                TextColumn("{task.fields[detail]}", markup=False),
                 TimeElapsedColumn(),
                 TextColumn("left, at most:"),
                 TimeRemainingColumn(),
@@ -91,7 +92,12 @@ class Watch:
             return
         self._spoken = now
 
+    def warn(self, warnings: Sequence[str]) -> None:
+        """What a run that may take long should have been told before; its report repeats it."""
+        for text in warnings:
+            self.message(f"warning: {text}")
+
     def message(self, text: str) -> None:
         """Something worth a line."""
         if not self.quiet:
-            self.console.print(text, highlight=False)
+            self.console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -24,6 +24,24 @@ FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
 
 
+def shape_record(model: CableModel) -> np.dtype[Any]:
+    """Layout of the C solver's dlo_shape."""
+    n, k = model.n, model.chain.n_nodes
+    return np.dtype(
+        {
+            "names": [
+                *("points", "headings", "lam_start", "lam", "moments", "energy"),
+                *("min_bend_radius", "end_error", "imbalance", "iterations", "turn"),
+            ],
+            "formats": [
+                *((float, (n + 1, 2)), (float, k), (float, 2), (float, 2), (float, 2)),
+                *(float, float, float, float, np.intc, np.intc),
+            ],
+        },
+        align=True,
+    )
+
+
 class CompiledSolver:
     """Equilibria by compiled C: thousands of poses a second.
 
@@ -62,19 +80,7 @@ class CompiledSolver:
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
         n, k = model.n, model.chain.n_nodes
-        self.record = np.dtype(
-            {
-                "names": [
-                    *("points", "headings", "lam_start", "lam", "moments", "energy"),
-                    *("min_bend_radius", "end_error", "imbalance", "iterations", "turn"),
-                ],
-                "formats": [
-                    *((float, (n + 1, 2)), (float, k), (float, 2), (float, 2), (float, 2)),
-                    *(float, float, float, float, np.intc, np.intc),
-                ],
-            },
-            align=True,
-        )
+        self.record = shape_record(model)
         self._pose = np.dtype((float, 6))
         self._slope = np.dtype(
             [("points", float, (n + 1, 2, 4)), ("headings", float, (k, 4)), ("lam", float, (2, 4))]
@@ -128,7 +134,8 @@ class CompiledSolver:
         headings : (2,) [rad]
             Of clamped start and end; not used at pins.
         branch : "ccw" or "cw", optional
-            Which way the cable turns; otherwise the stable equilibrium of lowest energy.
+            Which way the cable turns; otherwise the stable equilibrium of lowest energy. If none
+            is found to turn so, the status is "other_branch".
         warm : Shape, optional
             Where to start from.
         throw : bool

@@ -17,7 +17,7 @@ from dlo_casadi.codegen.kernels import Kernels, c_number, kernels_of, table_to_c
 from dlo_casadi.codegen.prefix import check_prefix
 from dlo_casadi.durable import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.effects import MeasurementEffect, StateEffect
-from dlo_casadi.equilibrium import total_dead_load
+from dlo_casadi.equilibrium import resting_headings, total_dead_load
 from dlo_casadi.errors import DloError
 from dlo_casadi.model import CableModel
 
@@ -101,26 +101,18 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
 def _extra(model: CableModel, p: FloatArray) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
-    load = total_dead_load(model, p)
-    return [model.true_length(p), down, *load, *model.end_offsets(p)[2:6]]
-
-
-def _resting(model: CableModel, rest: FloatArray) -> FloatArray:
-    """Headings (n_nodes,) of the cable at rest, counted from its start [rad]."""
-    cells = model.chain.cells
-    turn = np.concatenate([[0.0], np.cumsum(rest * np.diff(cells, axis=1).ravel())])
-    edges = np.concatenate([cells[:1, 0], cells[:, 1]])
-    return np.interp(model.chain.places, edges, turn)
+    offsets, length = model.held(p, 0, 0)
+    return [float(length), down, *total_dead_load(model, p), *np.array(offsets).ravel()[2:]]
 
 
 def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray, kernels: Kernels) -> list[float]:
     """The solver's table: numbers of the kernels, nodes, widths of the cells, rest, the others."""
-    stretch = model.true_length(p) / model.cable.length
+    stretch = float(model.held(p, 0, 0)[1]) / model.cable.length
     return [
         *kernels.table,
         *(model.chain.places / model.cable.length),
         *(1 / (np.diff(model.chain.cells, axis=1).ravel() * stretch)),
-        *_resting(model, rest),
+        *resting_headings(model.chain, rest),
         *_extra(model, p),
     ]
 
@@ -149,7 +141,7 @@ def _values(
         "N": str(model.n),
         "N_HEADINGS": str(count),
         "HEADINGS_ARE": chain.kind.nodes_are,
-        "LENGTH": c_number(model.true_length(p)),
+        "LENGTH": c_number(float(model.held(p, 0, 0)[1])),
         "START_CLAMPED": str(clamped["start"]),
         "END_CLAMPED": str(clamped["end"]),
         "END_FREE": str(int(model.end == "free")),
@@ -227,6 +219,13 @@ def generate(
         raise DloError(
             f"p has {len(p)} and rest {len(rest)} entries; the model has "
             f"{len(model.parameters)} parameters and {model.chain.n_cells} cells"
+        )
+    if model.shape_dependent_loads:
+        loads = " and ".join(model.shape_dependent_loads)
+        raise DloError(
+            f"no solver can be generated for a cable with {loads}: the force depends on the shape, "
+            "and the generated solver knows dead loads only.\n"
+            "  Try: dlo predict, or dlo_casadi.predict, which know it."
         )
     kernels = kernels_of(model, p, rest, inline)
     digest = solver_hash(model, p, rest)

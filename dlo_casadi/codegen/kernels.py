@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import POSE_SIZE, CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -177,7 +177,7 @@ def _kernel(
 def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
     """Energy of the holders, without end conditions."""
     x, lam = ca.SX.sym("x", 2), ca.SX.zeros(model.n_conditions)
-    value, _, _ = model.at_ends(x, lam, p, ca.DM.zeros(6), ca.DM.zeros(len(DEVIATIONS)))
+    value, _, _ = model.at_ends(x, lam, p, ca.DM.zeros(POSE_SIZE), ca.DM.zeros(len(DEVIATIONS)))
     if not ca.depends_on(value, x):
         return None
     return _derivatives(value, [x, _symbols(p)], x)

@@ -19,6 +19,7 @@ _HINTS = {
     "iteration_limit": "warm: the shape of a pose nearby.",
     "not_finite": "finite numbers for end, start and headings.",
     "unstable": "another branch, or a pose nearby.",
+    "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
 }
 
 

@@ -18,6 +18,7 @@ STATUSES = (
     "unstable",
     "workspace_too_small",
     "bad_argument",
+    "other_branch",
 )
 
 

@@ -4,8 +4,16 @@ The only package that imports yaml. All units are SI. Every problem of a file is
 each with its line.
 """
 
-from dlo_casadi.config.document import dump_yaml, read_yaml
+from dlo_casadi.config.document import dump_yaml, read_document, read_yaml
+from dlo_casadi.config.limits import (
+    MESH,
+    REST_COEFFICIENTS,
+    Range,
+    implausible_gravity,
+    implausible_sizes,
+)
 from dlo_casadi.config.load import load_config, unknown_effect
+from dlo_casadi.config.problems import Place, show
 from dlo_casadi.config.sections import (
     Board,
     Boundary,
@@ -24,10 +32,11 @@ from dlo_casadi.config.sections import (
     Reference,
     SkippedPose,
     Tolerances,
-    implausible_sizes,
 )
 
 __all__ = [
+    "MESH",
+    "REST_COEFFICIENTS",
     "Board",
     "Boundary",
     "Cable",
@@ -41,13 +50,18 @@ __all__ = [
     "Experiment",
     "Images",
     "ModelOptions",
+    "Place",
     "Pose",
+    "Range",
     "Reference",
     "SkippedPose",
     "Tolerances",
     "dump_yaml",
+    "implausible_gravity",
     "implausible_sizes",
     "load_config",
+    "read_document",
     "read_yaml",
+    "show",
     "unknown_effect",
 ]

@@ -10,8 +10,18 @@ from typing import Any
 
 import yaml
 
-from dlo_casadi.config.problems import Place, Problem, did_you_mean
+from dlo_casadi.config.problems import Place, Problem, did_you_mean, show
 from dlo_casadi.errors import ConfigError
+
+# A file of so many bytes takes PyYAML some five seconds; a session of a thousand poses has 80,000.
+_LARGEST = 500_000
+# Values in a file of that size take two characters each at least: aliases may not make more.
+_MOST_VALUES = _LARGEST // 2
+# Levels of lists and mappings; a configuration has seven.
+_DEEPEST = 30
+# No text: control characters beside tab and line breaks, and halves of surrogate pairs, which
+# names of files cannot hold and a terminal obeys or cannot write.
+_NO_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff]")
 
 
 def read_yaml(path: str | Path) -> Any:
@@ -34,7 +44,12 @@ def read_yaml(path: str | Path) -> Any:
     ConfigError
         If the file cannot be read, is empty, or is not YAML.
     """
-    return Document.read(Path(path)).data
+    return read_document(path).data
+
+
+def read_document(path: str | Path) -> Document:
+    """Read a YAML file with the lines of its values; see `read_yaml`."""
+    return Document.read(Path(path))
 
 
 def dump_yaml(data: object) -> str:
@@ -99,6 +114,21 @@ def _with_numbers_of_yaml_1_2(resolver: type[yaml.resolver.BaseResolver]) -> Non
 class _Loader(yaml.SafeLoader):
     """SafeLoader with the numbers of YAML 1.2."""
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            return super().construct_object(node, deep)
+        except yaml.YAMLError:
+            raise
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+            kind = node.tag.rpartition(":")[2]
+            raise yaml.constructor.ConstructorError(
+                None,
+                None,
+                f"{show(node.value)} cannot be read as {kind}. Try: a number of usual size, or "
+                f"the value without a tag such as !!{kind}",
+                node.start_mark,
+            ) from None
+
     def construct_decimal(self, node: yaml.ScalarNode) -> int:
         return int(self.construct_scalar(node))
 
@@ -132,19 +162,13 @@ class Document:
     @classmethod
     def read(cls, source: Path) -> Document:
         """Read a file, or raise a ConfigError."""
-        try:
-            text = source.read_bytes()
-        except FileNotFoundError:
-            near = did_you_mean(source.name, [p.name for p in source.parent.glob("*.y*ml")])
-            raise ConfigError(f"no such file{near}", file=source) from None
-        except OSError as error:
-            raise ConfigError(f"cannot be read: {error.strerror}", file=source) from None
+        text = _read_bytes(source)
         try:
             loader = _Loader(text)
             root = loader.get_single_node()
             if root is None:
                 raise ConfigError("the file is empty", file=source)
-            _refuse_repeated_keys(root, source)
+            _inspect(root, source)
             return cls(source, root, loader.construct_document(root))
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
@@ -154,7 +178,9 @@ class Document:
                 file=source,
                 line=None if mark is None else mark.line + 1,
             ) from None
-        except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        except RecursionError:
+            raise ConfigError(_too_deep(), file=source) from None
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(f"not a YAML text file: {reason}", file=source) from None
 
@@ -192,25 +218,82 @@ class Document:
         return ConfigError("\n".join([heading, *listed]), self.source)
 
 
-def _refuse_repeated_keys(root: yaml.Node, source: Path) -> None:
-    waiting, seen = [root], set()
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen:
-            continue
-        seen.add(id(node))
-        if isinstance(node, yaml.SequenceNode):
-            waiting.extend(node.value)
+def _read_bytes(source: Path) -> bytes:
+    """Contents of a file that is not larger than it may be."""
+    try:
+        with source.open("rb") as file:
+            text = file.read(_LARGEST + 1)
+    except FileNotFoundError:
+        near = did_you_mean(source.name, [p.name for p in source.parent.glob("*.y*ml")])
+        raise ConfigError(f"no such file{near}", file=source) from None
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror}", file=source) from None
+    except ValueError as error:  # a NUL in the name
+        raise ConfigError(f"cannot be read: {error}", file=source) from None
+    if len(text) > _LARGEST:
+        raise ConfigError(
+            f"larger than {_LARGEST} bytes, which no configuration or fitted cable is. Try: is it "
+            "the right file?",
+            file=source,
+        )
+    return text
+
+
+def _too_deep() -> str:
+    return f"lists and mappings more than {_DEEPEST} levels deep. Try: brackets and braces closed?"
+
+
+def _inspect(root: yaml.Node, source: Path) -> None:
+    """Refuse what is valid YAML but no plain data: each node once, aliases counted in full."""
+    measured: dict[int, tuple[int, int]] = {}
+    above: set[int] = set()
+
+    def refuse(message: str, node: yaml.Node) -> ConfigError:
+        return ConfigError(message, file=source, line=node.start_mark.line + 1)
+
+    def inspect(node: yaml.Node) -> tuple[int, int]:
+        """Values and levels of a node, its aliases written out."""
+        if id(node) in above:
+            raise refuse("an anchor (&) around its own alias (*): it contains itself", node)
+        if id(node) in measured:
+            return measured[id(node)]
+        above.add(id(node))
+        if isinstance(node, yaml.ScalarNode):
+            if found := _NO_TEXT.search(node.value):
+                raise refuse(f"{show(node.value)} holds {found[0]!r}, which is no text", node)
+            inner = []
         elif isinstance(node, yaml.MappingNode):
-            first: dict[Hashable, int] = {}
-            for key, value in node.value:
-                line = key.start_mark.line + 1
-                if isinstance(key, yaml.ScalarNode) and key.value in first:
-                    raise ConfigError(
-                        f"key {key.value!r} occurs twice, first in line {first[key.value]}",
-                        file=source,
-                        line=line,
-                    )
-                if isinstance(key, yaml.ScalarNode):
-                    first[key.value] = line
-                waiting.append(value)
+            _refuse_repeated_keys(node, source)
+            inner = [inspect(part) for pair in node.value for part in pair]
+        else:
+            inner = [inspect(part) for part in node.value]
+        values = 1 + sum(size for size, _ in inner)
+        levels = 1 + max((depth for _, depth in inner), default=0)
+        if values > _MOST_VALUES:
+            raise refuse(
+                f"{values:.3g} values, once its aliases (*) are written out; at most "
+                f"{_MOST_VALUES} are read. Try: without aliases",
+                node,
+            )
+        if levels > _DEEPEST:
+            raise refuse(_too_deep(), node)
+        above.discard(id(node))
+        measured[id(node)] = values, levels
+        return values, levels
+
+    inspect(root)
+
+
+def _refuse_repeated_keys(node: yaml.MappingNode, source: Path) -> None:
+    first: dict[Hashable, int] = {}
+    for key, _ in node.value:
+        if not isinstance(key, yaml.ScalarNode):
+            continue
+        line = key.start_mark.line + 1
+        if key.value in first:
+            raise ConfigError(
+                f"key {show(key.value)} occurs twice, first in line {first[key.value]}",
+                file=source,
+                line=line,
+            )
+        first[key.value] = line

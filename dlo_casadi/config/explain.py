@@ -100,6 +100,20 @@ def _about_number(value: object) -> str:
     return ""
 
 
+def _allowed(section: type[Section], key: object) -> str:
+    """The range of a number, where it has two ends."""
+    found: dict[str, float] = {}
+    waiting = [section.model_json_schema()["properties"].get(str(key))]
+    while waiting:
+        schema = waiting.pop()
+        if isinstance(schema, dict):
+            found |= {name: schema[name] for name in ("minimum", "maximum") if name in schema}
+            waiting += schema.get("anyOf", [])
+    if len(found) < 2:
+        return ""
+    return f"; {found['minimum']:g} to {found['maximum']:g} is possible"
+
+
 _MESSAGES: dict[str, str] = {
     "float_type": "a number belongs here, found {input}{number}",
     "float_parsing": "a number belongs here, found {input}{number}",
@@ -110,9 +124,9 @@ _MESSAGES: dict[str, str] = {
     "bool_type": "true or false belongs here, found {input}",
     "string_type": "text belongs here, found {input}",
     "greater_than": "must be larger than {gt:g}, found {input}",
-    "greater_than_equal": "must not be smaller than {ge:g}, found {input}",
+    "greater_than_equal": "must not be smaller than {ge:g}, found {input}{allowed}",
     "less_than": "must be smaller than {lt:g}, found {input}",
-    "less_than_equal": "must not be larger than {le:g}, found {input}",
+    "less_than_equal": "must not be larger than {le:g}, found {input}{allowed}",
     "literal_error": "allowed are {expected}, found {input}",
     "model_type": "a mapping of keys and values belongs here, found {kind}",
     "model_attributes_type": "a mapping of keys and values belongs here, found {kind}",
@@ -155,7 +169,7 @@ def explain(errors: Sequence[ErrorDetails], data: Any) -> list[Problem]:
             hint = did_you_mean(key, section.model_fields)
             if homes and "did you mean" not in hint:
                 hint = f"; it belongs into {' or '.join(homes)}"
-            text = f"unknown key {key!r} in {_label(place[:-1], data)}{hint}"
+            text = f"unknown key {show(key)} in {_label(place[:-1], data)}{hint}"
         elif kind in ("union_tag_invalid", "union_tag_not_found"):
             place = (*place, "kind")
             text = f"{label}: kind must be images or centerlines, found {show(context.get('tag'))}"
@@ -171,6 +185,7 @@ def explain(errors: Sequence[ErrorDetails], data: Any) -> list[Problem]:
                 "input": show(error["input"]),
                 "kind": kind_of(error["input"]),
                 "number": _about_number(error["input"]),
+                "allowed": _allowed(section, place[-1]),
             }
             text = f"{label}: {_MESSAGES[kind].format(**(context | words))}"
             if place[-1] == "start" and error["input"] == "free":

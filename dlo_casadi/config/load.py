@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import stat
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from pydantic import ValidationError
 
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.explain import explain
-from dlo_casadi.config.problems import Problem, did_you_mean, kind_of
+from dlo_casadi.config.limits import impossible_values
+from dlo_casadi.config.problems import Problem, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import (
     Cable,
     Config,
@@ -59,7 +61,11 @@ def load_config(path: str | Path) -> Config:
     except ValidationError as error:
         raise document.error(explain(error.errors(), document.data)) from None
 
-    if problems := [*_contradictions(file.experiment), *_unknown_effects(file)]:
+    if problems := [
+        *_contradictions(file.experiment),
+        *_unknown_effects(file),
+        *impossible_values(file),
+    ]:
         raise document.error(problems)
 
     poses = file.experiment.poses
@@ -93,6 +99,17 @@ def load_config(path: str | Path) -> Config:
 
 _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 
+# Results are named after a pose, with up to forty characters more; file systems take 255 bytes.
+_LONGEST_NAME = 200
+
+# The mesh that is chosen from the data has 20 elements at least, which error and time suggest:
+# quadratic ones converge with the fourth order, the others with the second.
+_COARSE = {"quadratic": 10, "arc": 20, "link": 20}
+# And it has 160 at most.
+_FINE = 160
+# Seconds of COBYLA for one pose: measured 1 for 10 links, 4 for 20; it grows with the square.
+_COBYLA_LINKS = 20
+
 # A start needs no more than a full turn [rad]; an end is continuous along a cable that may turn
 # round several times.
 _LARGEST_HEADINGS = {"start": 6.3, "end": 25.0}
@@ -109,6 +126,8 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
             at = ("experiment", "poses", i) if key is None else ("experiment", "poses", i, key)
             problems.append(Problem(at, f"pose {i + 1} ({pose.file.name}): {message}"))
 
+        if len(pose.name.encode()) > _LONGEST_NAME:
+            wrong(f"results are named after the file, at most {_LONGEST_NAME} bytes long")
         if pose.name in names:
             wrong(
                 f"pose {names[pose.name] + 1} is called {pose.name!r} too; results are named after "
@@ -195,14 +214,25 @@ def _missing(poses: Iterable[Pose]) -> dict[str, str]:
     """Find poses whose file does not exist."""
     reasons: dict[str, str] = {}
     for pose in poses:
-        if pose.file.is_file():
-            continue
-        folder = pose.file.parent
-        names = [p.name for p in folder.iterdir()] if folder.is_dir() else []
-        near = difflib.get_close_matches(pose.file.name, names, 1, cutoff=0.8)
-        hint = f"did you mean {near[0]}?" if near else "files are found relative to the YAML"
-        reasons[pose.name] = f"{pose.file} does not exist; {hint}"
+        try:
+            if stat.S_ISREG(pose.file.stat().st_mode):
+                continue
+            reasons[pose.name] = f"{pose.file} is no file; a photograph or a CSV belongs here"
+        except (FileNotFoundError, NotADirectoryError):
+            reasons[pose.name] = f"{pose.file} does not exist; {_near(pose.file)}"
+        except OSError as error:
+            reasons[pose.name] = f"{show(str(pose.file))} cannot be read: {error.strerror}"
     return reasons
+
+
+def _near(file: Path) -> str:
+    """What may be meant by a file that does not exist."""
+    try:
+        names = [path.name for path in file.parent.iterdir()]
+    except OSError:
+        names = []
+    near = difflib.get_close_matches(file.name, names, 1, cutoff=0.8)
+    return f"did you mean {near[0]}?" if near else "files are found relative to the YAML"
 
 
 def _no_fit_pose(poses: Sequence[Pose], skipped: Mapping[str, str]) -> list[Problem]:
@@ -242,6 +272,22 @@ def _oddities(file: File) -> list[str]:
     std = experiment.measurement.std
     if std is not None and std > 0.02 * cable.length:
         warnings.append(f"std {std:g} m is large for a cable of {cable.length:g} m: in metres?")
+    n, element, links = file.model.n, file.model.element, file.estimation.algorithm1_n
+    if n is not None and n < _COARSE[element]:
+        warnings.append(
+            f"model.n: {n} {element} elements are so coarse that the mesh's own error can look "
+            "like a missing effect. Without model.n the mesh is chosen from the data"
+        )
+    if n is not None and n > _FINE:
+        warnings.append(
+            f"model.n: {n} elements take minutes and much memory; the mesh that is chosen from "
+            f"the data, without model.n, never has more than {_FINE}"
+        )
+    if file.estimation.algorithm1_inner == "cobyla" and links > _COBYLA_LINKS:
+        warnings.append(
+            f"estimation.algorithm1_n: COBYLA takes about {(links / 10) ** 2:.0f} s for one shape "
+            f"of {links} links, and the loop needs hundreds; ipopt takes milliseconds"
+        )
     for end in ("start", "end"):
         headings = {pose.name: getattr(pose, f"{end}_heading") for pose in poses}
         given = {name: value for name, value in headings.items() if value is not None}

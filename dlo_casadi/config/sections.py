@@ -19,6 +19,16 @@ from pydantic import (
     model_validator,
 )
 
+from dlo_casadi.config.limits import (
+    COORDINATE,
+    MARKER,
+    MESH,
+    REST_COEFFICIENTS,
+    STIFFNESS,
+    implausible_camera,
+    implausible_pixels,
+    implausible_sizes,
+)
 from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean, show
 from dlo_casadi.errors import well_formed
 
@@ -42,7 +52,7 @@ def _empty_section(value: object) -> object:
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 NonNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
-Count = Annotated[int, Field(strict=True, ge=1)]
+Count = Annotated[int, Field(strict=True)]
 Switch = Annotated[bool, Field(strict=True)]
 Vector = Annotated[
     tuple[Number, Number], BeforeValidator(_pair, json_schema_input_type=tuple[Number, Number])
@@ -54,24 +64,6 @@ class Section(BaseModel):
     """A frozen mapping of the file: unknown keys are errors, the docstring of a key is its help."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
-
-
-def implausible_sizes(length: float, mass: float, diameter: float) -> list[Problem]:
-    """Find sizes [m], [kg] of a cable that no cable has, by their key."""
-    problems: list[Problem] = []
-    if length > 100.0:
-        text = f"{length:g} m: units are SI, did you mean {length / 1e3:g}?"
-        problems.append(Problem(("length",), text))
-    elif diameter > length:
-        text = (
-            f"{diameter:g} m is larger than the length {length:g} m: units are SI, "
-            f"did you mean {diameter / 1e3:g}?"
-        )
-        problems.append(Problem(("diameter",), text))
-    if mass > min(1000.0, 100.0 * length):
-        text = f"{mass:g} kg for {length:g} m: units are SI, did you mean {mass / 1e3:g}?"
-        problems.append(Problem(("mass",), text))
-    return problems
 
 
 class Cable(Section):
@@ -102,7 +94,12 @@ class Cable(Section):
 
     @model_validator(mode="after")
     def _plausible(self) -> Cable:
-        problems = implausible_sizes(self.length, self.mass, self.diameter)
+        problems = implausible_sizes(self.length, self.mass, self.diameter, self.bending_stiffness)
+        if self.youngs_modulus is not None and self.bending_stiffness is None:
+            stiffness = self.prior_bending_stiffness
+            problems += STIFFNESS.problems(
+                ("youngs_modulus",), stiffness, " for EI = E pi d^4 / 64"
+            )
         if self.youngs_modulus is None and self.bending_stiffness is None:
             problems.append(
                 Problem((), "give youngs_modulus [Pa] or bending_stiffness [N m^2], found neither")
@@ -133,12 +130,12 @@ class Camera(Section):
     matrix: tuple[Row, Row, Row]
     """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel]."""
     distortion: tuple[Number, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """Distortion coefficients k1, k2, p1, p2, k3."""
+    """OpenCV's 4, 5, 8, 12 or 14 coefficients k1, k2, p1, p2, k3, k4, ...; [] for none."""
 
     @model_validator(mode="after")
     def _plausible(self) -> Camera:
-        (fx, _, _), (below, fy, _), last = self.matrix
-        if fx <= 0.0 or fy <= 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
+        (fx, skew, _), (below, fy, _), last = self.matrix
+        if fx <= 0.0 or fy <= 0.0 or skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
             text = "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
             raise Contradiction(Problem(("matrix",), text))
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
@@ -147,6 +144,8 @@ class Camera(Section):
                 "[k1, k2, p1, p2, k3], 8, 12 or 14"
             )
             raise Contradiction(Problem(("distortion",), text))
+        if problems := implausible_camera(self.matrix, self.distortion):
+            raise Contradiction(*problems)
         return self
 
 
@@ -158,6 +157,9 @@ ARUCO_DICTIONARIES = (
 )
 """Names of OpenCV's predefined marker dictionaries."""
 
+_FAMILIES = {"ORIGINAL": 1024, "36h12": 250, "16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587}
+"""Markers of the dictionaries whose name does not tell."""
+
 
 class Board(Section):
     """A plane board with ArUco markers; it defines the frame in which everything is measured."""
@@ -168,19 +170,30 @@ class Board(Section):
     """Side of the black square of a marker [m]."""
     standoff: NonNegative = 0.0
     """Distance of the cable's axis in front of the board [m]; other than 0 needs a camera."""
-    marker_centers: Annotated[dict[Annotated[int, Field(ge=0)], Vector], Field(min_length=1)]
+    marker_centers: Annotated[
+        dict[Annotated[int, Field(ge=0)], Vector],
+        Field(min_length=1, max_length=max(_FAMILIES.values())),
+    ]
     """Centre of each marker by its id: {0: [x, y], 1: [x, y], ...} [m]."""
 
     @model_validator(mode="after")
     def _plausible(self) -> Board:
+        sizes = MARKER.problems(("marker_size",), self.marker_size)
+        sizes += COORDINATE.problems(("standoff",), self.standoff)
+        for i, center in self.marker_centers.items():
+            for value in center:
+                sizes += COORDINATE.problems(("marker_centers", i), value)
+        if sizes:
+            raise Contradiction(*sizes)
         if self.dictionary not in ARUCO_DICTIONARIES:
             hint = did_you_mean(self.dictionary, ARUCO_DICTIONARIES)
             text = f"OpenCV has no dictionary {self.dictionary!r}{hint}"
             raise Contradiction(Problem(("dictionary",), text))
         size = self.dictionary.rsplit("_", 1)[1]
-        too_large = [i for i in self.marker_centers if size.isdigit() and i >= int(size)]
+        count = int(size) if size.isdigit() else _FAMILIES[size]
+        too_large = [i for i in self.marker_centers if i >= count]
         if too_large:
-            text = f"{self.dictionary} has no marker {too_large[0]}: its ids end at {int(size) - 1}"
+            text = f"{self.dictionary} has no marker {too_large[0]:g}: its ids end at {count - 1}"
             raise Contradiction(Problem(("marker_centers",), text))
         for (i, a), (j, b) in itertools.combinations(self.marker_centers.items(), 2):
             if math.dist(a, b) < self.marker_size:
@@ -205,6 +218,12 @@ class Reference(Section):
         for name, (a, b) in (("pixels", self.pixels), ("points", self.points)):
             if a == b:
                 raise Contradiction(Problem((name,), f"the two points are the same: {list(a)}"))
+        if problems := implausible_pixels(("pixels",), [x for pair in self.pixels for x in pair]):
+            raise Contradiction(*problems)
+        for k, point in enumerate(self.points):
+            for value in point:
+                if problems := COORDINATE.problems(("points", k), value):
+                    raise Contradiction(*problems)
         return self
 
 
@@ -341,7 +360,7 @@ class DeclaredEffect(Section):
 class ModelOptions(Section):
     """The declared model."""
 
-    n: Annotated[int, Field(strict=True, ge=2, le=2000)] | None = None
+    n: Annotated[Count, Field(ge=MESH.least, le=MESH.most)] | None = None
     """Number of elements; chosen from the data when absent."""
     element: Literal["quadratic", "arc", "link"] = "quadratic"
     """quadratic (the heading bows in an element: fourth order), arc (it varies linearly: second
@@ -369,7 +388,9 @@ class EstimationOptions(Section):
     """Whether outlying points weigh less."""
     plausibility: Switch = True
     """Whether contradictions of the configuration stop the fit, or leave out a single pose."""
-    rest_curvature_coefficients: Count | None = None
+    rest_curvature_coefficients: (
+        Annotated[Count, Field(ge=REST_COEFFICIENTS.least, le=REST_COEFFICIENTS.most)] | None
+    ) = None
     """Number of coefficients of the rest curvature; chosen from the data when absent."""
 
 

@@ -29,7 +29,7 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
         if item.readable and not item.held_out:
             places = np.maximum.accumulate(chord_places(item, length))
             line = np.stack([np.interp(grid, places, item.points[:, i]) for i in (0, 1)], axis=1)
-            groups.setdefault(tuple(item.pose.vector), []).append(line)
+            groups.setdefault(tuple(item.pose.ends), []).append(line)
     squares = []
     for curves in groups.values():
         for k, curve in enumerate(curves):

@@ -26,6 +26,7 @@ from scipy.stats import chi2, f
 
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.effects import StateEffect
 from dlo_casadi.estimation.fit import carried_shapes
 from dlo_casadi.estimation.gauss_newton import (
     NO_INFORMATION,
@@ -71,7 +72,7 @@ def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
     model = fit.model
     for candidate in listed:
         if not candidate.nuisance:
-            model = model.with_effect(candidate.effect)
+            model = model.with_effect(candidate.effect.linear())
     return model
 
 
@@ -95,12 +96,18 @@ class _Linearized:
         columns = [unknowns.names.index(name) for name in names]
         slopes = unknowns.slopes(point.theta)[:, columns]
         still = np.zeros((len(rest), len(columns)))
-        along = problem.sweep.directions(point.shapes, p, rest, slopes, still)
-        seen = problem.sweep.observe(point.shapes, p, rest, along)
+        shapes = with_springs(problem.sweep, point.shapes, p, rest)
+        along = problem.sweep.directions(shapes, p, rest, slopes, still)
+        seen = problem.sweep.observe(shapes, p, rest, along)
         for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
             curve = problem.curve_of(seen.z[j])
             moved = problem.measured[j].line.residual_along(curve, s, seen.slopes[j])
             self.lin.by_theta[k][:, columns] = problem.whitening(j, s) @ moved[:, : len(columns)]
+
+
+def with_springs(sweep: Sweep, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Shapes:
+    """Shapes in which springs that do not pull yet are where they hang on the cable."""
+    return sweep.solve(shapes, p, rest)[0] if sweep.model.n_springs else shapes
 
 
 class Screen:
@@ -113,10 +120,20 @@ class Screen:
         # Nuisances that are candidates enter twice: with their prior, and free.
         self.free = fit.free_in(self.model)
         self.p = fit.values_in(self.model)
-        # What scans change the derivatives of.
+        # What scans change the derivatives of, within each pose.
         self.moving = tuple(
-            name for c in self.listed if len(c.scans) > 1 for name in c.screened if not c.nuisance
+            name
+            for c in self.listed
+            if len(c.scans) > 1 and not isinstance(c.effect, StateEffect)
+            for name in c.screened
         )
+        self.carried = {
+            name
+            for c in self.listed
+            if isinstance(c.effect, StateEffect)
+            for scan in c.scans
+            for name in scan
+        }
         self.sweep: Sweep | None = None
         self.shapes: Shapes | None = None
         self.still: _Linearized | None = None
@@ -126,7 +143,8 @@ class Screen:
         p = self.p.copy()
         for name, value in scan.items():
             p[self.model.names.index(name)] = value
-        if self.still is None or self.fit.model.has_state:
+        # What a pose leaves behind acts through all later ones.
+        if self.still is None or self.fit.model.has_state or not self.carried.isdisjoint(scan):
             self.still = self._linearized(p)
         else:
             self.still.move(self.moving, p)
@@ -151,6 +169,8 @@ class Screen:
         if self.shapes is None:
             self.shapes = carried_shapes(larger, self.fit)
         theta = unknowns.pack(p, self.fit.coefficients)
+        rest = unknowns.rest(theta)
+        self.shapes = with_springs(larger.sweep, self.shapes, p, rest)
         point = replace(self.fit.point, theta=theta, shapes=self.shapes)
         return _Linearized(larger, point, larger.linearize(point))
 
@@ -205,35 +225,54 @@ class Screen:
         u = u + h_cb @ solved[:, -1]
         scale = np.sqrt(np.maximum(np.diag(h_cc), 1e-300))
         scaled = information / np.outer(scale, scale)
-        values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-        seen = values > COLLINEAR
-        along = vectors.T @ (u / scale)
-        step = (vectors[:, seen] @ (along[seen] / values[seen])) / scale
-        score = float((along[seen] ** 2 / values[seen]).sum())
-        dof = int(seen.sum())
-        score = self._within_bounds(candidate, step, score)
+        score, step, dof = _best_step((scaled + scaled.T) / 2, u / scale)
+        inside = ~self._below(candidate, step / scale)
+        if not inside.all():
+            part = scaled[np.ix_(inside, inside)]
+            score, step[inside], _ = _best_step((part + part.T) / 2, (u / scale)[inside])
+            step[~inside] = 0.0
+        step = step / scale
         n_places = max(1.0, len(candidate.scans) / 3)
         single = survival(score, max(dof, 1), noise_dof)
         p_value = float(min(1.0, -np.expm1(n_places * np.log1p(-min(single, 1 - 1e-16)))))
-        start = dict(candidate.scans[k])
+        values = dict(candidate.scans[k])
         for name, change in zip(candidate.screened, step, strict=True):
             i = self.model.names.index(name)
             parameter = self.model.parameters[i]
             value = self.p[i] + change * parameter.scale
-            start[name] = float(np.clip(value, parameter.lower, parameter.upper))
-        return Screened(candidate, score, p_value, start)
+            values[name] = float(np.clip(value, parameter.lower, parameter.upper))
+        return Screened(candidate, score, p_value, self._own(candidate, values))
 
-    def _within_bounds(self, candidate: Candidate, step: FloatArray, score: float) -> float:
-        """Zero where a candidate's one parameter would fall below a bound at which it vanishes.
+    def _own(self, candidate: Candidate, values: dict[str, float]) -> dict[str, float]:
+        """Qualified parameters of the candidate's effect from those of its score test."""
+        effect, cable = candidate.effect, self.model.cable
+        prefix = f"{effect.label}."
+        own = effect.of_linear(cable, {k.removeprefix(prefix): v for k, v in values.items()})
+        bounded = {
+            q.name: float(np.clip(own[q.name], q.lower, q.upper)) for q in effect.parameters(cable)
+        }
+        return {prefix + name: value for name, value in bounded.items()}
 
-        Steps of several parameters and beyond other bounds keep their score: a refit decides.
+    def _below(self, candidate: Candidate, step: FloatArray) -> NDArray[np.bool_]:
+        """Which parameters would fall below a bound at which they vanish.
+
+        Steps beyond other bounds are left to a refit.
         """
-        if len(step) != 1:
-            return score
-        i = self.model.names.index(candidate.screened[0])
-        parameter = self.model.parameters[i]
-        below = self.p[i] + step[0] * parameter.scale < parameter.lower
-        return 0.0 if below and parameter.lower == parameter.nominal else score
+        below = []
+        for name, change in zip(candidate.screened, step, strict=True):
+            i = self.model.names.index(name)
+            q = self.model.parameters[i]
+            below.append(q.lower == q.nominal and self.p[i] + change * q.scale < q.lower)
+        return np.array(below)
+
+
+def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, FloatArray, int]:
+    """Largest gain of 2 slope . x - x . information x: (gain, x, directions that are seen)."""
+    values, vectors = np.linalg.eigh(information)
+    seen = values > COLLINEAR
+    along = vectors.T @ slope
+    step = vectors[:, seen] @ (along[seen] / values[seen])
+    return float((along[seen] ** 2 / values[seen]).sum()), step, int(seen.sum())
 
 
 def survival(score: float, dof: int, noise_dof: float) -> float:

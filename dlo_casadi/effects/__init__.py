@@ -14,6 +14,8 @@ from dlo_casadi.effects.effect import (
     MeasurementEffect,
     PointForceAt,
     SectionLaw,
+    Sight,
+    SpringAt,
     StateEffect,
 )
 from dlo_casadi.effects.end_offset import EndOffset
@@ -23,11 +25,14 @@ from dlo_casadi.effects.image_distortion import ImageDistortion
 from dlo_casadi.effects.image_scale import ImageScale
 from dlo_casadi.effects.length_error import LengthError
 from dlo_casadi.effects.lumped_mass import LumpedMass
+from dlo_casadi.effects.plastic_set import PlasticSet
 from dlo_casadi.effects.point_force import PointForce
 from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
 from dlo_casadi.effects.side_load import SideLoad
+from dlo_casadi.effects.standoff_error import StandoffError
 from dlo_casadi.effects.stiff_section import StiffSection
 from dlo_casadi.effects.stiffness_gradient import StiffnessGradient
+from dlo_casadi.effects.tether import Tether
 from dlo_casadi.effects.unknown_pull import UnknownPull
 
 EFFECTS: dict[str, type[Effect]] = {
@@ -35,6 +40,7 @@ EFFECTS: dict[str, type[Effect]] = {
     for effect in (
         LumpedMass,
         PointForce,
+        Tether,
         SideLoad,
         GravityTilt,
         StiffnessGradient,
@@ -47,8 +53,10 @@ EFFECTS: dict[str, type[Effect]] = {
         ClampAngle,
         EndOffset,
         RestCurvatureDrift,
+        PlasticSet,
         ImageScale,
         ImageDistortion,
+        StandoffError,
     )
 }
 
@@ -72,14 +80,19 @@ __all__ = [
     "Load",
     "LumpedMass",
     "MeasurementEffect",
+    "PlasticSet",
     "PointForce",
     "PointForceAt",
     "RestCurvatureDrift",
     "SectionLaw",
     "SideLoad",
+    "Sight",
+    "SpringAt",
+    "StandoffError",
     "StartSpring",
     "StateEffect",
     "StiffSection",
     "StiffnessGradient",
+    "Tether",
     "UnknownPull",
 ]

@@ -76,6 +76,44 @@ class PointForceAt:
 
 
 @dataclass(frozen=True)
+class SpringAt:
+    """A spring from the arc length `position` [m] of the cable, at the place y (dimension,) [m].
+
+        V(y) = stiffness |y|^2 / 2 - force . y + constant               [J]
+
+    of the stiffness k [N/m] and the force (dimension,) [N] on it at the origin: k times the anchor.
+    """
+
+    stiffness: ca.SX
+    force: ca.SX
+    constant: ca.SX
+    position: ca.SX
+
+    def energy(self, place: ca.SX) -> ca.SX:
+        """Energy [J] at a place."""
+        return self.stiffness * ca.sumsqr(place) / 2 - ca.dot(self.force, place) + self.constant
+
+
+@dataclass(frozen=True)
+class Sight:
+    """From where the points of a pose are measured: symbols of one pose.
+
+    Parameters
+    ----------
+    start : (2,) [m]
+        The start fixture.
+    camera : (2,) [1]
+        The camera's centre (x, y) over its distance z from the cable's declared plane.
+    nearness : scalar [1/m]
+        1/z. Both are zero where no camera is known: it then sees from infinity, straight on.
+    """
+
+    start: ca.SX
+    camera: ca.SX
+    nearness: ca.SX
+
+
+@dataclass(frozen=True)
 class Effect:
     """Something that acts on a cable. Subclasses fill the slot that gives them their base.
 
@@ -99,6 +137,18 @@ class Effect:
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Parameters with units, bounds and the nominal value at which the effect vanishes."""
         raise TypeError(f"{type(self).__name__} declares no parameters")
+
+    def linear(self) -> Effect:
+        """Return the same effect, of the same label, in parameters for its score test.
+
+        Those are another choice where a parameter tells nothing at the value at which the effect
+        vanishes although the effect is linear in several at once.
+        """
+        return self
+
+    def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
+        """Own parameters from those of `linear`."""
+        return dict(values)
 
 
 class SectionLaw(Effect):
@@ -148,6 +198,13 @@ class Load(Effect):
     """Slot `load`: forces with a potential. Loads add; all share one gravity."""
 
     slot: ClassVar[str] = "load"
+    # Number of `springs`; without any the forces stay the same whatever the shape.
+    n_springs: ClassVar[int] = 0
+
+    @property
+    def dead(self) -> bool:
+        """Whether the forces stay the same whatever the shape."""
+        return self.n_springs == 0
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
         """Return the direction and size of gravity (2,) [m/s^2] that every weight feels."""
@@ -163,6 +220,10 @@ class Load(Effect):
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """Forces of the load on single places of the cable."""
+        return ()
+
+    def springs(self, params: Params) -> tuple[SpringAt, ...]:
+        """Springs from single places of the cable."""
         return ()
 
 
@@ -185,15 +246,13 @@ class MeasurementEffect(Effect):
 
     slot: ClassVar[str] = "measurement"
 
-    def observe(self, point: ca.SX, heading: ca.SX, start: ca.SX, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Where the camera believes the true point (2,) [m] to be. Maps apply in order.
 
         Parameters
         ----------
         heading : scalar [rad]
             Direction of the cable at the point.
-        start : (2,) [m]
-            The start fixture.
         """
         raise TypeError(f"{self.name} has no measurement map")
 
@@ -203,6 +262,6 @@ class StateEffect(Effect):
 
     slot: ClassVar[str] = "state"
 
-    def next_rest(self, rest: ca.SX, curvature: ca.SX, params: Params) -> ca.SX:
+    def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Rest curvature [1/m] of a cell after a pose of this curvature has been held."""
         raise TypeError(f"{self.name} has no law of the state")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params
+from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
 from dlo_casadi.parameters import Parameter
 
 
@@ -25,6 +25,6 @@ class ImageScale(MeasurementEffect):
         """Declare the factor."""
         return (Parameter("factor", nominal=1.0, scale=0.002, lower=0.7, upper=1.4),)
 
-    def observe(self, point: ca.SX, heading: ca.SX, start: ca.SX, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Scale about the start fixture."""
-        return start + params["factor"] * (point - start)
+        return sight.start + params["factor"] * (point - sight.start)

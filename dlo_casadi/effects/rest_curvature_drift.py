@@ -25,6 +25,6 @@ class RestCurvatureDrift(StateEffect):
         """Declare the rate."""
         return (Parameter("rate", scale=0.05, lower=0.0, upper=0.95),)
 
-    def next_rest(self, rest: ca.SX, curvature: ca.SX, params: Params) -> ca.SX:
+    def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Rest curvature after the pose [1/m]."""
         return rest + params["rate"] * (curvature - rest)

@@ -30,6 +30,7 @@ from dlo_casadi.equilibrium import stats_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import normal_rows
+from dlo_casadi.model import POSE_SIZE
 from dlo_casadi.whole_pose import PoseSymbols, balance, curve, rest_after
 
 FloatArray = NDArray[np.floating]
@@ -132,7 +133,7 @@ class _BatchNlp:
         self.problem = problem
         unknowns, model = problem.unknowns, problem.unknowns.model
         self.poses = list(range(problem.sweep.m)) if model.has_state else list(problem.used)
-        self.n_x, self.n_lam = problem.sweep.assembly.n, model.n_conditions
+        self.n_x, self.n_lam = problem.sweep.assembly.n, model.n_border
         self.columns = problem.sweep.used_deviations
         self.n_dev = len(self.columns)
         self.n_rest = model.chain.n_cells if model.has_state else 0
@@ -151,7 +152,7 @@ class _BatchNlp:
         unknowns, model = problem.unknowns, problem.unknowns.model
         theta = ca.SX.sym("theta", unknowns.size)
         own = ca.SX.sym("own", self.stride)
-        ends = ca.SX.sym("ends", 6)
+        pose = ca.SX.sym("pose", POSE_SIZE)
         x, lam, dev, rest = self._split(own)
         deviation = ca.SX.zeros(len(DEVIATIONS))
         for k, column in enumerate(self.columns):
@@ -159,20 +160,20 @@ class _BatchNlp:
         if not model.has_state:
             rest = unknowns.symbolic_rest(theta)
         p = unknowns.symbolic_p(theta)
-        pose = PoseSymbols(x, lam * self.force, p, rest, ends, deviation)
+        symbols = PoseSymbols(x, lam * self.force, p, rest, pose, deviation)
         scale = np.concatenate(
             [
                 np.full(self.n_x, 1 / (self.force * model.cable.length)),
                 np.full(self.n_lam, 1 / model.cable.length),
             ]
         )
-        imbalance = balance(model, pose) * scale
-        z = curve(model, pose)
+        imbalance = balance(model, symbols) * scale
+        z = curve(model, symbols)
         after = ca.SX.zeros(0)
         if model.has_state:
-            after = rest_after(model, pose) / model.cable.curvature_scale
+            after = rest_after(model, symbols) / model.cable.curvature_scale
         both = ca.vertcat(own, theta)
-        given = [own, theta, ends]
+        given = [own, theta, pose]
         self.value = ca.Function("value", given, [imbalance, z, after])
         blocks = [ca.densify(ca.jacobian(block, both)) for block in (imbalance, z, after)]
         self.slope = ca.Function("slope", given, blocks)
@@ -275,6 +276,8 @@ class _BatchNlp:
                 "ipopt.mu_init": 1e-6,
                 "ipopt.bound_push": 1e-9,
                 "ipopt.bound_frac": 1e-9,
+                # IPOPT widens bounds by 1e-8; what it returns must lie within them.
+                "ipopt.honor_original_bounds": "yes",
                 "ipopt.nlp_scaling_method": "none",
             },
         )

@@ -209,7 +209,9 @@ def carried_shapes(problem: BatchProblem, start: Fit) -> Shapes:
             raise EstimationError(error.message) from error
         rows.append((found.x, found.multipliers, np.zeros(len(DEVIATIONS))))
     x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
-    return on_other_mesh(Shapes(x, lam, deviation), start.model, problem.unknowns.model)
+    model = problem.unknowns.model
+    shapes = with_border_of(Shapes(x, lam, deviation), start.model, model)
+    return on_other_mesh(shapes, start.model, model)
 
 
 def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
@@ -218,6 +220,17 @@ def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shape
         return shapes
     coarse, fine = model.chain.places, other.chain.places
     return replace(shapes, x=other.chain.kind.node.interpolated(fine, coarse, shapes.x))
+
+
+def with_border_of(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
+    """Multipliers in another model's order; what it has beside them begins at zero."""
+    if model.border_names == other.border_names:
+        return shapes
+    lam = np.zeros((len(shapes.lam), other.n_border))
+    for i, name in enumerate(other.border_names):
+        if name in model.border_names:
+            lam[:, i] = shapes.lam[:, model.border_names.index(name)]
+    return replace(shapes, lam=lam)
 
 
 def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:

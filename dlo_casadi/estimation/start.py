@@ -44,7 +44,8 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     if plain != chain.element:
         sweep = Sweep(model.with_mesh(chain.n, plain), problem.sweep.poses)
     flat = np.zeros(chain.n_cells)
-    x = np.array([guesses(model, item.pose, flat)[0] for item in problem.measured])[..., None]
+    first = [guesses(model, model.nominal, flat, item.pose)[0] for item in problem.measured]
+    x = np.array(first)[..., None]
     feet: list[FloatArray] = []
     for j in used:
         places = chord_places(problem.measured[j], chain.length)

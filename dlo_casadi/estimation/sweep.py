@@ -55,7 +55,7 @@ class Sweep:
 
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes of these nodes (m, n_nodes, coordinates), without forces and deviations."""
-        return Shapes.declared(x, np.zeros((self.m, self.model.n_conditions)))
+        return Shapes.declared(x, np.zeros((self.m, self.model.n_border)))
 
     # ---- state -----------------------------------------------------------------------------------
 
@@ -81,6 +81,11 @@ class Sweep:
     def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Rest curvature (n_cells,) that the last pose leaves behind."""
         return self._after(self.m - 1, shapes, p, self.rests(shapes, p, rest))[0]
+
+    def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """Curvature minus the rest curvature that each pose finds (m, n_cells) [1/m]."""
+        given = self._given(shapes, p, rest)
+        return self.assembly.strain(shapes, given) - given.rest
 
     def _given(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Given:
         return Given.of(p, self.rests(shapes, p, rest), self._ends)
@@ -292,7 +297,7 @@ class Sweep:
         negative = matrix.factor().negative
         bends = self.node.difference(shapes.x[:, :-1], shapes.x[:, 1:])
         free = np.abs(bends).max(axis=(1, 2)) < JOINT_BOUND
-        return np.asarray((negative == self.model.n_conditions) & free)
+        return np.asarray((negative == self.model.n_multipliers) & free)
 
 
 def _still(a: Assembly, m: int, rest: FloatArray, p: FloatArray) -> Directions:

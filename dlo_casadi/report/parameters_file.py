@@ -18,7 +18,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.config import Config, dump_yaml, implausible_sizes, read_yaml
+from dlo_casadi.config import (
+    MESH,
+    REST_COEFFICIENTS,
+    Config,
+    Place,
+    Range,
+    dump_yaml,
+    implausible_gravity,
+    implausible_sizes,
+    read_document,
+    show,
+)
 from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.result import Fit
@@ -32,6 +43,9 @@ FloatArray = NDArray[np.floating]
 
 SCHEMA = "dlo-parameters/1"
 FILE = "parameters.yaml"
+# A value at a bound may miss it by so much of the bound, or of the parameter's scale: rounding of
+# value = nominal + scale x, or exp(x), some 1e-14; and what solvers leave of a bound.
+_ROUNDING = 1e-9
 # Folders of results that a message lists.
 _LISTED = 5
 # What a prediction depends on beside the values of the parameters.
@@ -85,6 +99,14 @@ class Metadata:
     config: str
     versions: dict[str, str]
     document: dict[str, Any]
+
+
+class _DamagedError(DloError):
+    """What is wrong in a file, and where."""
+
+    def __init__(self, place: Place, message: str) -> None:
+        super().__init__(f"{'.'.join(map(str, place))}{message}")
+        self.place = place
 
 
 class Parameters(NamedTuple):
@@ -293,7 +315,8 @@ def load_parameters(path: str | Path) -> Parameters:
             raise ConfigError(f"no {FILE} in this folder.{_results_near(source)}", source.parent)
     elif not os.path.exists(source):
         raise ConfigError(f"no such file or folder of results.{_results_near(source)}", source)
-    document = read_yaml(source)
+    file = read_document(source)
+    document = file.data
     if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         found = document.get("schema") if isinstance(document, dict) else type(document).__name__
         raise ConfigError(
@@ -301,14 +324,20 @@ def load_parameters(path: str | Path) -> Parameters:
             "  Try: the parameters.yaml in the results folder of a fit.",
             source,
         )
+    line = None
     try:
         return _rebuild(document, source)
+    except _DamagedError as error:
+        wrong, line = error.message, file.line(error.place)
     except DloError as error:
-        raise ConfigError(f"damaged parameters: {error.message}", source) from None
+        wrong = error.message
     except KeyError as error:
-        raise ConfigError(f"damaged parameters: {error.args[0]} is missing", source) from None
-    except (TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(f"damaged parameters: {error}", source) from None
+        wrong = f"{error.args[0]} is missing"
+    except (TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        wrong = str(error)
+    raise ConfigError(
+        f"damaged parameters: {wrong}.\n  Try: the file as a fit has written it.", source, line
+    )
 
 
 def _results_near(path: Path) -> str:
@@ -340,20 +369,28 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         name=str(declared["name"]),
         straight=declared["rest_shape"] == "straight",
     )
-    for (key, *_), message in implausible_sizes(cable.length, cable.mass, cable.diameter):
-        raise DloError(f"cable.{key}: {message}")
+    for place, message in implausible_sizes(
+        cable.length, cable.mass, cable.diameter, cable.bending_stiffness
+    ):
+        raise _DamagedError(("cable", *place), f": {message}")
     gravity = _numbers(document["gravity"], 2, "gravity")
+    for place, message in implausible_gravity((float(gravity[0]), float(gravity[1]))):
+        raise _DamagedError(place, f": {message}")
     boundary = document["boundary"]
     tolerances = {name: row.get("tolerance") for name, row in rows.items()}
     model = CableModel(
         cable=cable,
-        n=int(document["n"]),
+        n=_count(document, "n", MESH),
         element=_one_of(document["element"], tuple(ELEMENTS), "element"),
-        start=_one_of(boundary["start"], ("pinned", "clamped"), "boundary.start"),
-        end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary.end"),
+        start=_one_of(boundary["start"], ("pinned", "clamped"), "boundary", "start"),
+        end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary", "end"),
         gravity=(float(gravity[0]), float(gravity[1])),
-        effects=tuple(_effect(row) for row in document["effects"]),
-        n_rest=int(document["n_rest"]),
+        effects=tuple(_effect(row, k) for k, row in enumerate(document["effects"])),
+        n_rest=_count(
+            document,
+            "n_rest",
+            REST_COEFFICIENTS._replace(least=0) if cable.straight else REST_COEFFICIENTS,
+        ),
         priors={name: float(std) for name, std in tolerances.items() if std is not None},
     )
     if set(rows) != set(model.names):
@@ -383,56 +420,91 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     return Parameters(
         model,
         _numbers(values, len(values), "parameters"),
-        _numbers(rest, model.chain.n_cells, "state.rest_curvature"),
+        _numbers(rest, model.chain.n_cells, "state", "rest_curvature"),
         metadata,
     )
 
 
-def _effect(row: Mapping[str, Any]) -> Effect:
+def _effect(row: Mapping[str, Any], k: int) -> Effect:
     name = row["name"]
     if name not in _KNOWN:
-        raise DloError(f"no effect is called {name!r}; known: {', '.join(_KNOWN)}")
-    options: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value
-        for key, value in row.items()
-        if key != "name"
-    }
+        raise _DamagedError(
+            ("effects", k), f": no effect is called {name!r}; known: {', '.join(_KNOWN)}"
+        )
+    kinds = {item.name: item.default for item in fields(_KNOWN[name])}
+    options: dict[str, Any] = {}
+    for key, value in row.items():
+        if key == "name":
+            continue
+        if key not in kinds:
+            raise _DamagedError(("effects", k, key), f": {name} knows {', '.join(kinds)}")
+        options[key] = tuple(value) if isinstance(value, list) else value
+        if not _is_like(options[key], kinds[key]):
+            raise _DamagedError(
+                ("effects", k, key),
+                f": something like {kinds[key]!r} belongs here, found {show(value)}",
+            )
     return _KNOWN[name](**options)
+
+
+def _is_like(value: Any, example: Any) -> bool:
+    """Whether an effect's option is of the kind of its default; numbers are finite."""
+    if isinstance(example, tuple):
+        return (
+            isinstance(value, tuple)
+            and len(value) == len(example)
+            and all(_is_like(*pair) for pair in zip(value, example, strict=True))
+        )
+    if isinstance(example, float):
+        return _is_number(value) and math.isfinite(value)
+    return isinstance(value, type(example))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _positive(section: Mapping[str, Any], where: str, key: str) -> float:
     value = section[key]
-    if not isinstance(value, int | float) or not 0 < value < math.inf:
-        raise DloError(f"{where}.{key} must be a positive number, found {value!r}")
+    if not _is_number(value) or not 0 < value < math.inf:
+        raise _DamagedError((where, key), f" must be a positive number, found {show(value)}")
     return float(value)
+
+
+def _count(document: Mapping[str, Any], key: str, allowed: Range) -> int:
+    value = document[key]
+    if not _is_number(value) or value not in allowed or value != int(value):
+        raise _DamagedError((key,), f" must be a whole number, found {show(value)}: {allowed}")
+    return int(value)
 
 
 def _within_bounds(q: Parameter, row: Mapping[str, Any]) -> float:
     """Value of a parameter, within the bounds of the file and of the model."""
-    value = row["value"]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise DloError(f"parameters.{q.name}.value must be finite, found {value!r}")
+    value, place = row["value"], ("parameters", q.name, "value")
+    if not _is_number(value) or not math.isfinite(value):
+        raise _DamagedError(place, f" must be finite, found {show(value)}")
     lower = max(q.lower, -math.inf if row.get("lower") is None else float(row["lower"]))
     upper = min(q.upper, math.inf if row.get("upper") is None else float(row["upper"]))
-    slack = 1e-9 * q.scale  # of the solver, which may end beside a bound by so much
-    if (q.log and value <= 0) or not lower - slack <= value <= upper + slack:
-        raise DloError(
-            f"parameters.{q.name}.value: {value:g} {q.unit} lies outside of its bounds "
-            f"[{lower:g}, {upper:g}]. Try: the file as a fit has written it"
+    beyond = max(lower - value, value - upper)
+    bound = lower if lower > value else upper
+    if (q.log and value <= 0) or beyond > _ROUNDING * max(q.scale, abs(bound)):
+        raise _DamagedError(
+            place,
+            f": {value:.12g} {q.unit} lies outside of its bounds [{lower:.12g}, {upper:.12g}]",
         )
     return float(value)
 
 
-def _numbers(values: Sequence[Any], size: int, where: str) -> FloatArray:
+def _numbers(values: Sequence[Any], size: int, *where: str) -> FloatArray:
     array = np.array(values, dtype=float)
     if array.shape != (size,):
-        raise DloError(f"{where}: {size} numbers belong here, found {array.size}")
+        raise _DamagedError(where, f": {size} numbers belong here, found {array.size}")
     if not np.all(np.isfinite(array)):
-        raise DloError(f"{where}: all numbers must be finite")
+        raise _DamagedError(where, ": all numbers must be finite")
     return array
 
 
-def _one_of(value: Any, allowed: tuple[str, ...], where: str) -> Any:
+def _one_of(value: Any, allowed: tuple[str, ...], *where: str) -> Any:
     if value not in allowed:
-        raise DloError(f"{where} must be {' or '.join(allowed)}, found {value!r}")
+        raise _DamagedError(where, f" must be {' or '.join(allowed)}, found {show(value)}")
     return value

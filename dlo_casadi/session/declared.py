@@ -141,6 +141,12 @@ def declared_model(
     fixed: list[str] = []
     for item in options.effects:
         _check_name(item.name, "model.effects", config)
+        if item.name == "standoff_error" and not _camera(config):
+            raise ConfigError(
+                "model.effects: standoff_error is a shift along the rays of a calibrated camera, "
+                "and none is declared. Try: measurement.camera, or image_scale",
+                config.path,
+            )
         effect = make_effect(item.name, model, center)
         model = model.with_effect(effect)
         known = [q.name for q in effect.parameters(cable)]
@@ -159,6 +165,14 @@ def declared_model(
     declared = experiment.tolerances
     tolerances = Tolerances(declared.length, declared.end, declared.heading, declared.scale)
     return Declared(nuisances(model, tolerances, pixel), values, tuple(fixed), tolerances)
+
+
+def _camera(config: Config) -> bool:
+    """Whether it can be told from the photographs where the camera stood."""
+    measurement = config.experiment.measurement
+    if measurement.kind != "images" or measurement.board is None:
+        return False
+    return measurement.camera is not None
 
 
 def _check_name(name: str, where: str, config: Config) -> None:

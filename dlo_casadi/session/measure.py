@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -76,7 +77,12 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
         reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
         raise MeasurementError(f"no fit pose could be read:\n{reasons}")
     return tuple(
-        MeasuredPose(conditions(pose), item.points, item.weight, pose.role == "held_out")
+        MeasuredPose(
+            replace(conditions(pose), camera_center=item.camera_center),
+            item.points,
+            item.weight,
+            pose.role == "held_out",
+        )
         for pose, item in zip(config.experiment.poses, inputs, strict=True)
     )
 
@@ -133,6 +139,7 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
         pixels=line.pixels[kept],
         to_pixels=view.to_pixels,
         center=tuple(view.to_board([[image.shape[1] / 2, image.shape[0] / 2]])[0]),
+        camera_center=None if view.camera_center is None else tuple(view.camera_center),
         pixel=1.0 / view.scale,
         weight=(line.std / np.median(line.std))[kept],
         coverage=line.coverage,

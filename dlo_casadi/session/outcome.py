@@ -161,6 +161,8 @@ class PoseInput:
         Why the pose could not be read, if so.
     center : (float, float), optional [m]
         Middle of the photograph in the board frame.
+    camera_center : (float, float, float), optional [m]
+        Where a calibrated camera stood, see `equilibrium.Pose`.
     pixel : float, optional [m]
         Size of a pixel on the board.
     weight : (K,), optional
@@ -183,6 +185,7 @@ class PoseInput:
     to_pixels: Any = None
     problem: str = ""
     center: tuple[float, float] | None = None
+    camera_center: tuple[float, float, float] | None = None
     pixel: float | None = None
     weight: FloatArray | None = None
     coverage: float | None = None

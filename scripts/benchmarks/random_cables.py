@@ -14,38 +14,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
-from dlo_casadi.codegen.compiled import CompiledSolver
+from dlo_casadi.codegen.compiled import shape_record
 from dlo_casadi.codegen.generate import generate, numbers_of
 from dlo_casadi.codegen.kernels import kernels_of
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model import CableModel
+from dlo_casadi.initial import limited
+from dlo_casadi.model import CableModel, EndKind, StartKind
 
 FloatArray = NDArray[np.floating]
+
+BOUNDARIES: tuple[tuple[StartKind, EndKind], ...] = (
+    *(("pinned", "pinned"), ("clamped", "pinned"), ("pinned", "clamped"), ("clamped", "clamped")),
+    *(("pinned", "free"), ("clamped", "free")),
+)
 
 # The public functions read the solver's own table; this one is given another.
 _WITH_TABLE = """
 void dlo_batch_with(const double *table, const dlo_pose *poses, size_t count, dlo_branch branch,
-                    dlo_shape *shapes, dlo_status *statuses, double *work, size_t work_size);
+                    const dlo_shape *warm, dlo_shape *shapes, dlo_status *statuses, double *work,
+                    size_t work_size);
 void dlo_batch_with(const double *table, const dlo_pose *poses, size_t count, dlo_branch branch,
-                    dlo_shape *shapes, dlo_status *statuses, double *work, size_t work_size)
+                    const dlo_shape *warm, dlo_shape *shapes, dlo_status *statuses, double *work,
+                    size_t work_size)
 {
     size_t i;
     for (i = 0; i < count; ++i)
-        statuses[i] = solve_one(table, poses + i, branch, 0, shapes + i, work, work_size);
+        statuses[i] = solve_one(table, poses + i, branch, warm ? warm + i : 0, shapes + i, work,
+                                work_size);
 }
 """
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One random cable with its ends (m, 2)."""
+    """One random cable with its ends (m, 2) and the headings (m, 2) of its clamps."""
 
     model: CableModel
     rest: FloatArray
     ends: FloatArray
+    headings: FloatArray
+
+    def pose(self, i: int) -> Pose:
+        """One pose for the Python solver."""
+        end, (first, last), model = self.ends[i], self.headings[i], self.model
+        return Pose(
+            (0.0, 0.0),
+            None if model.end == "free" else (float(end[0]), float(end[1])),
+            float(first) if model.start == "clamped" else None,
+            float(last) if model.end == "clamped" else None,
+        )
 
 
 def random_problem(
@@ -66,7 +86,46 @@ def random_problem(
     rest *= rng.uniform(0.0, 4 * np.pi) / turn
     radius = 0.995 * np.sqrt(rng.uniform(size=poses))
     angle = rng.uniform(-np.pi, np.pi, size=poses)
-    return Problem(model, rest, radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1))
+    ends = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return Problem(model, rest, ends, np.zeros((poses, 2)))
+
+
+def held_problem(
+    rng: np.random.Generator, start: StartKind, end: EndKind, poses: int, n: int = 16
+) -> Problem:
+    """A cable of 1 m of any ratio of stiffness to weight, held anywhere in any directions.
+
+    EI over weight L^3 from 0.003 to 3, rest curvature up to half a turn, uniform for every other
+    cable; chords from 0.2 to 0.95 L.
+    """
+    mass = 0.1
+    stiffness = 9.81 * mass * np.exp(rng.uniform(np.log(0.003), np.log(3.0)))
+    model = CableModel(Cable(1.0, mass, 0.01, stiffness), n=n, start=start, end=end)
+    width = np.diff(model.chain.cells, axis=1).ravel()
+    rest = model.rest_basis @ rng.normal(size=model.rest_basis.shape[1])
+    rest *= rng.uniform(0.0, np.pi) / np.abs(rest * width).sum()
+    if rng.uniform() < 0.5:
+        rest = np.full(len(rest), rng.uniform(-np.pi, np.pi))
+    radius, angle = rng.uniform(0.2, 0.95, size=poses), rng.uniform(-np.pi, np.pi, size=poses)
+    ends = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return Problem(model, rest, ends, rng.uniform(-np.pi, np.pi, size=(poses, 2)))
+
+
+def random_starts(rng: np.random.Generator, problem: Problem) -> FloatArray:
+    """Smooth headings (m, n_headings) between the clamps; free ones anywhere within a turn."""
+    model = problem.model
+    u, m = model.chain.heading_places / model.chain.length, len(problem.ends)
+    first, last = problem.headings.T
+    if model.start != "clamped" and model.end != "clamped":
+        first = rng.uniform(-np.pi, np.pi, size=m)
+    if model.start != "clamped" and model.end == "clamped":
+        first = last + rng.uniform(-2 * np.pi, 2 * np.pi, size=m)
+    if model.end != "clamped":
+        last = first + rng.uniform(-2 * np.pi, 2 * np.pi, size=m)
+    waves = np.sin(np.pi * np.arange(1, 4)[:, None] * u)
+    sizes = rng.normal(size=(m, 3)) * 1.5 / np.arange(1, 4)
+    phi = first[:, None] + (last - first)[:, None] * u + sizes @ waves
+    return np.array([limited(row) for row in phi])
 
 
 class AnyCable:
@@ -83,9 +142,9 @@ class AnyCable:
         self._c = ctypes.CDLL(str(compile_library(self._source, folder, flags)))
         pointer, size = ctypes.c_void_p, ctypes.c_size_t
         self._c.dlo_batch_with.argtypes = [
-            *(pointer, pointer, size, ctypes.c_int, pointer, pointer, pointer, size)
+            *(pointer, pointer, size, ctypes.c_int, pointer, pointer, pointer, pointer, size)
         ]
-        self.record = CompiledSolver(model, model.nominal, problem.rest).record
+        self.record = shape_record(model)
         self._work = np.empty(source.workspace)
 
     def table(self, problem: Problem) -> FloatArray:
@@ -95,17 +154,21 @@ class AnyCable:
         return np.array(numbers_of(model, model.nominal, problem.rest, kernels))
 
     def solve(
-        self, problem: Problem, branch: int = 0
+        self, problem: Problem, branch: int = 0, starts: FloatArray | None = None
     ) -> tuple[NDArray[np.void], NDArray[np.intc], float]:
-        """Shapes, statuses and seconds of all poses of a problem."""
+        """Shapes, statuses and seconds of all poses of a problem, cold or from headings."""
         table = self.table(problem)
         poses = np.zeros((len(problem.ends), 6))
-        poses[:, 2:4] = problem.ends
+        poses[:, 2:4], poses[:, 4:] = problem.ends, problem.headings
+        warm = np.zeros(len(poses), self.record)
+        if starts is not None:
+            warm["headings"] = starts
         shapes = np.zeros(len(poses), self.record)
         statuses = np.zeros(len(poses), np.intc)
         begin = perf_counter()
         self._c.dlo_batch_with(
-            *(table.ctypes.data, poses.ctypes.data, len(poses), branch, shapes.ctypes.data),
+            *(table.ctypes.data, poses.ctypes.data, len(poses), branch),
+            *(None if starts is None else warm.ctypes.data, shapes.ctypes.data),
             *(statuses.ctypes.data, self._work.ctypes.data, self._work.size),
         )
         return shapes, statuses, perf_counter() - begin
@@ -142,9 +205,8 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
 def compare_with_ipopt(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> str:
     """Our energy against IPOPT's: same, lower, higher or ipopt_failed."""
     try:
-        other = solve_equilibrium(
-            problem.model, problem.model.nominal, problem.rest, Pose((0.0, 0.0), tuple(end))
-        )
+        pose = Pose((0.0, 0.0), (float(end[0]), float(end[1])))
+        other = solve_equilibrium(problem.model, problem.model.nominal, problem.rest, pose)
     except EquilibriumError:
         return "ipopt_failed"
     if not other.stable:
@@ -154,3 +216,34 @@ def compare_with_ipopt(problem: Problem, shape: NDArray[np.void], end: FloatArra
     if abs(shape["energy"] - other.energy) <= slack:
         return "same"
     return "lower" if shape["energy"] < other.energy else "higher"
+
+
+def missed(
+    rng: np.random.Generator, start: StartKind, end: EndKind, problems: int, starts: int = 24
+) -> tuple[int, list[tuple[Problem, NDArray[np.void]]]]:
+    """Of random problems held so, how many have a lower equilibrium than the one that is found.
+
+    Lower by more than 1e-6 of EI / L + weight L, from so many random starts each.
+
+    Returns
+    -------
+    int, list of (Problem, shape)
+        Problems that were missed, no equilibrium included; all problems, of one pose each.
+    """
+    count, found = 0, []
+    solver = AnyCable(held_problem(np.random.default_rng(0), start, end, 1))
+    for _ in range(problems):
+        problem = held_problem(rng, start, end, 1)
+        shapes, statuses, _ = solver.solve(problem)
+        again = replace(
+            problem,
+            ends=problem.ends.repeat(starts, axis=0),
+            headings=problem.headings.repeat(starts, axis=0),
+        )
+        others, failed, _ = solver.solve(again, starts=random_starts(rng, again))
+        lowest = min(others["energy"][failed == 0], default=np.inf)
+        cable = problem.model.cable
+        scale = cable.bending_stiffness / cable.length + 9.81 * cable.mass * cable.length
+        count += bool(statuses[0] or shapes["energy"][0] > lowest + 1e-6 * scale)
+        found.append((problem, shapes[0]))
+    return count, found

@@ -140,6 +140,30 @@ def test_branches_bow_either_way():
     assert solver.solve((0.5, 0.0)).energy == min(left.energy, right.energy)
 
 
+def test_a_branch_without_an_equilibrium_is_a_status():
+    """A limp cable hangs, and does not stand up: nothing is returned in place of what was named."""
+    model = CableModel(Cable(0.8, 0.2, 0.01, 0.005), n=12)
+    solver = CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells))
+    hung = solver.solve((0.5, 0.0))
+    assert hung.turn == 1
+    for warm in (None, hung):
+        shape = solver.solve((0.5, 0.0), branch="cw", warm=warm, throw=False)
+        assert shape.status == "other_branch"
+        assert all_zero(shape)
+        assert solver.solve((0.5, 0.0), branch="ccw", warm=warm).turn == 1
+    with pytest.raises(EquilibriumError, match=r"other_branch with the end.*\n  Try: the other"):
+        solver.solve((0.5, 0.0), branch="cw")
+    path = solver.path([(0.5, 0.0), (0.5, 0.1)], branch="cw")
+    assert [shape.status for shape in path.shapes] == ["other_branch"] * 2
+
+
+def test_a_warm_start_of_the_other_branch_is_not_followed():
+    solver = CompiledSolver(*cable("arc", straight=True))
+    left = solver.solve((0.5, 0.0), branch="ccw")
+    right = solver.solve((0.5, 0.0), branch="cw", warm=left)
+    assert right.turn == -1
+
+
 def test_a_clamped_loop_turns_once_clockwise():
     model, p, rest = cable("arc", "clamped", "clamped", n=40, straight=True)
     shape = CompiledSolver(model, p, rest).solve((0.2, 0.0), headings=(0.0, -2 * np.pi))

@@ -253,10 +253,10 @@ def test_limits_end_the_loop_with_a_message():
     assert short.status is Algorithm1Status.ITERATION_LIMIT
     assert short.iterations == 2
     assert "After 2 iterations" in short.message
-    none = run_algorithm1(cable, poses, GRAVITY, time_limit=0.0)
+    none = run_algorithm1(cable, poses, GRAVITY, max_iterations=0)
     assert none.status is Algorithm1Status.ITERATION_LIMIT
     assert none.iterations == 0
-    # Nothing was found in no time: the prior.
+    # Nothing was found in no iteration: the prior.
     np.testing.assert_allclose(none.EI, cable.bending_stiffness, rtol=1e-12)
     np.testing.assert_array_equal(none.theta_0, 0)
 

@@ -1,5 +1,6 @@
 """parameters.yaml rebuilds the model exactly, and says what is wrong with a damaged file."""
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from small_sessions import BENCH, small
 
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
-from dlo_casadi.effects import ImageDistortion, RestCurvatureDrift
+from dlo_casadi.effects import BendingSoftening, ImageDistortion, RestCurvatureDrift
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -23,6 +24,7 @@ from dlo_casadi.report.parameters_file import (
     parameters_text,
 )
 from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import solved_by_ipopt
 from dlo_casadi.session.measure import read_poses
 
 
@@ -191,7 +193,7 @@ def damaged(file, tmp_path, change):
         (
             lambda d: d["parameters"]["bending_stiffness"].update(value=-0.3),
             "parameters.bending_stiffness.value: -0.3 N m^2 lies outside of its bounds "
-            "[1e-12, 1e+09]",
+            "[1e-12, 1000000000]",
         ),
         (
             lambda d: d["parameters"]["end_offset.dx"].update(value=0.02, upper=0.01),
@@ -209,6 +211,79 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
     with pytest.raises(ConfigError, match=re.escape(message)) as caught:
         load_parameters(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.update(n=math.inf), "n must be a whole number, found inf: 2 to 2000 elements"),
+        (lambda d: d.update(n=10**9), "n must be a whole number, found 1000000000: 2 to 2000"),
+        (lambda d: d.update(n=20.5), "n must be a whole number, found 20.5"),
+        (
+            lambda d: d.update(n_rest=100_000),
+            "n_rest must be a whole number, found 100000: 4 to 64",
+        ),
+        (
+            lambda d: d["cable"].update(bending_stiffness=1e-300),
+            "cable.bending_stiffness: 1e-300 N m^2: 1e-12 to 1e+09 N m^2 is possible",
+        ),
+        (
+            lambda d: d["cable"].update(length=1e-300),
+            "cable.length: 1e-300 m: units are SI, 0.001 to 100 m is possible",
+        ),
+        (
+            lambda d: d.update(gravity=[0, 1e30]),
+            "gravity: 1e+30 m/s^2: 0 to 10000 m/s^2 is possible",
+        ),
+        (
+            lambda d: d["effects"][0].update(center=[0, 0]),
+            "effects.0.center: length_error knows label",
+        ),
+        (lambda d: d["effects"][0].update(label=[1]), "effects.0.label: something like '' belongs"),
+    ],
+)
+def test_a_value_that_cannot_be_computed_with_is_named_with_its_line(
+    file, tmp_path, change, message
+):
+    with pytest.raises(ConfigError, match=re.escape(message)) as caught:
+        load_parameters(damaged(file, tmp_path, change))
+    assert "Try: the file as a fit has written it." in str(caught.value)
+    key = re.findall(r"\w+", message.split()[0])[-1]
+    lines = caught.value.file.read_text().splitlines()
+    assert f"{key}:" in lines[caught.value.line - 1]
+
+
+@pytest.mark.parametrize("bound", ["lower", "upper"])
+def test_values_at_their_bounds_are_read_as_they_were_written(outcome, tmp_path, bound):
+    """What a fit may return at a bound: the bound, and the bound as scale or logarithm round it."""
+    fit = outcome.fit
+    limits = {q.name: getattr(q, bound) for q in fit.model.parameters}
+    rounded = {
+        q.name: np.exp(np.log(limits[q.name]))
+        if q.log
+        else q.nominal + q.scale * ((limits[q.name] - q.nominal) / q.scale)
+        for q in fit.model.parameters
+    }
+    for values in (limits, rounded):
+        document = fit_dict(fit)
+        for name, value in values.items():
+            document["parameters"][name]["value"] = float(value)
+        document["model_hash"] = parameters_hash(document)
+        path = tmp_path / "parameters.yaml"
+        path.write_text(dump_yaml(document))
+
+        model, p, _, metadata = load_parameters(path)
+        assert dict(zip(model.names, p, strict=True)) == values  # every digit
+        assert not metadata.edited
+
+
+def test_a_fit_that_ends_at_a_bound_can_be_read(outcome, tmp_path):
+    """IPOPT widens bounds by 1e-8 of them; here the softness would be -5e-10 m."""
+    fit, _ = fitted("short_clean", BendingSoftening(), n=10)
+    fit = solved_by_ipopt(fit)
+    assert fit.converged
+    assert fit.value("bending_softening.softness") == 0.0
+    assert np.array_equal(load_parameters(as_file(fit, outcome, tmp_path / "p.yaml")).p, fit.p)
 
 
 def test_a_missing_file_is_a_clear_error(tmp_path):

@@ -1,7 +1,11 @@
 """Files that are, and are not, whole images."""
 
+import resource
+import struct
+import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -43,3 +47,52 @@ def test_missing_empty_and_foreign_files_are_named(tmp_path):
         read_image(tmp_path / "text.jpg")
     with pytest.raises(VisionError, match="cannot read"):
         read_image(tmp_path)
+
+
+def png(width, height):
+    """A PNG that declares a size and holds next to nothing."""
+
+    def chunk(kind, data):
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"0")) + chunk(b"IEND", b"")
+
+
+JPEG_HEADER = b"\xff\xd8\xff\xc0" + struct.pack(">HBHHB", 17, 8, 32000, 32000, 3) + bytes(9)
+BITMAP = b"BM" + struct.pack("<IIIIiiHHIIiiII", 54, 0, 54, 40, 32000, 32000, 1, 24, *[0] * 6)
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [("a.png", png(32000, 32000)), ("a.jpg", JPEG_HEADER + b"\xff\xd9"), ("a.bmp", BITMAP)],
+)
+def test_a_picture_of_absurd_size_is_refused_before_it_is_decoded(tmp_path, name, data):
+    """3 GB decoded; the process may grow by a fiftieth of that."""
+    (tmp_path / name).write_bytes(data)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(VisionError, match=rf"{name}: the picture is 32000 x 32000 px.* Try: make"):
+        read_image(tmp_path / name)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 60e3  # kB
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".png", ".tif", ".bmp", ".webp"])
+def test_every_format_is_read_whole_or_refused_by_name(tmp_path, ending):
+    picture = np.random.default_rng(0).integers(0, 255, (40, 60, 3)).astype(np.uint8)
+    data = cv2.imencode(ending, picture)[1].tobytes()
+    path = tmp_path / f"a{ending}"
+    path.write_bytes(data)
+    assert read_image(path).shape == (40, 60, 3)
+    for end in (4, 12, 40, len(data) // 2):
+        path.write_bytes(data[:end])
+        with pytest.raises(VisionError, match=rf"a\{ending}: the "):
+            read_image(path)
+
+
+@pytest.mark.parametrize("data", [bytes(1000), b"\xff\xd8\xff\xd9", png(0, 0), png(50, 50)])
+def test_what_holds_no_picture_is_no_image(tmp_path, data):
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(VisionError, match=r"a\.png: the file is not an image"):
+        read_image(tmp_path / "a.png")

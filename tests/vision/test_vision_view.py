@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision import Board, Camera, Reference, from_reference, locate_board
+from dlo_casadi.vision import Board, Camera, Reference, View, from_reference, locate_board
 
 SHAPE = (480, 640)
 MATRIX = np.array([[620.0, 0.0, 322.0], [0.0, 618.0, 236.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([-0.08, 0.03, 0.001, -0.0005, 0.0])
+# k1, k2, p1, p2, k3, then rational, thin prism, tilted sensor: 30 px in a corner.
+LENS = [1.2, 0.5, 1e-3, -5e-4, 0.05, 1.5, 0.8, 0.1, 1e-3, 2e-3, -1e-3, 5e-4, 0.02, -0.03]
 CENTERS = {0: (-0.1, 0.2), 1: (0.5, 0.2), 2: (0.5, -0.25), 3: (-0.1, -0.25)}
 POINTS = np.array([[0.0, 0.0], [0.3, 0.1], [0.15, -0.2], [0.45, -0.1]])
 
@@ -26,13 +28,19 @@ def pose():
 
 
 def bend(a, b, distortion):
-    """Brown's model of a lens, written out."""
-    k1, k2, p1, p2, k3 = distortion
+    """Brown's model of a lens and its extensions, written out from OpenCV's manual."""
+    full = np.pad(distortion, (0, 14 - len(distortion)))
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, x_tilt, y_tilt = full
     r2 = a * a + b * b
-    g = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    bent_a = a * g + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-    bent_b = b * g + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-    return bent_a, bent_b
+    g = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    bent_a = a * g + 2 * p1 * a * b + p2 * (r2 + 2 * a * a) + s1 * r2 + s2 * r2**2
+    bent_b = b * g + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b + s3 * r2 + s4 * r2**2
+    (cx, sx), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (x_tilt, y_tilt))
+    about_x = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+    turn = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]]) @ about_x
+    sensor = np.array([[turn[2, 2], 0, -turn[0, 2]], [0, turn[2, 2], -turn[1, 2]], [0, 0, 1]])
+    u, v, w = sensor @ turn @ np.stack([bent_a, bent_b, np.ones_like(a)])
+    return u / w, v / w
 
 
 def project(points, height, distortion=DISTORTION):
@@ -100,6 +108,32 @@ def test_board_and_camera_give_the_plane_in_front_of_the_board(picture):
 def test_round_trip_is_exact_to_rounding(picture):
     view = locate_board(picture, a_board(), CAMERA)
     assert view.to_board(view.to_pixels(POINTS)) == pytest.approx(POINTS, abs=1e-9)
+
+
+@pytest.mark.parametrize("count", [0, 4, 5, 8, 12, 14])
+def test_every_coefficient_of_a_lens_counts_both_ways(count):
+    """To the corners of the picture; to the fixed point's own tolerance of 1e-10 focal lengths."""
+    view = View(np.eye(3), SHAPE, Camera(MATRIX, LENS[:count]))
+    a, b = (axis.ravel() for axis in np.meshgrid([-0.45, 0.0, 0.2, 0.5], [-0.35, -0.1, 0.0, 0.35]))
+    seen = np.stack([*bend(a, b, LENS[:count]), np.ones_like(a)], axis=1) @ MATRIX[:2].T
+    rays = np.stack([a, b], axis=1)
+    assert view.to_pixels(rays) == pytest.approx(seen, abs=1e-9)
+    assert view.to_board(seen) == pytest.approx(rays, abs=1e-9)
+
+
+def test_a_rational_lens_is_the_same_for_the_board_and_the_cable():
+    picture = photograph(distortion=LENS[:8])
+    view = locate_board(picture, a_board(), Camera(MATRIX, LENS[:8]))
+    assert view.to_pixels(POINTS) == pytest.approx(project(POINTS, 0.02, LENS[:8]), abs=0.1)
+
+
+def test_the_camera_stands_where_it_stood(picture):
+    """Corners of 1/10 px: 0.1 / 620 of the distance of 0.95 m across, some times that along."""
+    turn, shift = pose()
+    view = locate_board(picture, a_board(), CAMERA)
+    stood = -turn.T @ shift - [0.0, 0.0, 0.02]
+    assert view.camera_center == pytest.approx(stood, abs=1e-3)
+    assert locate_board(picture, a_board(standoff=0.0)).camera_center is None
 
 
 def test_standoff_moves_points_the_right_way(picture):

@@ -1,0 +1,186 @@
+"""Which values a cable, its fixtures and its measurement can have at all.
+
+What lies beyond is a slip (a unit, an exponent) and cannot be computed with: it is refused with the
+range that is allowed. What can be computed but is hardly meant is a warning of `load_config`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from dlo_casadi.config.problems import Place, Problem
+from dlo_casadi.effects import EFFECTS, ClampAngle, Effect, EndOffset, ImageScale, LengthError
+from dlo_casadi.effects import Cable as EffectsCable
+from dlo_casadi.parameters import STIFFNESS_BOUNDS
+
+if TYPE_CHECKING:
+    from dlo_casadi.config.sections import Experiment, File
+
+
+class Range(NamedTuple):
+    """From where to where a value can lie."""
+
+    least: float
+    most: float
+    unit: str
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, int | float) and self.least <= value <= self.most
+
+    def __str__(self) -> str:
+        return f"{self.least:g} to {self.most:g}{self.unit and ' '}{self.unit} is possible"
+
+    def problems(self, place: Place, value: float, hint: str = "") -> list[Problem]:
+        """What is wrong with a value, if it lies outside."""
+        if value in self:
+            return []
+        text = f"{value:g}{self.unit and ' '}{self.unit}: {self}{hint}"
+        return [Problem(place, text)]
+
+
+# Nothing shorter than a millimetre is held in two fixtures; 100 m hang between two masts.
+LENGTH = Range(1.0e-3, 100.0, "m")
+# Carbon fibres have 5e-6 m; the upper limit is the length itself.
+_THINNEST = 1.0e-6
+# A millimetre of the thinnest wire on sale (copper, 10 um): 9e3 pi (5e-6)^2 1e-3 = 7e-10 kg.
+_LIGHTEST = 1.0e-10
+# A metre of a submarine power cable has 100 kg.
+_HEAVIEST, _HEAVIEST_PER_METRE = 1000.0, 100.0
+# A carbon fibre has E pi d^4 / 64 = 2.3e11 pi (5e-6)^4 / 64 = 7e-12 N m^2, a steel bar of 0.5 m
+# 6e8 N m^2: the bounds of the fit itself.
+STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
+# The largest centrifuge for models of soil reaches some 1e3 times the Earth's 9.81 m/s^2.
+GRAVITY = Range(0.0, 1.0e4, "m/s^2")
+# A frame whose origin is farther away is that of a map; of 1e3 m, doubles resolve 1e-13 m.
+COORDINATE = Range(-1.0e3, 1.0e3, "m")
+# A fifth of the wavelength of green light, beyond any camera. Upwards: the cable's length.
+_FINEST_STD = 1.0e-7
+# A nanometre over a metre is what interferometers resolve.
+_FINEST_TOLERANCE = 1.0e-9
+# A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
+PIXELS = Range(-1.0e6, 1.0e6, "px")
+FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
+# Terms of a wide lens that cancel one another reach hundreds; a million is a slip.
+DISTORTION = Range(-1.0e6, 1.0e6, "")
+# A marker of a tenth of a millimetre has no pixels; ten metres are the side of a house.
+MARKER = Range(1.0e-4, 10.0, "m")
+# Two elements have a joint between them; of a metre, 2000 are half a millimetre each, less than a
+# cable is thick.
+MESH = Range(2, 2000, "elements")
+# Cubic splines need four coefficients. A line of 240 points has four between two knots of 64; the
+# covariance that a result holds grows with their square.
+REST_COEFFICIENTS = Range(4, 64, "coefficients")
+
+# Tolerance -> the parameter that takes it up. It must leave the parameter within its bounds, or
+# these, and not the tolerance, decide.
+_TAKEN_UP: dict[str, tuple[Effect, str, str]] = {
+    "length": (LengthError(), "length_difference", "m"),
+    "end": (EndOffset(), "dx", "m"),
+    "heading": (ClampAngle(), "start_heading_error", "rad"),
+    "scale": (ImageScale(), "factor", ""),
+}
+
+
+def implausible_sizes(
+    length: float, mass: float, diameter: float, stiffness: float | None = None
+) -> list[Problem]:
+    """Find sizes [m], [kg], [N m^2] of a cable that no cable has, by their key."""
+    problems: list[Problem] = []
+    if length not in LENGTH:
+        meant = length / 1e3  # of millimetres
+        hint = f"did you mean {meant:g}? " if meant in LENGTH else ""
+        text = f"{length:g} m: units are SI, {hint}{LENGTH}"
+        problems.append(Problem(("length",), text))
+    elif diameter > length:
+        text = (
+            f"{diameter:g} m is larger than the length {length:g} m: units are SI, "
+            f"did you mean {diameter / 1e3:g}?"
+        )
+        problems.append(Problem(("diameter",), text))
+    else:
+        problems += Range(_THINNEST, length, "m").problems(("diameter",), diameter)
+    heaviest = min(_HEAVIEST, _HEAVIEST_PER_METRE * length)
+    if mass > heaviest:
+        meant = mass / 1e3  # of grams
+        hint = f"did you mean {meant:g}? " if meant <= heaviest else ""
+        text = (
+            f"{mass:g} kg for {length:g} m: units are SI, {hint}at most {heaviest:g} kg is possible"
+        )
+        problems.append(Problem(("mass",), text))
+    elif mass < _LIGHTEST:
+        text = (
+            f"{mass:g} kg: no cable is lighter than {_LIGHTEST:g} kg; to leave its weight out, "
+            "write gravity: [0, 0]"
+        )
+        problems.append(Problem(("mass",), text))
+    if stiffness is not None:
+        problems += STIFFNESS.problems(("bending_stiffness",), stiffness)
+    return problems
+
+
+def implausible_gravity(gravity: tuple[float, float]) -> list[Problem]:
+    """Find a gravity [m/s^2] that no laboratory has."""
+    return GRAVITY.problems(("gravity",), math.hypot(*gravity))
+
+
+def implausible_pixels(place: Place, values: Iterable[float]) -> list[Problem]:
+    """Find pixels [px] that no picture has."""
+    return [problem for value in values for problem in PIXELS.problems(place, value)]
+
+
+def implausible_camera(
+    matrix: Sequence[Sequence[float]], distortion: Sequence[float]
+) -> list[Problem]:
+    """Find numbers of a pinhole camera that no lens has, by their key."""
+    (fx, skew, cx), (_, fy, cy), _ = matrix
+    problems = [p for f in (fx, fy) for p in FOCAL_LENGTH.problems(("matrix",), f)]
+    problems += implausible_pixels(("matrix",), (skew, cx, cy))
+    return problems + [p for k in distortion for p in DISTORTION.problems(("distortion",), k)]
+
+
+def impossible_values(file: File) -> list[Problem]:
+    """Find what lies beyond the ranges above, and values of effects beyond their bounds."""
+    return [*_of_experiment(file.experiment, file.cable.length), *_of_effects(file)]
+
+
+def _of_experiment(experiment: Experiment, length: float) -> Iterator[Problem]:
+    at = ("experiment",)
+    for place, message in implausible_gravity(experiment.gravity):
+        yield Problem((*at, *place), f"gravity: {message}")
+    std = experiment.measurement.std
+    if std is not None:
+        for place, message in Range(_FINEST_STD, length, "m").problems(
+            (*at, "measurement", "std"), std, "; without it, it is estimated from the data"
+        ):
+            yield Problem(place, f"std: {message}")
+    cable = EffectsCable(length, 1.0, 1.0, 1.0)
+    for key, (effect, name, unit) in _TAKEN_UP.items():
+        (q,) = (q for q in effect.parameters(cable) if q.name == name)
+        most = min(q.upper - q.nominal, q.nominal - q.lower)
+        for place, message in Range(_FINEST_TOLERANCE, most, unit).problems(
+            (*at, "tolerances", key), getattr(experiment.tolerances, key)
+        ):
+            yield Problem(place, f"tolerances.{key}: {message}")
+    for i, pose in enumerate(experiment.poses):
+        for key in ("start", "end"):
+            for k, value in enumerate(getattr(pose, key) or ()):
+                for place, message in COORDINATE.problems((*at, "poses", i, key, k), value):
+                    yield Problem(place, f"pose {i + 1} ({pose.file.name}) {key}: {message}")
+
+
+def _of_effects(file: File) -> Iterator[Problem]:
+    cable = EffectsCable(
+        file.cable.length, file.cable.mass, file.cable.diameter, file.cable.prior_bending_stiffness
+    )
+    for i, item in enumerate(file.model.effects):
+        if item.name not in EFFECTS:
+            continue
+        for q in EFFECTS[item.name]().parameters(cable):
+            if q.name not in item.parameters:
+                continue
+            for place, message in Range(*q.range, q.unit).problems(
+                ("model", "effects", i, "parameters", q.name), item.parameters[q.name].value
+            ):
+                yield Problem(place, f"model.effects: {item.name}.{q.name}: {message}")

@@ -1,0 +1,94 @@
+"""Loads at one place as causes of an unexplained pull.
+
+Where the declared model has gone far astray, no effect can be followed from its shapes. The pull
+has found shapes that fit, and in every pose a force f_j at one place r_j of the cable; a load is
+its cause if its own law gives these forces. All are linear in their parameters once the place is
+known (a tether in k and k a: f = k a - k r), so that least squares tell where a refit starts.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.diagnosis.confirm import Confirmed
+from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.pull import Pull
+from dlo_casadi.diagnosis.screening import Screened
+from dlo_casadi.effects import Load
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.result import Fit
+
+FloatArray = NDArray[np.floating]
+
+# Gauss-Newton steps of one refit, from forces that a pose's own pull has blurred.
+MOST_STEPS = 60
+
+
+def is_local_load(candidate: Candidate) -> bool:
+    """Whether the candidate is a load at one place of the cable."""
+    own = {name.split(".")[-1] for name in candidate.frees}
+    return isinstance(candidate.effect, Load) and "position" in own
+
+
+def start_from(pull: Pull, candidate: Candidate) -> dict[str, float]:
+    """Qualified parameters of a load at one place that come closest to the forces of a pull."""
+    fit, model = pull.fit, pull.fit.model
+    effect = candidate.effect.linear()
+    assert isinstance(effect, Load)
+    prefix = f"{effect.label}."
+    point = ca.SX.sym("r", 2)
+    names = [q.name for q in effect.parameters(model.cable) if q.name != "position"]
+    linear = ca.SX.sym("linear", len(names))
+    params = {name: linear[k] for k, name in enumerate(names)} | {"position": ca.SX(pull.position)}
+    force = ca.SX.zeros(2)
+    for dead in effect.forces(ca.SX(ca.DM(model.gravity)), params):
+        force += dead.force
+    for spring in effect.springs(params):
+        force -= ca.gradient(spring.energy(point), point)
+    slopes = ca.Function("slopes", [point], [ca.jacobian(force, linear)])
+    curves = fit.problem.curves(fit.point.theta, fit.point.shapes)
+    places = [curves[j].at(np.array([pull.position]))[0] for j in fit.problem.used]
+    arms = np.concatenate([np.array(slopes(place)) for place in places])
+    found = np.linalg.lstsq(arms, pull.force_per_pose.ravel(), rcond=None)[0]
+    values = dict(zip(names, map(float, found), strict=True)) | {"position": pull.position}
+    own = candidate.effect.of_linear(model.cable, values)
+    bounds = {q.name: (q.lower, q.upper) for q in candidate.effect.parameters(model.cable)}
+    return {prefix + name: float(np.clip(own[name], *bounds[name])) for name in own}
+
+
+def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:
+    """Refit the base's model with a load in the place of the pull; None if none can be followed.
+
+    Parameters
+    ----------
+    base : Fit
+        Without either.
+    """
+    candidate = screened.candidate
+    model = candidate.add_to(base.model)
+    values = model.nominal.copy()
+    for name, value in start_from(pull, candidate).items():
+        values[model.names.index(name)] = value
+    known = base.problem.unknowns
+    held = {name for name, free in zip(known.model.names, known.free, strict=True) if not free}
+    for name in held:
+        values[model.names.index(name)] = base.value(name)
+    try:
+        fit = fit_model(
+            model,
+            base.problem.history,
+            base.problem.tolerances,
+            free=[name for name in model.names if name not in held],
+            values=values,
+            start=pull.fit,
+            max_iterations=MOST_STEPS,
+        )
+    except EstimationError:
+        return None
+    gain = 2 * (base.point.objective - fit.point.objective)
+    price = len(candidate.frees) * np.log(max(base.problem.n_points, 2))
+    return Confirmed(screened, fit, cross_validate(fit), gain, gain - float(price))

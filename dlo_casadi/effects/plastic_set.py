@@ -1,0 +1,55 @@
+"""A cable that takes a set where it is bent sharply."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, Params, StateEffect
+from dlo_casadi.parameters import Parameter
+
+# A kink max(x, 0) is rounded to (x + sqrt(x^2 + d^2)) / 2 with d this share of one turn per length:
+# off by d / 2 at the kink, by d^2 / (4 |x|) away from it.
+_ROUNDING = 0.01
+
+
+class PlasticSet(StateEffect):
+    """After each pose a share of what the bend exceeds a yield curvature by has become rest shape.
+
+        b = kappa - kappa_0
+        kappa_0 <- kappa_0 + share (max(b - y, 0) - max(-b - y, 0))
+
+    At y = 0 it is a drift of the rest curvature. The kinks are rounded over a hundredth of a turn
+    per length, smoothly and oddly in b.
+
+    Parameters
+    ----------
+    yield_curvature : scalar y [1/m], >= 0
+        Bends below it leave nothing behind; at most a hundred turns per length.
+    share : scalar, in [0, 1)
+        Vanishes at 0; 1 would be ideally plastic.
+
+    References
+    ----------
+    Moment and curvature of an elastic-plastic beam with linear hardening, e.g. Lubliner,
+    Plasticity Theory, 1990, in the poses' order and without the Bauschinger effect.
+    """
+
+    name = "plastic_set"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare yield curvature and share."""
+        turn = cable.curvature_scale
+        return (
+            Parameter("yield_curvature", "1/m", 0.5 * turn, 0.1 * turn, 0.0, 100 * turn, scan=True),
+            Parameter("share", scale=0.1, lower=0.0, upper=0.99),
+        )
+
+    def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Rest curvature after the pose [1/m]."""
+        delta = _ROUNDING * cable.curvature_scale
+
+        def ramp(x: ca.SX) -> ca.SX:
+            return (x + ca.sqrt(x * x + delta**2)) / 2
+
+        bend, limit = curvature - rest, params["yield_curvature"]
+        return rest + params["share"] * (ramp(bend - limit) - ramp(-bend - limit))

@@ -1,0 +1,43 @@
+"""A cable that is not as far in front of the board as declared."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
+from dlo_casadi.parameters import Parameter
+
+
+class StandoffError(MeasurementEffect):
+    """The cable's axis lies nearer to the camera than declared, or farther.
+
+    The camera sees a point P of the cable, d in front of the declared plane, along the ray from
+    its centre C, z in front of that plane, and takes it for where the ray meets the plane:
+
+        measured = C + (P - C) z / (z - d) = P + (P - C) d / (z - d)
+
+    With one camera that does not move this is `image_scale` about C instead of the start fixture,
+    by the factor z / (z - d): the two differ by a shift of (factor - 1) (start - C) alone. A camera
+    that looks straight down on the start fixture cannot tell them apart, and one beside it only as
+    well as the fixtures are known; photographs from several places can.
+
+    Parameters
+    ----------
+    distance : scalar d [m]
+        True minus declared, positive towards the camera; less than z. Vanishes at 0.
+
+    References
+    ----------
+    Central projection, e.g. Hartley and Zisserman, Multiple View Geometry, 2004, section 6.1.
+    """
+
+    name = "standoff_error"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the distance."""
+        return (Parameter("distance", "m", scale=1e-3),)
+
+    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
+        """Follow the ray through the point to the declared plane."""
+        d = params["distance"]
+        return point + d * (sight.nearness * point - sight.camera) / (1 - d * sight.nearness)

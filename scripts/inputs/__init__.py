@@ -1,0 +1,1 @@
+"""Wrong inputs by the thousand, and a watch over what each does."""

@@ -1,0 +1,77 @@
+"""A cable that stands farther in front of the board than declared, seen by a calibrated camera."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dlo_casadi.config import load_config
+from dlo_casadi.config.sections import DeclaredEffect
+from dlo_casadi.diagnosis.candidates import candidates
+from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.effects import EFFECTS
+from dlo_casadi.errors import ConfigError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.measure import conditions
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+CLEAN = DATA / "bench" / "clean" / "session.yaml"
+DISTANCE, STD = 3e-3, 1e-4  # true minus declared standoff; noise of a point [m]
+# Photographs by hand: every one from another place, 1.5 to 2 m in front of the board.
+CAMERAS = np.random.default_rng(1).uniform([-0.4, -0.8, 1.5], [1.0, 0.4, 2.0], (8, 3))
+# Confirming the others would take a minute.
+RIVALS = {"standoff_error", "image_scale", "image_distortion", "length_error", "end_offset"}
+OTHERS = tuple(set(EFFECTS) - RIVALS)
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_config(CLEAN)
+
+
+def photographed(config, cameras) -> tuple[MeasuredPose, ...]:
+    """True curves, DISTANCE in front of the declared plane z = 0, as their rays meet that plane."""
+    rng, shapes = np.random.default_rng(0), np.load(DATA / "bench_truth/clean/truth_shapes.npz")
+    measured = []
+    for pose, camera in zip(config.experiment.poses, cameras, strict=False):
+        curve = shapes[pose.name]
+        rays = np.column_stack([curve, np.full(len(curve), DISTANCE)]) - camera
+        seen = camera - rays * (camera[2] / rays[:, 2:])
+        points = seen[:, :2] + STD * rng.standard_normal(curve.shape)
+        ends = replace(conditions(pose), camera_center=tuple(camera))
+        measured.append(MeasuredPose(ends, points, held_out=pose.role == "held_out"))
+    return tuple(measured)
+
+
+@pytest.mark.parametrize("cameras", [CAMERAS, np.tile(CAMERAS[0], (8, 1))], ids=["moved", "fixed"])
+def test_a_wrong_standoff_is_found_and_not_taken_for_a_scale(config, cameras):
+    declared = declared_model(config)
+    measured = photographed(config, cameras)
+    fit = fit_model(declared.model.with_mesh(20), measured, declared.tolerances, STD)
+    found = diagnose(fit, exclude=OTHERS)
+    assert [item.candidate.name for item in found.added] == ["standoff_error"]
+    name = "standoff_error.distance"
+    assert abs(found.after.value(name) - DISTANCE) < 3 * found.after.std(name)
+    assert found.after.std(name) < 0.2 * DISTANCE  # it would not be found otherwise
+    assert "image_scale" not in found.added[0].rivals
+    assert found.verdict == "effect_found"
+
+
+def test_without_a_calibrated_camera_it_is_no_candidate(config):
+    model = declared_model(config).model
+    named = [{item.name for item in candidates(model, (0, 0), 8, camera=c)} for c in (True, False)]
+    assert named[0] - named[1] == {"standoff_error"}
+
+
+def test_it_cannot_be_declared_without_a_calibrated_camera(config):
+    effects = (DeclaredEffect(name="standoff_error"),)
+    named = replace(config, model=config.model.model_copy(update={"effects": effects}))
+    assert "standoff_error.distance" in declared_model(named).model.names
+    experiment = config.experiment
+    blind = experiment.measurement.model_copy(update={"camera": None})
+    named = replace(named, experiment=experiment.model_copy(update={"measurement": blind}))
+    with pytest.raises(ConfigError, match=r"standoff_error .* Try: measurement\.camera"):
+        declared_model(named)
