@@ -279,7 +279,7 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
     rest : (n_cells,) [1/m]
     """
     chain = model.chain
-    ends, length = model.held(p, pose.vector, 0)
+    ends, length = model.held(p, pose.ends, 0)
     start, end, headings = np.array(ends).reshape(3, 2)
     u, chord = chain.heading_places / chain.length, (end - start) / float(length)
     held = tuple(side == "clamped" for side in (model.start, model.end))
@@ -332,7 +332,7 @@ def check_reach(model: CableModel, p: FloatArray, pose: Pose) -> None:
     """Raise EquilibriumError when the end is farther away than the cable is long."""
     if pose.end is None or model.extensible:
         return
-    ends, true_length = model.held(p, pose.vector, 0)
+    ends, true_length = model.held(p, pose.ends, 0)
     start, end, _ = np.array(ends).reshape(3, 2)
     distance, length = float(np.hypot(*(end - start))), float(true_length)
     if distance >= length:
