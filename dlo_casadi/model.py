@@ -6,8 +6,16 @@ Every stage differentiates the same expression
 
 with the energy V of bending, weight and loads, the end conditions c = 0, and, for a cable of axial
 compliance C, the tension N_e = -(1/h) dL/d(length ratio of element e), which is exact for dead
-loads and leaves out terms of second order in the strain for others. An equilibrium is a stationary
-point; the chain's coordinates stay the headings alone.
+loads. An equilibrium is a stationary point; the chain's coordinates stay the headings alone.
+
+A load W(r) whose force depends on the place r(s) where it acts would couple all headings before s.
+Stretching and bowing, small as they are, feel it as the dead force f = -W'(r_0) at the place r_0 of
+the cable that does neither, u away from where it really is:
+
+    L = A(phi, lam, f) + f . r_0 + W(r_0),    dL/dphi = dA/dphi + dr_0/dphi^T W'' u
+
+with A the Lagrangian under dead loads. With f and q = W'' u as symbols all terms are those of
+neighbours; derivatives go through these two vectors by the chain rule.
 """
 
 from __future__ import annotations
@@ -348,16 +356,27 @@ class CableModel:
             density += self._p[0] / 2 * tangent * (bowed**2 + 2 * uneven * bend * bowed)
         return ca.dot(width, density) * self._stretch
 
-    def _energy(self, curve: Curve) -> ca.SX:
-        """Energy of bending, weight, loads and holders [J], without stretching."""
-        energy = self._bending_energy(curve)
+    @cached_property
+    def _gravity(self) -> ca.SX:
+        """Gravity (2,) [m/s^2] that every weight feels."""
         gravity = ca.SX(ca.DM(self.gravity))
-        loads = self._slot(Load)
-        for effect, local in loads:
+        for effect, local in self._slot(Load):
             gravity = effect.gravity(gravity, local)
-        energy -= self.cable.mass / self.cable.length * ca.dot(gravity, curve.first_moment)
-        for effect, local in loads:
-            energy += effect.energy(curve, gravity, local)
+        return gravity
+
+    def _energy(self, curve: Curve, dead: bool = False) -> ca.SX:
+        """Energy of bending, weight, loads and holders [J], without stretching.
+
+        `dead`: forces that depend on the shape are the symbols `_force`.
+        """
+        energy = self._bending_energy(curve)
+        weight = self.cable.mass / self.cable.length * self._gravity
+        energy -= ca.dot(weight, curve.first_moment)
+        for effect, local in self._slot(Load):
+            if effect.dead or not dead:
+                energy += effect.energy(curve, self._gravity, local)
+        if dead:
+            energy -= ca.dot(self._force, self._places(curve))
         for effect, local in self._slot(BoundaryEffect):
             energy += effect.energy(curve, local)
         return energy
@@ -375,13 +394,76 @@ class CableModel:
                 rows.append(curve.end_direction - held.end_heading)
         return ca.vertcat(*rows) if rows else ca.SX.zeros(0)
 
+    # ---- loads that depend on the shape ------------------------------------------------------
+
+    @cached_property
+    def _local_loads(self) -> list[tuple[Any, dict[str, ca.SX]]]:
+        return [(effect, local) for effect, local in self._slot(Load) if not effect.dead]
+
+    @cached_property
+    def _force(self) -> ca.SX:
+        return ca.SX.sym("force", 2 * len(self._local_loads))
+
+    @cached_property
+    def _swing(self) -> ca.SX:
+        """How much each force changes as the place moves to where it really is [N]."""
+        return ca.SX.sym("swing", 2 * len(self._local_loads))
+
+    def _places(self, curve: Curve) -> ca.SX:
+        """Where the loads that depend on the shape act, stacked [m]."""
+        return ca.vertcat(*(curve.position(local["position"]) for _, local in self._local_loads))
+
+    @cached_property
+    def _local(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Places r_0, energy W(r_0), and what `_force` and (given it) `_swing` stand for."""
+        at = ca.SX.sym("at", 2 * len(self._local_loads))
+        energy = ca.SX(0)
+        for k, (effect, local) in enumerate(self._local_loads):
+            energy += effect.energy_at(at[2 * k : 2 * k + 2], self._gravity, local)
+        stiffness, slope = ca.hessian(energy, at)
+        places = self._places(self._curve())
+        moved = -(ca.gradient(self._under_dead_loads[0], self._force) + places)
+        energy, force, swing = ca.substitute([energy, -slope, stiffness @ moved], [at], [places])
+        return places, energy, force, swing
+
+    def _resolved(self, *expressions: ca.SX) -> list[ca.SX]:
+        """Expressions of headings, multipliers and inputs alone."""
+        if not self._local_loads:
+            return list(expressions)
+        _, _, force, swing = self._local
+        found = ca.substitute([*expressions], [self._swing], [swing])
+        return list(ca.substitute(found, [self._force], [force]))
+
+    def _jacobian(self, expression: ca.SX, symbols: ca.SX) -> ca.SX:
+        """Derivative by the symbols, through the forces that depend on the shape."""
+        slopes = ca.jacobian(expression, symbols)
+        if self._local_loads:
+            _, _, force, swing = self._local
+            by_force = ca.jacobian(force, symbols)
+            by_swing = ca.jacobian(swing, symbols) + ca.jacobian(swing, self._force) @ by_force
+            slopes += ca.jacobian(expression, self._force) @ by_force
+            slopes += ca.jacobian(expression, self._swing) @ by_swing
+        return ca.densify(slopes)
+
     @cached_property
     def _lagrangian(self) -> tuple[ca.SX, Curve]:
         """Lagrangian and the stretched, bowed curve, functions of headings and multipliers."""
+        lagrangian, curve = self._under_dead_loads
+        if self._local_loads:
+            places, energy, _, _ = self._local
+            lagrangian += ca.dot(self._force, places) + energy
+        lagrangian, ratio, bow, square = self._resolved(
+            lagrangian, curve.ratio, curve.bow, curve.square
+        )
+        return lagrangian, replace(curve, ratio=ratio, bow=bow, square=square)
+
+    @cached_property
+    def _under_dead_loads(self) -> tuple[ca.SX, Curve]:
+        """The same with `_force` for what depends on the shape, its energy W left out."""
         ratio, bow = ca.SX.sym("ratio", self.n), ca.SX.sym("bow", self.n)
         uniform, none = ca.SX.ones(self.n) * self._stretch, ca.SX.zeros(self.n)
         curve = self._curve(ratio if self.extensible else uniform, bow if self.bowed else none)
-        plain = self._energy(curve) + ca.dot(self._lam, self._conditions(curve))
+        plain = self._energy(curve, dead=True) + ca.dot(self._lam, self._conditions(curve))
 
         def rigid(*expressions: ca.SX) -> list[ca.SX]:
             """Without stretching and bowing."""
@@ -443,36 +525,36 @@ class CableModel:
     @cached_property
     def _stationarity(self) -> ca.SX:
         """Gradient of the Lagrangian by (phi, lam): force balance, then end conditions."""
-        lagrangian, _ = self._lagrangian
+        lagrangian, _ = self._under_dead_loads
+        if self._local_loads:
+            lagrangian += ca.dot(self._swing, self._local[0])
         return ca.gradient(lagrangian, ca.vertcat(self._phi, self._lam))
 
     @cached_property
     def kkt(self) -> ca.Function:
         """(phi, lam, p, rest, pose, deviation) -> stationarity (N,), its Jacobian (N, N)."""
         unknowns = ca.vertcat(self._phi, self._lam)
-        matrix = ca.jacobian(self._stationarity, unknowns)
-        return ca.Function(
-            "kkt", self._arguments, [ca.densify(self._stationarity), ca.densify(matrix)]
-        )
+        blocks = [ca.densify(self._stationarity), self._jacobian(self._stationarity, unknowns)]
+        return ca.Function("kkt", self._arguments, self._resolved(*blocks))
 
     @cached_property
     def balance(self) -> ca.Function:
         """Same arguments -> stationarity (N,) only."""
-        return ca.Function("balance", self._arguments, [self._stationarity])
+        return ca.Function("balance", self._arguments, self._resolved(self._stationarity))
 
     @cached_property
     def sensitivity(self) -> ca.Function:
         """Same arguments -> derivatives of the stationarity by p, rest and deviation."""
         blocks = [
-            ca.densify(ca.jacobian(self._stationarity, symbol))
+            self._jacobian(self._stationarity, symbol)
             for symbol in (self._p, self._rest, self._deviation)
         ]
-        return ca.Function("sensitivity", self._arguments, blocks)
+        return ca.Function("sensitivity", self._arguments, self._resolved(*blocks))
 
     @cached_property
     def _observed(self) -> ca.SX:
         """Measured image of the curve: see `observation`."""
-        _, curve = self._lagrangian
+        _, curve = self._under_dead_loads
         nodes = curve.nodes
         maps = self._slot(MeasurementEffect)
         rows = []
@@ -502,21 +584,20 @@ class CableModel:
         z = self._observed
         unknowns = ca.vertcat(self._phi, self._lam)
         blocks = [
-            ca.densify(ca.jacobian(z, symbol))
-            for symbol in (unknowns, self._p, self._rest, self._deviation)
+            self._jacobian(z, symbol) for symbol in (unknowns, self._p, self._rest, self._deviation)
         ]
-        return ca.Function("observation", self._arguments, [z, *blocks])
+        return ca.Function("observation", self._arguments, self._resolved(z, *blocks))
 
     def slopes_by(self, names: Sequence[str]) -> ca.Function:
         """Same arguments -> derivatives of the stationarity and of z by the named parameters."""
         chosen = ca.vertcat(*(self._p[self.names.index(name)] for name in names))
-        blocks = [ca.densify(ca.jacobian(e, chosen)) for e in (self._stationarity, self._observed)]
-        return ca.Function("slopes_by", self._arguments, blocks)
+        blocks = [self._jacobian(e, chosen) for e in (self._stationarity, self._observed)]
+        return ca.Function("slopes_by", self._arguments, self._resolved(*blocks))
 
     @cached_property
     def shape(self) -> ca.Function:
         """Same arguments -> measured curve z only."""
-        return ca.Function("shape", self._arguments, [self._observed])
+        return ca.Function("shape", self._arguments, self._resolved(self._observed))
 
     @cached_property
     def strain(self) -> ca.Function:
@@ -564,7 +645,7 @@ class CableModel:
     @property
     def shape_dependent_loads(self) -> tuple[str, ...]:
         """Names of effects whose forces depend on the shape."""
-        return tuple(effect.name for effect, _ in self._slot(Load) if not effect.dead)
+        return tuple(effect.name for effect, _ in self._local_loads)
 
     @cached_property
     def dead_load(self) -> ca.Function:

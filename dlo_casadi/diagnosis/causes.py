@@ -8,14 +8,10 @@ known (a tether in k and k a: f = k a - k r), so that least squares tell where a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import cast
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.chain import Curve
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.confirm import Confirmed
 from dlo_casadi.diagnosis.crossval import cross_validate
@@ -31,17 +27,6 @@ FloatArray = NDArray[np.floating]
 
 # Gauss-Newton steps of one refit, from forces that a pose's own pull has blurred.
 MOST_STEPS = 60
-
-
-@dataclass(frozen=True)
-class _Place:
-    """What a load at one place needs to know of a curve."""
-
-    point: ca.SX
-
-    def position(self, s: ca.SX | float) -> ca.SX:
-        """The place, whatever its arc length."""
-        return self.point
 
 
 def is_local_load(candidate: Candidate) -> bool:
@@ -60,7 +45,7 @@ def start_from(pull: Pull, candidate: Candidate) -> dict[str, float]:
     names = [q.name for q in effect.parameters(model.cable) if q.name != "position"]
     linear = ca.SX.sym("linear", len(names))
     params = {name: linear[k] for k, name in enumerate(names)} | {"position": ca.SX(pull.position)}
-    energy = effect.energy(cast(Curve, _Place(point)), ca.SX(ca.DM(model.gravity)), params)
+    energy = effect.energy_at(point, ca.SX(ca.DM(model.gravity)), params)
     slopes = ca.Function("slopes", [point], [ca.jacobian(-ca.gradient(energy, point), linear)])
     z = fit.problem.sweep.shapes_seen(fit.point.shapes, fit.p, fit.rest)
     places = [
@@ -84,19 +69,14 @@ def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:
     """
     candidate = screened.candidate
     model = candidate.add_to(base.model)
-    values = model.nominal.copy()
+    values = pull.fit.values_in(model)
     for name, value in start_from(pull, candidate).items():
         values[model.names.index(name)] = value
-    known = base.problem.unknowns
-    held = {name for name, free in zip(known.model.names, known.free, strict=True) if not free}
-    for name in held:
-        values[model.names.index(name)] = base.value(name)
     try:
         fit = fit_model(
             model,
             base.problem.history,
             base.problem.tolerances,
-            free=[name for name in model.names if name not in held],
             values=values,
             start=pull.fit,
             max_iterations=MOST_STEPS,

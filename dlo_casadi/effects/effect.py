@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import pi
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import casadi as ca
 import numpy as np
@@ -181,7 +181,8 @@ class Load(Effect):
     """Slot `load`: forces with a potential. Loads add; all share one gravity."""
 
     slot: ClassVar[str] = "load"
-    # Whether the forces stay the same whatever the shape.
+    # Whether the forces stay the same whatever the shape. If not, the load acts at one place, the
+    # arc length `position` among its parameters.
     dead: ClassVar[bool] = True
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
@@ -191,6 +192,20 @@ class Load(Effect):
     def energy(self, curve: Curve, gravity: ca.SX, params: Params) -> ca.SX | float:
         """Potential energy of the load [J]."""
         return 0.0
+
+    def energy_at(self, point: ca.SX, gravity: ca.SX, params: Params) -> ca.SX | float:
+        """Potential energy [J] of a load at one place, where that place (2,) [m] is known."""
+        return self.energy(cast(Curve, _Place(point)), gravity, params)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """One point of a curve: all that a load at one place asks a curve for."""
+
+    point: ca.SX
+
+    def position(self, s: ca.SX | float) -> ca.SX:
+        return self.point
 
 
 class BoundaryEffect(Effect):

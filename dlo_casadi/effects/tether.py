@@ -22,8 +22,8 @@ class Tether(Load):
         V = k |r(s) - a|^2 / 2                                        [J]
 
     No dead load: its force k (a - r(s)) depends on the shape, and couples all headings before s.
-    On a stretching cable the tension is taken from the unstretched shape, which leaves out terms
-    of second order in the axial strain.
+    Stretch and bows are found under the force at the place without them, which leaves out terms
+    of second order in both.
 
     Parameters
     ----------
