@@ -152,6 +152,11 @@ class AnyCable:
         own = groups_of(split.slots, inline=False)
         if [(g.key, g.members) for g in own] != [(g.key, g.members) for g in self._groups]:
             raise ValueError("the cable is of another kind than the compiled one")
+        for group in self._groups:
+            taken = [group.columns[int(column)] for _, column in group.source]
+            numbers = np.array([split.slots[j].numbers for j in group.members])
+            if not np.array_equal(numbers, numbers[:, taken]):
+                raise ValueError("numbers of this cable differ that are one in the compiled one")
         return np.array(numbers_of(split, self._groups))
 
     def solve(
@@ -232,7 +237,9 @@ def missed(
         Problems that were missed, no equilibrium included; all problems, of one pose each.
     """
     count, found = 0, []
-    solver = AnyCable(held_problem(np.random.default_rng(0), start, end, 1))
+    any_rest = held_problem(rng, start, end, 1)
+    any_rest = replace(any_rest, rest=rng.normal(size=len(any_rest.rest)))
+    solver = AnyCable(any_rest)
     for _ in range(problems):
         problem = held_problem(rng, start, end, 1)
         shapes, statuses, _ = solver.solve(problem)
