@@ -20,9 +20,6 @@ _HALF_ANGLE = (
 # A clamp's turning decays as (1 - s/L)^5 from it. Of 1200 random problems with clamps, the lowest
 # equilibrium was missed in 9, 2, 0, 0, 1 with the power 3, 4, 5, 6, 8; high ones seldom converge.
 _DECAY = 5
-# An arc is bent into its clamps on the other way, too, where the nearer one takes more than this
-# [rad]: that halves these guesses, and misses 1 of the 1200.
-_RIVAL = 1.5
 
 
 def wrapped(angle: float) -> float:
@@ -72,7 +69,7 @@ def arc_headings(
 
 def arc_into_clamps(
     u: FloatArray, chord: FloatArray, clamps: tuple[float | None, float | None], side: int
-) -> tuple[FloatArray, FloatArray | None]:
+) -> tuple[FloatArray, FloatArray, float]:
     """Headings of the arc through both ends that bends into the headings of the clamps.
 
         phi(u) = arc(u) + t + (1 - u)^5 (first - arc(0) - t) + u^5 (last - arc(1) - t),  t = 2 pi k
@@ -93,8 +90,10 @@ def arc_into_clamps(
     -------
     (k,) [rad]
         With the k that bends the cable least at its clamps.
-    (k,) [rad] or None
-        With the next k, that bends it the other way; None where that is no rival.
+    (k,) [rad]
+        With the next k, that bends it the other way.
+    float [rad]
+        How far the first bends it, in the mean over the clamps, at most pi.
     """
     arc = arc_headings(np.concatenate([[0.0], u, [1.0]]), 1.0, np.zeros(2), chord, side)
     excess = [
@@ -114,7 +113,7 @@ def arc_into_clamps(
         return phi
 
     other = turns + 1 if rest > 0 else turns - 1
-    return bent(2 * np.pi * turns), bent(2 * np.pi * other) if abs(rest) > _RIVAL else None
+    return bent(2 * np.pi * turns), bent(2 * np.pi * other), abs(rest)
 
 
 def limited(phi: FloatArray) -> FloatArray:

@@ -135,7 +135,9 @@ def test_a_moved_start_moves_the_cable(pinned):
 
 def test_an_end_out_of_reach_is_told_with_numbers(pinned):
     message = (
-        r"the end \(0.9000, 0.0000\) m is 0.9000 m from the start, the cable is 0\.5\d\d\d m long"
+        # The fitted end_offset moves the end by some tenths of a millimetre.
+        r"the end \(0.9000, 0.0000\) m is 0\.(?:899|900)\d m from the start, "
+        r"the cable is 0\.5\d\d\d m long"
     )
     with pytest.raises(EquilibriumError, match=message) as caught:
         predict(pinned, end=(0.9, 0.0))

@@ -70,19 +70,14 @@ def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:
     """
     candidate = screened.candidate
     model = candidate.add_to(base.model)
-    values = model.nominal.copy()
+    values = pull.fit.values_in(model)
     for name, value in start_from(pull, candidate).items():
         values[model.names.index(name)] = value
-    known = base.problem.unknowns
-    held = {name for name, free in zip(known.model.names, known.free, strict=True) if not free}
-    for name in held:
-        values[model.names.index(name)] = base.value(name)
     try:
         fit = fit_model(
             model,
             base.problem.history,
             base.problem.tolerances,
-            free=[name for name in model.names if name not in held],
             values=values,
             start=pull.fit,
             max_iterations=MOST_STEPS,

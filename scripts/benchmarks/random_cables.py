@@ -231,7 +231,9 @@ def missed(
         Problems that were missed, no equilibrium included; all problems, of one pose each.
     """
     count, found = 0, []
-    solver = AnyCable(held_problem(np.random.default_rng(0), start, end, 1))
+    any_rest = held_problem(rng, start, end, 1)
+    any_rest = replace(any_rest, rest=rng.normal(size=len(any_rest.rest)))
+    solver = AnyCable(any_rest)
     for _ in range(problems):
         problem = held_problem(rng, start, end, 1)
         shapes, statuses, _ = solver.solve(problem)
