@@ -37,7 +37,9 @@ def test_moved_and_difference_are_inverse(kind):
 def test_expressions_move_as_arrays_do(kind):
     x = nodes(kind, 5)
     way = np.random.default_rng(2).uniform(-1.5, 1.5, size=(5, kind.increment))
-    moved = [np.array(kind.retract(ca.DM(a), ca.DM(d))).ravel() for a, d in zip(x, way, strict=True)]
+    moved = [
+        np.array(kind.retract(ca.DM(a), ca.DM(d))).ravel() for a, d in zip(x, way, strict=True)
+    ]
     np.testing.assert_allclose(moved, kind.moved(x, way), atol=ROUNDING)
 
 
