@@ -137,7 +137,6 @@ class Assembly:
         self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
         self._slots = self.chain.n_slots
         self._next = np.minimum(np.arange(self._slots) + 1, self.n - 1)
-        self._own_rest = self.chain.rest_of_slots
         self._functions: dict[str, _Mapped] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -155,10 +154,7 @@ class Assembly:
         """A function of a slot for all slots: outputs (m, n_slots, rows, columns)."""
         m = len(shapes.x)
         both = np.concatenate([shapes.x[:, : self._slots], shapes.x[:, self._next]], axis=2)
-        # (n_slots, 3, n_cells) @ (m, n_cells): few cells matter to a slot, but one product is fast.
-        own = (given.rest @ self._own_rest.reshape((-1, self.chain.n_cells)).T).reshape(
-            (m, self._slots, 3)
-        )
+        own = self.chain.rest_inside(given.rest[..., None])[..., 0]
         alike = (shapes.lam, given.p, shapes.deviation)
         lam, p, deviation = (
             np.broadcast_to(one[:, None], (m, self._slots, one.shape[1])) for one in alike
@@ -222,15 +218,10 @@ class Assembly:
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
         n_p = along.p.shape[1]
         moved = slots[..., :n_p] @ along.p[:, None]
-        moved += slots[..., n_p : n_p + 3] @ self._rest_along(along.rest)
+        moved += slots[..., n_p : n_p + 3] @ self.chain.rest_inside(along.rest)
         moved += slots[..., n_p + 3 :] @ along.deviation[:, None]
         at_ends = ends[..., :n_p] @ along.p + ends[..., n_p:] @ along.deviation
         return self._added(moved, at_ends)
-
-    def _rest_along(self, rest: FloatArray) -> FloatArray:
-        """Rest curvature inside the slots (m, n_slots, 3, q) from the cells' (m, n_cells, q)."""
-        flat = self._own_rest.reshape((-1, self.chain.n_cells)) @ rest
-        return flat.reshape((len(rest), self._slots, 3, rest.shape[2]))
 
     # ---- the curve ------------------------------------------------------------------------------
 
@@ -325,7 +316,7 @@ class CurveSlopes:
         steps = self.by_moving[..., : 2 * b] @ nodes
         steps += self.by_moving[..., 2 * b :] @ d.lam[:, None]
         steps += self.by_others[..., :n_p] @ d.p[:, None]
-        steps += self.by_others[..., n_p : n_p + 3] @ a._rest_along(d.rest)
+        steps += self.by_others[..., n_p : n_p + 3] @ a.chain.rest_inside(d.rest)
         steps += self.by_others[..., n_p + 3 :] @ d.deviation[:, None]
         start = np.zeros((len(steps), 2, steps.shape[3]))
         places, ratio = a._stations(steps, start)

@@ -517,7 +517,7 @@ def _balanced(
     inside = bool(np.abs(_bends(model, now)).max() < JOINT_BOUND + AT_BOUND)
     holds = imbalance <= BALANCE * float(matrix.scale[0]) and residual <= END_TOLERANCE
     stable = np.isfinite(matrix.scale[0]) and (
-        int(matrix.factor().negative[0]) == model.n_multipliers + len(held)
+        int(matrix.negative()[0]) == model.n_multipliers + len(held)
     )
     return _Balance(now, bound_lam, residual, holds and inside, bool(stable))
 

@@ -246,7 +246,7 @@ class CableModel:
 
     @cached_property
     def _rest(self) -> ca.SX:
-        """Rest curvature inside a slot, see `Chain.rest_of_slots`."""
+        """Rest curvature inside a slot, see `Chain.rest_stencils`."""
         return ca.SX.sym("rest", 3)
 
     @cached_property

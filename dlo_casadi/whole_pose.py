@@ -131,10 +131,11 @@ def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
 def _slot_arguments(model: CableModel, s: PoseSymbols) -> list[list[ca.SX]]:
     chain = model.chain
     c, last = chain.kind.node.coordinates, chain.n_nodes - 1
+    cells, weights = chain.rest_stencils
     rows: list[list[Any]] = []
     for j in range(chain.n_slots):
         k = min(j + 1, last)
         both = ca.vertcat(s.x[j * c : (j + 1) * c], s.x[k * c : (k + 1) * c])
-        own = ca.DM(chain.rest_of_slots[j]) @ s.rest
+        own = ca.DM(weights[j]) @ s.rest[cells[j].tolist()]
         rows.append([both, s.lam, s.p, own, ca.DM(chain.layout.slots[j]), s.deviation])
     return rows

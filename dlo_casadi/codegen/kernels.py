@@ -119,7 +119,7 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
         rows are in the table, and cables of one kind differ in it alone.
     """
     places = model.chain.layout.slots
-    own = np.column_stack([places[:, 0], model.chain.rest_of_slots @ rest])
+    own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
     # A force on a single place pulls at all of a slot, at nothing of it, or it stands in there.

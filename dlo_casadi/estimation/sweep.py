@@ -294,7 +294,7 @@ class Sweep:
     def stable(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> NDArray[np.bool_]:
         """Whether each pose is a strict minimum of the energy under its end conditions."""
         _, matrix = self.balance(shapes, p, rest)
-        negative = matrix.factor().negative
+        negative = matrix.negative()
         bends = self.node.difference(shapes.x[:, :-1], shapes.x[:, 1:])
         free = np.abs(bends).max(axis=(1, 2)) < JOINT_BOUND
         return np.asarray((negative == self.model.n_multipliers) & free)

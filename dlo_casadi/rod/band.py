@@ -15,7 +15,7 @@ Heller, SIAM J. Numer. Anal. 13 (1976); Haynsworth, Linear Algebra Appl. 1 (1968
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -30,7 +30,7 @@ LEAST_PIVOT = 1e-8
 # Steps of iterative refinement at most, and the relative residual at which they end.
 REFINEMENTS = 3
 RESIDUAL = 1e-13
-# Pivots within this share of their row's largest entry are zero: rounding of the elimination.
+# Eigenvalues within this share of the largest entry are zero: rounding of the elimination.
 ZERO_PIVOT = 1e-13
 
 
@@ -155,6 +155,15 @@ class BandMatrix:
         """Eliminate the nodes."""
         return BandFactor(self)
 
+    def negative(self) -> NDArray[np.intp]:
+        """Number of negative eigenvalues of each matrix (m,), border included.
+
+        Eigenvalues of A that are zero to rounding count as negative, so that a neutral shape is
+        not a stable one; -1 where conditions in the border depend on each other.
+        """
+        rounding = ZERO_PIVOT * self.scale[:, None, None, None] * np.eye(self.diagonal.shape[2])
+        return replace(self, diagonal=self.diagonal - rounding).factor().negative
+
 
 class BandFactor:
     """The elimination of a `BandMatrix`, to solve with and to read the inertia from."""
@@ -163,7 +172,7 @@ class BandFactor:
         self.matrix = matrix
         self._least = LEAST_PIVOT * matrix.scale[:, None, None, None]
         self._levels: list[_Level] = []
-        self._pivots: list[FloatArray] = []
+        self._eigenvalues: list[FloatArray] = []
         diagonal, upper = matrix.diagonal, matrix.upper
         while diagonal.shape[1] > 1:
             level = self._eliminate(diagonal[:, 1::2], upper)
@@ -177,12 +186,13 @@ class BandFactor:
 
     def _inverse(self, pivots: FloatArray) -> FloatArray:
         """Inverses of pivots (m, h, b, b); those that are all but singular are moved a little."""
-        self._pivots.append(pivots)
         b = pivots.shape[-1]
         if b == 1:
+            self._eigenvalues.append(pivots)
             small = np.abs(pivots) < self._least
             return 1 / np.where(small, np.where(pivots < 0, -1, 1) * self._least, pivots)
         values, vectors = np.linalg.eigh(pivots)
+        self._eigenvalues.append(values)
         least = self._least[..., 0]
         small = np.abs(values) < least
         values = np.where(small, np.where(values < 0, -1, 1) * least, values)
@@ -263,11 +273,10 @@ class BandFactor:
 
     @cached_property
     def negative(self) -> NDArray[np.intp]:
-        """Number of negative eigenvalues of each matrix (m,), border included; -1 if singular."""
+        """As `BandMatrix.negative`, of the matrix as it is."""
         total = np.zeros(len(self.schur), dtype=np.intp)
         singular = np.zeros(len(self.schur), dtype=bool)
-        for pivots in self._pivots:
-            values = pivots[..., 0, 0] if pivots.shape[-1] == 1 else np.linalg.eigvalsh(pivots)
+        for values in self._eigenvalues:
             total += (values.reshape((len(total), -1)) < 0).sum(axis=1)
         if self.schur.shape[1]:
             size = np.sqrt(np.maximum(np.abs(np.diagonal(self.schur, axis1=1, axis2=2)), 1e-300))

@@ -88,8 +88,8 @@ class Chain:
         return len(self.cells)
 
     @cached_property
-    def rest_of_slots(self) -> FloatArray:
-        """Rest curvature inside each slot (n_slots, 3, n_cells) from the means over the cells.
+    def rest_stencils(self) -> tuple[NDArray[np.intp], FloatArray]:
+        """Cells (n_slots, 3) that tell the rest curvature inside a slot, and how (n_slots, 3, 3).
 
         From the means m over a cell and its neighbours, for x from -1/2 to 1/2,
 
@@ -97,18 +97,26 @@ class Chain:
             a = (m_(e+1) - m_(e-1)) / 2,   c = (m_(e+1) - 2 m_e + m_(e-1)) / 2
 
         which is exact for parabolas on equal cells. The first and last cell continue their
-        neighbour's.
+        neighbour's. Weights are zero where a slot has no cell.
         """
         count = self.n_cells
-        out = np.zeros((self.n_slots, 3, count))
+        cells = np.zeros((self.n_slots, 3), dtype=np.intp)
+        weights = np.zeros((self.n_slots, 3, 3))
         for e, j in enumerate(self.layout.bends):
-            out[j, 0, e] = 1.0
             if count < 3:
-                out[j, 1] = [-1.0, 1.0] if count == 2 else 0.0
+                cells[j] = [e, 0, count - 1]
+                weights[j, 0] = [1.0, 0.0, 0.0]
+                weights[j, 1] = [0.0, -1.0, 1.0]
                 continue
             middle = min(max(e, 1), count - 2)
-            around = slice(middle - 1, middle + 2)
-            out[j, 2, around] = [0.5, -1.0, 0.5]
-            out[j, 1, around] = [-0.5, 0.0, 0.5]
-            out[j, 1] += 2 * (e - middle) * out[j, 2]
-        return out
+            cells[j] = [middle - 1, middle, middle + 1]
+            weights[j, 0, e - middle + 1] = 1.0
+            weights[j, 2] = [0.5, -1.0, 0.5]
+            weights[j, 1] = [-0.5, 0.0, 0.5]
+            weights[j, 1] += 2 * (e - middle) * weights[j, 2]
+        return cells, weights
+
+    def rest_inside(self, means: FloatArray) -> FloatArray:
+        """Rest curvature inside the slots (..., n_slots, 3, q) of means over cells (..., q)."""
+        cells, weights = self.rest_stencils
+        return np.asarray(weights @ means[..., cells, :])

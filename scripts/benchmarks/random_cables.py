@@ -112,9 +112,9 @@ def held_problem(
 
 
 def random_starts(rng: np.random.Generator, problem: Problem) -> FloatArray:
-    """Smooth headings (m, n_headings) between the clamps; free ones anywhere within a turn."""
+    """Smooth headings (m, n_nodes) between the clamps; free ones anywhere within a turn."""
     model = problem.model
-    u, m = model.chain.heading_places / model.chain.length, len(problem.ends)
+    u, m = model.chain.places / model.chain.length, len(problem.ends)
     first, last = problem.headings.T
     if model.start != "clamped" and model.end != "clamped":
         first = rng.uniform(-np.pi, np.pi, size=m)

@@ -1,0 +1,78 @@
+"""The contract of a node: it moves by increments; nothing else needs to know its coordinates."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.node import Heading, Node
+
+# Some node of each kind; all others are reached from there.
+SOME: dict[type[Node], list[float]] = {Heading: [0.3]}
+EVERY = pytest.mark.parametrize("kind", SOME, ids=lambda kind: kind.__name__)
+ROUNDING = 1e-14  # a few operations on numbers of order one
+
+
+def nodes(kind: type[Node], *shape: int) -> np.ndarray:
+    """Nodes (*shape, coordinates) that lie less than half a turn apart."""
+    rng = np.random.default_rng(0)
+    way = rng.uniform(-0.8, 0.8, size=(*shape, kind.increment))
+    return kind.moved(np.broadcast_to(SOME[kind], (*shape, kind.coordinates)), way)
+
+
+def test_every_kind_of_node_is_known_here():
+    assert {element.node for element in ELEMENTS.values()} <= set(SOME)
+
+
+@EVERY
+def test_moved_and_difference_are_inverse(kind):
+    x, y = nodes(kind, 2, 7), nodes(kind, 2, 7)[::-1]
+    np.testing.assert_allclose(kind.moved(x, kind.difference(x, y)), y, atol=ROUNDING)
+    way = np.random.default_rng(1).uniform(-1.5, 1.5, size=(2, 7, kind.increment))
+    np.testing.assert_allclose(kind.difference(x, kind.moved(x, way)), way, atol=ROUNDING)
+    np.testing.assert_allclose(kind.difference(x, x), 0.0, atol=ROUNDING)
+
+
+@EVERY
+def test_expressions_move_as_arrays_do(kind):
+    x = nodes(kind, 5)
+    way = np.random.default_rng(2).uniform(-1.5, 1.5, size=(5, kind.increment))
+    moved = [
+        np.array(kind.retract(ca.DM(a), ca.DM(d))).ravel() for a, d in zip(x, way, strict=True)
+    ]
+    np.testing.assert_allclose(moved, kind.moved(x, way), atol=ROUNDING)
+
+
+@EVERY
+def test_increments_reach_every_neighbour_and_the_tangent_stays_a_unit_vector(kind):
+    """No increment is lost at delta = 0; the tangent turns across itself."""
+    x, delta = ca.SX.sym("x", kind.coordinates), ca.SX.sym("delta", kind.increment)
+    moved = kind.retract(x, delta)
+    tangent = kind.tangent(moved)
+    rows = [ca.jacobian(moved, delta), tangent, ca.jacobian(tangent, delta)]
+    slopes = ca.Function("slopes", [x, delta], rows)
+    for some in nodes(kind, 5):
+        by_delta, t, turning = (np.array(block) for block in slopes(some, 0))
+        assert np.linalg.matrix_rank(by_delta) == kind.increment
+        assert t.shape == (kind.dimension, 1)
+        assert np.linalg.norm(t) == pytest.approx(1.0, abs=ROUNDING)
+        np.testing.assert_allclose(t.T @ turning, 0.0, atol=ROUNDING)
+        assert np.abs(turning).max() > 0.5
+
+
+@EVERY
+def test_interpolation_hits_what_is_known_and_the_middle_in_between(kind):
+    known, x = np.array([0.1, 0.4, 0.5]), nodes(kind, 2, 3)
+    np.testing.assert_allclose(kind.interpolated(known, known, x), x, atol=ROUNDING)
+    middle = kind.interpolated(np.array([0.25, 0.45]), known, x)
+    half = kind.difference(x[:, :-1], x[:, 1:]) / 2
+    np.testing.assert_allclose(kind.difference(x[:, :-1], middle), half, atol=ROUNDING)
+    beyond = kind.interpolated(np.array([0.0, 0.9]), known, x)
+    np.testing.assert_allclose(beyond, x[:, [0, -1]], atol=ROUNDING)
+
+
+def test_headings_count_whole_turns():
+    """A cable that turns once on its way has turned, whatever its tangent."""
+    x, y = np.array([[0.2]]), np.array([[0.2 - 2 * np.pi]])
+    np.testing.assert_allclose(Heading.difference(x, y), -2 * np.pi)
+    np.testing.assert_allclose(Heading.tangent(ca.DM(np.pi / 2)), [[0.0], [1.0]], atol=ROUNDING)
