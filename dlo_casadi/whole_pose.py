@@ -73,7 +73,8 @@ def potential(model: CableModel) -> Potential:
     given = [energy, conditions[multipliers]]
     energy, conditions = ca.substitute(given, [s.lam[multipliers]], [zero])
     parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
-    coordinates = ca.vertcat(s.x, s.lam[places], ca.vec(inner))
+    held = [s.lam[i] for i in places]
+    coordinates = ca.vertcat(s.x, *held, *ca.vertsplit(ca.vec(inner)))
     return Potential(coordinates, parameters, energy, conditions)
 
 
