@@ -1,4 +1,4 @@
-"""The contract of a node: it moves by increments, and nothing else needs to know its coordinates."""
+"""The contract of a node: it moves by increments; its coordinates are its own affair."""
 
 import casadi as ca
 import numpy as np
