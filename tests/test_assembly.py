@@ -1,0 +1,216 @@
+"""Poses put together from slots: derivatives, independence of poses, memory that grows with n."""
+
+import pickle
+import tracemalloc
+
+import numpy as np
+import pytest
+from perturbed import any_rest, any_shapes, central, directions
+
+from dlo_casadi.assembly import Assembly, Given, Shapes
+from dlo_casadi.effects import (
+    AxialStretch,
+    BendingSoftening,
+    Cable,
+    ClampAngle,
+    EndOffset,
+    EndSpring,
+    GravityTilt,
+    ImageDistortion,
+    ImageScale,
+    LengthError,
+    LumpedMass,
+    PointForce,
+    RestCurvatureDrift,
+    SideLoad,
+    StiffSection,
+    UnknownPull,
+)
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.model import CableModel
+from dlo_casadi.rod.chain import ELEMENTS
+
+CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
+ENDS = np.array(
+    [[0.1, 0.2, 0.9, 0.1, 0.2, -0.3], [0.0, 0.0, 0.5, -0.4, 0.0, 0.4], [-0.1, 0.3, 0.4, 0.4, 1, 1]]
+)  # start, end [m], headings [rad] of three poses
+M = len(ENDS)
+ALL = pytest.mark.parametrize("element", ELEMENTS)
+BOUNDARIES = pytest.mark.parametrize(
+    "boundary", [("pinned", "pinned"), ("clamped", "clamped"), ("clamped", "free")]
+)
+LOADS = (LumpedMass(), PointForce(), SideLoad(), GravityTilt(), UnknownPull())
+MOST = (
+    *LOADS,
+    *(AxialStretch(), LengthError(), StiffSection(), BendingSoftening(), RestCurvatureDrift()),
+    *(ImageScale(), ImageDistortion()),
+)
+HOLDERS = {"pinned": (EndSpring(), EndOffset()), "clamped": (ClampAngle(),), "free": ()}
+
+
+def posed(element: str, boundary: tuple, effects=MOST, n=4) -> tuple[Assembly, Shapes, Given]:
+    """Three poses of a model with most effects, at nothing special."""
+    effects = (*effects, *HOLDERS[boundary[1]])
+    model = CableModel(CABLE, n, element, *boundary, effects=effects)
+    rng = np.random.default_rng(2)
+    p = model.nominal + [0.3 * q.scale * (not q.log) * rng.uniform(0.2, 1) for q in model.parameters]
+    a = model.assembly
+    return a, any_shapes(a, M), Given.of(p, any_rest(a, M), ENDS)
+
+
+def steps(a: Assembly, *names: str) -> np.ndarray:
+    """Steps of central differences: 1e-5 of a parameter's scale, 1e-6 of all else."""
+    count = directions(a, 1, *names).lam.shape[2]
+    out = np.full(count, 1e-6)
+    if "p" in names:
+        at = directions(a, 1, *names).p[0].argmax(axis=1)
+        out[at] = [1e-5 * (q.nominal if q.log else q.scale) for q in a.model.parameters]
+    return out
+
+
+def assert_close(exact: np.ndarray, approximate: np.ndarray, d: np.ndarray, size: float) -> None:
+    """Central differences: 1e-10 of third derivatives, and rounding of values of this size."""
+    tolerance = 1e-6 * np.maximum(np.abs(exact), 1.0) + 1e-15 * size / d
+    gap = np.abs(exact - approximate)
+    assert np.all(gap < tolerance), f"{(gap / tolerance).max():.2g} of the tolerance"
+
+
+# ---- derivatives -------------------------------------------------------------------------------
+
+
+@ALL
+@BOUNDARIES
+def test_gradient_and_hessian_of_the_lagrangian(element, boundary):
+    a, shapes, given = posed(element, boundary)
+    names = ("x", "lam")
+    along, d = directions(a, M, *names), steps(a, *names)
+    total, slope, matrix = a.balance(shapes, given)
+    by_value = central(a, lambda s, g: a.balance(s, g)[0], shapes, given, along, d)
+    assert_close(slope.rows[..., 0], by_value, d, np.abs(total).max())
+    by_slope = central(a, lambda s, g: a.balance(s, g)[1].rows[..., 0], shapes, given, along, d)
+    dense = matrix.dense()
+    assert_close(dense, by_slope, d, np.abs(slope.rows).max())
+    np.testing.assert_allclose(dense, np.swapaxes(dense, 1, 2), atol=1e-13)
+
+
+@ALL
+@BOUNDARIES
+def test_gradient_by_what_the_equilibrium_depends_on(element, boundary):
+    """By parameters, rest curvature and deviations."""
+    a, shapes, given = posed(element, boundary)
+    names = ("p", "rest", "deviation")
+    along, d = directions(a, M, *names), steps(a, *names)
+    exact = a.imbalance_by(shapes, given, along).rows
+    slope = central(a, lambda s, g: a.balance(s, g)[1].rows[..., 0], shapes, given, along, d)
+    assert_close(exact, slope, d, 10.0)
+
+
+@ALL
+@BOUNDARIES
+def test_measured_curve_by_all_it_depends_on(element, boundary):
+    a, shapes, given = posed(element, boundary)
+    names = ("x", "lam", "p", "rest", "deviation")
+    along, d = directions(a, M, *names), steps(a, *names)
+    slopes = a.curve_slopes(shapes, given)
+    np.testing.assert_allclose(slopes.z, a.curve(shapes, given), atol=1e-14)  # rounding
+    assert slopes.z.shape == (M, a.chain.n + 1, 4 if a.chain.kind.smooth else 2)
+    assert_close(slopes.along(along), central(a, a.curve, shapes, given, along, d), d, 10.0)
+
+
+@ALL
+@BOUNDARIES
+def test_state_by_all_it_depends_on(element, boundary):
+    a, shapes, given = posed(element, boundary)
+    names = ("x", "p", "rest")
+    along, d = directions(a, M, *names), steps(a, *names)
+    after = a.state_after(shapes, given)
+    exact = a.state_along(after, along.x, along.rest, along.p)
+    approximate = central(a, lambda s, g: a.state_after(s, g)[0], shapes, given, along, d)
+    assert_close(exact, approximate, d, 10.0)
+
+
+@ALL
+def test_energy_is_the_lagrangian_less_the_work_of_its_multipliers(element):
+    """Where nothing inside moves with them it does not depend on the multipliers."""
+    a, shapes, given = posed(element, ("clamped", "clamped"), LOADS)
+    total, slope, _ = a.balance(shapes, given)
+    energy = a.energy(shapes, given)
+    work = (shapes.lam * slope.y[..., 0]).sum(axis=1)
+    np.testing.assert_allclose(energy + work, total, rtol=1e-12)
+    if not a.model.yields:
+        others = Shapes(shapes.x, 3 * shapes.lam - 1, shapes.deviation)
+        np.testing.assert_allclose(a.energy(others, given), energy, rtol=1e-12)
+
+
+# ---- shape -------------------------------------------------------------------------------------
+
+
+@ALL
+def test_the_curve_without_measurement_effects_is_the_cable(element):
+    """Places of the nodes; for smooth elements the direction there, as long as the stretch."""
+    a, shapes, given = posed(element, ("pinned", "pinned"), (LengthError(),))
+    z = a.curve(shapes, given)
+    np.testing.assert_allclose(z[..., :2], a.nodes(shapes, given), atol=1e-14)
+    np.testing.assert_array_equal(z[:, 0, :2], ENDS[:, :2])
+    if a.chain.kind.smooth:
+        stretch = a.model.true_length(given.p[0]) / CABLE.length
+        x = shapes.x[..., 0]
+        exact = stretch * np.stack([np.cos(x), np.sin(x)], axis=-1)
+        np.testing.assert_allclose(z[..., 2:], exact, atol=1e-14)
+
+
+@ALL
+def test_the_end_is_held_where_the_multipliers_say(element):
+    """Gradient by the first two multipliers: where the cable ends, less where it should."""
+    a, shapes, given = posed(element, ("clamped", "pinned"))
+    gap = a.balance(shapes, given)[1].y[:, :2, 0]
+    offsets = a.model.end_offsets(given.p[0])[2:4] + shapes.deviation[:, :2]
+    exact = a.nodes(shapes, given)[:, -1] - (ENDS[:, 2:4] + offsets)
+    np.testing.assert_allclose(gap, exact, atol=1e-13)  # rounding of a dozen sums
+
+
+@ALL
+def test_poses_do_not_touch_each_other(element):
+    """All poses at once are each pose alone."""
+    a, shapes, given = posed(element, ("clamped", "clamped"))
+    together = a.balance(shapes, given)
+    for j in range(M):
+        alone = a.balance(shapes.subset([j]), given.subset([j]))
+        assert alone[0][0] == together[0][j]
+        np.testing.assert_array_equal(alone[1].rows[0], together[1].rows[j])
+        np.testing.assert_array_equal(alone[2].dense()[0], together[2].dense()[j])
+        one = a.curve(shapes.subset([j]), given.subset([j]))
+        np.testing.assert_array_equal(one[0], a.curve(shapes, given)[j])
+
+
+def test_another_process_gets_the_same_numbers():
+    a, shapes, given = posed("quadratic", ("pinned", "pinned"))
+    again = pickle.loads(pickle.dumps(a))
+    np.testing.assert_array_equal(again.balance(shapes, given)[0], a.balance(shapes, given)[0])
+
+
+# ---- size --------------------------------------------------------------------------------------
+
+
+def most_memory(n: int) -> int:
+    """Largest memory [bytes] that NumPy holds during a linearisation of three poses."""
+    tracemalloc.start()
+    model = CableModel(CABLE, n, effects=(LumpedMass(), RestCurvatureDrift()))
+    sweep = Sweep(model, [Pose((0.0, 0.0), (0.5, 0.1 * j)) for j in range(M)])
+    s = model.chain.places / CABLE.length
+    shapes = sweep.start_shapes(np.broadcast_to((1 - 2 * s)[:, None], (M, len(s), 1)))
+    rest = np.full(model.chain.n_cells, 0.5)
+    p = np.array([0.02, 0.01, 0.3, 0.1])
+    slopes, rest_slopes = np.eye(4, 13), np.hstack([np.zeros((n, 4)), model.rest_basis])
+    along = sweep.directions(shapes, p, rest, slopes, rest_slopes)
+    sweep.observe(shapes, p, rest, along)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return peak
+
+
+def test_memory_grows_with_the_nodes_and_not_with_their_square():
+    """Eight times the nodes: at most eight times the memory; a dense matrix would ask for 64."""
+    assert most_memory(640) < 8 * most_memory(80)
+

@@ -1,0 +1,91 @@
+"""A pose as one expression for IPOPT: the same numbers as the assembly of its slots."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from perturbed import any_rest, any_shapes
+
+from dlo_casadi.assembly import Given
+from dlo_casadi.effects import (
+    AxialStretch,
+    Cable,
+    ClampAngle,
+    EndSpring,
+    ImageScale,
+    LumpedMass,
+    RestCurvatureDrift,
+)
+from dlo_casadi.model import CableModel
+from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.whole_pose import PoseSymbols, balance, curve, potential, rest_after
+
+CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
+ENDS = np.array([0.1, 0.2, 0.9, 0.1, 0.2, -0.3])  # start, end [m], headings [rad]
+EFFECTS = (AxialStretch(), LumpedMass(), RestCurvatureDrift(), ImageScale())
+ALL = pytest.mark.parametrize("element", ELEMENTS)
+BOUNDARIES = pytest.mark.parametrize(
+    "boundary", [("pinned", "pinned"), ("clamped", "clamped"), ("clamped", "free")]
+)
+
+
+def model_of(element: str, boundary: tuple[str, str]) -> tuple[CableModel, np.ndarray]:
+    own = ClampAngle() if boundary[1] == "clamped" else EndSpring()
+    model = CableModel(CABLE, 4, element, *boundary, effects=(*EFFECTS, own))
+    return model, np.array([0.02, 0.02, 0.1, 0.5, 0.2, 1.1, 0.3, 0.1])
+
+
+@ALL
+@BOUNDARIES
+def test_expressions_are_what_the_assembly_says(element, boundary):
+    model, p = model_of(element, boundary)
+    a, s = model.assembly, PoseSymbols.of(model)
+    shapes, rest = any_shapes(a), any_rest(a)[0]
+    given = Given.of(p, rest, ENDS[None])
+    arguments = [s.x, s.lam, s.p, s.rest, s.ends, s.deviation]
+    expressions = [balance(model, s), curve(model, s), rest_after(model, s)]
+    numbers = ca.Function("pose", arguments, expressions)(
+        shapes.x.ravel(), shapes.lam[0], p, rest, ENDS, shapes.deviation[0]
+    )
+    exact = [
+        a.balance(shapes, given)[1].rows,
+        a.curve(shapes, given),
+        a.state_after(shapes, given)[0],
+    ]
+    for found, expected in zip(numbers, exact, strict=True):
+        # The same few dozen terms of order ten, added in another order.
+        np.testing.assert_allclose(np.array(found).ravel(), expected.ravel(), atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("element", "effect", "own"),
+    [
+        ("quadratic", LumpedMass(), [0.1, 0.5]),
+        ("arc", AxialStretch(), [0.02]),
+        ("link", AxialStretch(), [0.02]),
+    ],
+)
+@pytest.mark.parametrize("held", ["pinned", "clamped"])
+def test_minimum_over_what_is_inside_is_the_lagrangian(element, effect, own, held):
+    """V + lam^T c is quadratic in bows or axial strains; its minimum is L, whatever the nodes.
+
+    Under tension: a compressed bow is kept stiff in the Lagrangian alone. Bows and strains one at
+    a time: the Lagrangian leaves out their product.
+    """
+    model = CableModel(CABLE, 4, element, held, held, effects=(effect,))
+    a, problem, p = model.assembly, potential(model), np.array([0.02, *own])
+    shapes, rest = any_shapes(a, scale=0.05), any_rest(a)[0]
+    shapes.lam[0, :2] = [-9.0, 0.0]  # N; the cable pulls its end back
+    total = problem.energy + ca.dot(ca.DM(shapes.lam[0]), problem.conditions)
+    inner = problem.coordinates[a.n :]
+    derivatives = ca.Function(
+        "derivatives",
+        [problem.coordinates, problem.parameters],
+        [total, ca.gradient(total, inner), ca.hessian(total, inner)[0]],
+    )
+    x = np.concatenate([shapes.x.ravel(), np.zeros(inner.numel())])
+    values = np.concatenate([p, rest, ENDS, shapes.deviation[0]])
+    value, slope, bend = (np.array(block) for block in derivatives(x, values))
+    assert np.all(np.linalg.eigvalsh(bend) > 0)
+    least = value - slope.T @ np.linalg.solve(bend, slope) / 2
+    exact = a.balance(shapes, Given.of(p, rest, ENDS[None]))[0][0]
+    assert least.item() == pytest.approx(exact, rel=1e-12)
