@@ -54,7 +54,9 @@ def posed(element: str, boundary: tuple, effects=MOST, n=4) -> tuple[Assembly, S
     effects = (*effects, *HOLDERS[boundary[1]])
     model = CableModel(CABLE, n, element, *boundary, effects=effects)
     rng = np.random.default_rng(2)
-    p = model.nominal + [0.3 * q.scale * (not q.log) * rng.uniform(0.2, 1) for q in model.parameters]
+    p = model.nominal + [
+        0.3 * q.scale * (not q.log) * rng.uniform(0.2, 1) for q in model.parameters
+    ]
     a = model.assembly
     return a, any_shapes(a, M), Given.of(p, any_rest(a, M), ENDS)
 
@@ -213,4 +215,3 @@ def most_memory(n: int) -> int:
 def test_memory_grows_with_the_nodes_and_not_with_their_square():
     """Eight times the nodes: at most eight times the memory; a dense matrix would ask for 64."""
     assert most_memory(640) < 8 * most_memory(80)
-

@@ -49,7 +49,7 @@ def by_c(model, p, rest, poses, folder):
     for pose in poses:
         at, found_here = pose.vector, []
         for which in range(5):
-            phi = np.zeros(model.chain.n_headings)
+            phi = np.zeros(model.chain.n_nodes)
             if library.dlo_guess(at.ctypes.data, which, phi.ctypes.data, work.ctypes.data):
                 found_here.append(phi)
         found.append(found_here)

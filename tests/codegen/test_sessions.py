@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dlo_casadi.assembly import DEVIATIONS
+from dlo_casadi.assembly import Given
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config, read_yaml
 from dlo_casadi.effects import EFFECTS, ClampAngle
@@ -76,6 +76,6 @@ def test_session(name):
         assert np.abs(shape.points - expected.points).max() < 1e-8
         assert shape.min_bend_radius == pytest.approx(expected.min_bend_radius, rel=1e-6)
         if model.has_state:  # a drift enters with its latest state: compile anew
-            arguments = (expected.phi, expected.multipliers, p, rest, pose.vector)
-            rest = np.array(model.next_rest(*arguments, np.zeros(len(DEVIATIONS)))[0]).ravel()
+            given = Given.of(p, rest, pose.vector[None])
+            rest = model.assembly.state_after(expected.shapes, given)[0][0]
             solver = CompiledSolver(model, p, rest)

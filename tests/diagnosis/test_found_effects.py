@@ -17,7 +17,7 @@ from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.declared import nuisances
@@ -109,11 +109,8 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     """Forces k (a - r_j) at the places r_j of the poses' own shapes, by least squares."""
     fit = session("tether", *TETHER)
     stiffness, position, *anchor = TETHER
-    z = fit.problem.sweep.shapes_seen(fit.point.shapes, fit.p, fit.rest)
-    places = [
-        NodeCurve.of(fit.model.chain, row).at(np.array([position]))[0]
-        for row in z[fit.problem.used]
-    ]
+    curves = fit.problem.curves(fit.point.theta, fit.point.shapes)
+    places = [curves[j].at(np.array([position]))[0] for j in fit.problem.used]
     pull = Pull(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), 0.0, fit)
     listed = {c.name: c for c in candidates(fit.model, None, len(ENDS))}
     start = start_from(pull, listed["tether"])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small_sessions import BENCH, small
 
+from dlo_casadi.assembly import Given
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.effects import BendingSoftening, ImageDistortion, RestCurvatureDrift
 from dlo_casadi.errors import ConfigError
@@ -134,8 +135,9 @@ def test_the_next_pose_finds_the_cable_as_the_last_one_left_it(outcome, tmp_path
     rate, expected = fit.value("rest_curvature_drift.rate"), fit.rest
     shapes = fit.point.shapes
     for j, item in enumerate(measured):
-        kappa = fit.model.strain(shapes.phi[j], item.pose.vector, shapes.deviation[j], fit.p)
-        expected = expected + rate * (np.array(kappa).ravel() - expected)
+        given = Given.of(fit.p, expected, item.pose.vector[None])
+        kappa = fit.model.assembly.strain(shapes.subset([j]), given)[0]
+        expected = expected + rate * (kappa - expected)
     assert rate > 0.005
     assert np.abs(expected - fit.rest).max() > 0.01
     assert rest == pytest.approx(expected, abs=1e-9)
