@@ -11,6 +11,7 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
+from dlo_casadi.assembly import Given
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import AxialStretch, Cable, EndSpring, LumpedMass, PointForce
 from dlo_casadi.equilibrium import Equilibrium, Pose, Status, solve_equilibrium
@@ -328,11 +329,20 @@ def test_straight_strut_about_the_euler_load(share, status):
     assert straight.status is status
 
 
+@ALL
+@pytest.mark.parametrize("rest", [0.0, 2.0])
+def test_a_shape_that_nothing_turns_back_is_not_stable(element, rest):
+    """Without weight, a cable on one pin turns about it at no cost."""
+    model = CableModel(HEAVY, 8, element, end="free", gravity=WEIGHTLESS)
+    held = solve(model, 0.1, Pose((0.0, 0.0)), rest)
+    assert held.status is Status.UNSTABLE
+
+
 def test_second_mode_is_flagged_and_avoided():
     """A strip bent to an S is in balance but not stable; on its own the solver bends it to a C."""
     model = CableModel(Cable(1.0, 0.1, 0.01, 0.3), 16, gravity=WEIGHTLESS)
     pose = Pose((0.0, 0.0), (0.8, 0.0))
-    s = model.chain.heading_places
+    s = model.chain.places
     double = solve(model, 0.3, pose, phi_init=0.9 * np.cos(2 * np.pi * s))
     assert double.status is Status.UNSTABLE
     assert not double.stable
@@ -432,8 +442,8 @@ def test_a_joint_at_its_bound_beside_others_that_bow(end, headings):
     np.testing.assert_allclose(held.points[-1], end, atol=1e-9)
     moments = held.bound_multipliers
     assert moments.any()
-    given = (model.nominal, np.zeros(20), pose.vector, np.zeros(6))
-    force = np.array(model.balance(held.phi, held.multipliers, *given)).ravel()[:21]
+    given = Given.of(model.nominal, np.zeros(20), pose.vector[None])
+    force = model.assembly.balance(held.shapes, given)[1].x.ravel()
     turned = np.concatenate([[0.0], moments]) - np.concatenate([moments, [0.0]])
     np.testing.assert_allclose(force + turned, 0.0, atol=1e-10)
 
