@@ -210,7 +210,8 @@ class Assembly:
     def energy(self, shapes: Shapes, given: Given) -> FloatArray:
         """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers."""
         total, slope, _ = self.balance(shapes, given)
-        return total - (shapes.lam * slope.y[:, :, 0]).sum(axis=1)
+        work = shapes.lam * slope.y[:, :, 0] * self.model.are_multipliers
+        return total - work.sum(axis=1)
 
     def imbalance_by(self, shapes: Shapes, given: Given, along: Directions) -> Vector:
         """Change of the gradient at fixed nodes and multipliers, along p, rest and deviation."""

@@ -6,8 +6,9 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from perturbed import any_rest, any_shapes, central, directions
 
-from dlo_casadi.assembly import DEVIATIONS
+from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.effects import (
     EFFECTS,
     BendingSoftening,
@@ -20,6 +21,7 @@ from dlo_casadi.effects import (
     ImageDistortion,
     ImageScale,
     Kinematics,
+    Load,
     LumpedMass,
     PlasticSet,
     PointForce,
@@ -32,19 +34,19 @@ from dlo_casadi.effects import (
     StiffnessGradient,
     StiffSection,
     Tether,
+    UnknownPull,
 )
 from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.model import CableModel
+from dlo_casadi.rod.element import Cell
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 # Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).
 POSE = Pose((0.1, 0.05), (0.5, -0.1), 0.4, -0.2, camera_center=(0.6, -0.4, 2.0)).vector
-STILL = np.zeros(len(DEVIATIONS))
 SLOTS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
 UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad"}
 EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
-OUTPUTS = ("kkt", "observation", "next_rest")
 
 
 @cache
@@ -71,21 +73,35 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
     return p
 
 
-def state(model: CableModel, headings: str) -> tuple[np.ndarray, ...]:
-    """Arguments phi, lam, (p), rest, pose, deviation; p is put in by the caller."""
-    rng = np.random.default_rng(1)
-    phi = rng.normal(scale=0.5, size=model.chain.n_headings)
-    lam = rng.normal(size=model.n_conditions)
-    rest = rng.normal(size=model.chain.n_cells)
-    if headings == "straight":
-        phi, lam, rest = 0 * phi, 0 * lam, 0 * rest
-    return phi, lam, rest
+def posed(
+    model: CableModel, p: np.ndarray, headings: str = "random", pose: np.ndarray = POSE
+) -> tuple[Shapes, Given]:
+    """One pose, straight and unloaded or without any symmetry."""
+    a, scale = model.assembly, 0.0 if headings == "straight" else 1.0
+    shapes = any_shapes(a, scale=1.5 * scale)
+    given = Given.of(p, scale * any_rest(a)[0], pose[None])
+    # Springs rest at the origin: their unknowns are those of no other model.
+    lam = scale * shapes.lam * (np.arange(a.k) < model.n_conditions)
+    return Shapes.declared(shapes.x, lam), given
 
 
-def outputs(model: CableModel, name: str, p: np.ndarray, headings: str = "random"):
-    phi, lam, rest = state(model, headings)
-    found = getattr(model, name)(phi, lam, p, rest, POSE, STILL)
-    return [np.array(block) for block in found]
+def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[str, np.ndarray]:
+    """All that the other stages ask for, derivatives by all but the effect's own parameters."""
+    a, (shapes, given) = model.assembly, posed(model, p, headings)
+    total, slope, matrix = a.balance(shapes, given)
+    along = directions(a, 1, "x", "lam", "p", "rest", "deviation")
+    kept = ~along.p[0, 1:].any(axis=0)
+    curve, after = a.curve_slopes(shapes, given), a.state_after(shapes, given)
+    return {
+        "Lagrangian": total,
+        "gradient": slope.rows,
+        "Hessian": matrix.dense(),
+        "gradient by all": a.imbalance_by(shapes, given, along).rows[..., kept],
+        "curve": curve.z,
+        "curve by all": curve.along(along)[..., kept],
+        "rest after": after[0],
+        "rest after by all": a.state_along(after, along.x, along.rest, along.p)[..., kept],
+    }
 
 
 def number(expression) -> np.ndarray:
@@ -119,9 +135,13 @@ def test_gradients_and_hessians_are_finite(name, element, headings, values):
     """No sqrt(0), atan2(0, 0) or 0/0 in the Lagrangian, its Hessian, or the derivatives by p."""
     model = with_effect(name, element)
     p = own_parameters(model, values)
-    for function in (*OUTPUTS, "sensitivity"):
-        for block in outputs(model, function, p, headings):
-            assert np.all(np.isfinite(block)), function
+    shapes, given = posed(model, p, headings)
+    blocks = outputs(model, p, headings)
+    own = directions(model.assembly, 1, "p")
+    blocks["gradient by p"] = model.assembly.imbalance_by(shapes, given, own).rows
+    blocks["curve by p"] = model.assembly.curve_slopes(shapes, given).along(own)
+    for what, block in blocks.items():
+        assert np.all(np.isfinite(block)), what
 
 
 @EVERY
@@ -129,51 +149,54 @@ def test_gradients_and_hessians_are_finite(name, element, headings, values):
 def test_no_effect_at_nominal_values(name, element):
     """Balance, Hessian, measured curve and state are those of the model without the effect."""
     model, bare = with_effect(name, element), plain(name, element)
-    for function in OUTPUTS:
-        with_it = outputs(model, function, model.nominal)
-        without = outputs(bare, function, bare.nominal)
-        by_p = {"observation": 2, "next_rest": 3}.get(function)
-        for k, (one, other) in enumerate(zip(with_it, without, strict=True)):
-            if k == by_p:
-                one = one[:, : other.shape[1]]  # without the effect's own parameters
-            # The rounding of a few dozen terms, of size up to 1e2 in the Hessian.
-            np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11, err_msg=function)
+    with_it, without = outputs(model, model.nominal), outputs(bare, bare.nominal)
+    if model.n_springs:
+        with_it["gradient"] = with_it["gradient"][:, : without["gradient"].shape[1]]
+        with_it = {what: with_it[what] for what in ("Lagrangian", "gradient", "curve")}
+    for what, block in with_it.items():
+        # The rounding of a few dozen terms, of size up to 1e2 in the Hessian.
+        np.testing.assert_allclose(block, without[what], rtol=1e-11, atol=1e-11, err_msg=what)
 
 
 @EVERY
 @ALL
 def test_every_effect_does_something(name, element):
     model, bare = with_effect(name, element), plain(name, element)
-    p = own_parameters(model, "off")
-    change = [
-        np.abs(outputs(model, f, p)[0] - outputs(bare, f, bare.nominal)[0]).max() for f in OUTPUTS
-    ]
-    assert max(change) > 1e-4
+    with_it = outputs(model, own_parameters(model, "off"))
+    without = outputs(bare, bare.nominal)
+    missing = with_it["gradient"].shape[1] - without["gradient"].shape[1]
+    without["gradient"] = np.pad(without["gradient"], ((0, 0), (0, missing), (0, 0)))
+    felt = ("gradient", "curve", "rest after")
+    assert max(np.abs(with_it[what] - without[what]).max() for what in felt) > 1e-4
 
 
 @EVERY
 @ALL
 def test_derivatives_by_parameters_against_finite_differences(name, element):
-    """Of the balance (`sensitivity`), the measured curve and the state."""
+    """Of the balance, the measured curve and the state."""
     model = with_effect(name, element)
-    p = own_parameters(model, "off")
-    pairs = {"kkt": ("sensitivity", 0), "observation": ("observation", 2)}
-    pairs["next_rest"] = ("next_rest", 3)
-    for function, (source, index) in pairs.items():
-        exact = outputs(model, source, p)[index]
-        for i, q in enumerate(model.parameters):
-            d = 1e-5 * (q.nominal if q.log else q.scale)
-            step = d * np.eye(len(p))[i]
-            ahead = outputs(model, function, p + step)[0]
-            behind = outputs(model, function, p - step)[0]
-            central = ((ahead - behind) / (2 * d)).ravel()
-            size = max(np.abs(exact[:, i]).max(), 1.0)
-            # Central differences of 1e-5 scales: 1e-10 of the third derivative, and the
-            # rounding of values of order ten over 2 d, d > 1e-8.
-            tolerance = 1e-6 * size + 1e-14 / d
-            np.testing.assert_allclose(
-                central, exact[:, i], rtol=0, atol=tolerance, err_msg=f"{function} by {q.name}"
-            )
+    a, (shapes, given) = model.assembly, posed(model, own_parameters(model, "off"))
+    along = directions(a, 1, "p")
+    d = np.array([1e-5 * (q.nominal if q.log else q.scale) for q in model.parameters])
+    after = a.state_after(shapes, given)
+    for what, exact, function in (
+        (
+            "balance",
+            a.imbalance_by(shapes, given, along).rows,
+            lambda s, g: a.balance(s, g)[1].rows[..., 0],
+        ),
+        ("curve", a.curve_slopes(shapes, given).along(along), a.curve),
+        (
+            "state",
+            a.state_along(after, along.x, along.rest, along.p),
+            lambda s, g: a.state_after(s, g)[0],
+        ),
+    ):
+        found = central(a, function, shapes, given, along, d)
+        size = np.maximum(np.abs(exact).max(axis=tuple(range(exact.ndim - 1))), 1.0)
+        # Central differences of 1e-5 scales: 1e-10 of the third derivative, and the
+        # rounding of values of order ten over 2 d, d > 1e-8.
+        assert np.all(np.abs(found - exact) < 1e-6 * size + 1e-14 / d), what
 
 
 ELASTIC = sorted(k for k, kind in EFFECTS.items() if issubclass(kind, SectionLaw | Kinematics))
@@ -189,21 +212,20 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, element):
     gravity = tuple(float(g) for g in turn @ np.array(model.gravity))
     turned = replace(model, gravity=gravity)
     p = own_parameters(model, "off")
-    phi, lam, rest = state(model, "random")
     start, end = POSE[:2], POSE[2:4]
-    ends = np.concatenate([turn @ start + shift, turn @ end + shift, POSE[4:6] + angle, POSE[6:]])
-    energy, nodes = model.energy(phi, lam, p, rest, POSE, STILL)
-    new_energy, new_nodes = turned.energy(phi + angle, turn @ lam, p, rest, ends, STILL)
+    pose = np.concatenate([turn @ start + shift, turn @ end + shift, POSE[4:6] + angle, POSE[6:]])
+    shapes, given = posed(model, p)
+    there = Shapes.declared(shapes.x + angle, shapes.lam @ turn.T)
+    moved = replace(given, poses=pose[None])
+    a, b = model.assembly, turned.assembly
     fall = -CABLE.mass * np.array(gravity) @ shift  # the weight has been moved, too
     # Rounding of a few dozen terms of order one.
-    assert float(new_energy) - fall == pytest.approx(float(energy), abs=1e-11)
-    np.testing.assert_allclose(np.array(new_nodes), np.array(nodes) @ turn.T + shift, atol=1e-11)
-    balance, _ = model.kkt(phi, lam, p, rest, POSE, STILL)
-    new_balance, _ = turned.kkt(phi + angle, turn @ lam, p, rest, ends, STILL)
-    headings = model.chain.n_headings
-    np.testing.assert_allclose(
-        np.array(new_balance)[:headings], np.array(balance)[:headings], atol=1e-11
-    )
+    energy = b.energy(there, moved) - fall
+    np.testing.assert_allclose(energy, a.energy(shapes, given), atol=1e-11)
+    nodes = a.nodes(shapes, given) @ turn.T + shift
+    np.testing.assert_allclose(b.nodes(there, moved), nodes, atol=1e-11)
+    balance, new_balance = a.balance(shapes, given)[1], b.balance(there, moved)[1]
+    np.testing.assert_allclose(new_balance.x, balance.x, atol=1e-11)
 
 
 # ---- loads -------------------------------------------------------------------------------------
@@ -212,10 +234,8 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, element):
 def energies(effects: tuple[Effect, ...], p: list[float], gravity=(0.0, -9.81), element="arc"):
     """Energy [J] and nodes of a random shape that hangs on these loads alone."""
     model = CableModel(CABLE, n=5, element=element, effects=effects, gravity=gravity)
-    phi, lam, rest = state(model, "random")
-    full = np.array([CABLE.bending_stiffness, *p])
-    energy, nodes = model.energy(phi, lam, full, rest, POSE, STILL)
-    return float(energy), np.array(nodes)
+    where = posed(model, np.array([CABLE.bending_stiffness, *p]))
+    return model.assembly.energy(*where)[0], model.assembly.nodes(*where)[0]
 
 
 # Loads bow quadratic elements at given headings: not for those.
@@ -228,9 +248,6 @@ def test_energy_of_loads(element):
     assert mass - none == pytest.approx(0.3 * 9.81 * nodes[2, 1], abs=1e-12)
     force, _ = energies((PointForce(),), [0.4, -0.7, s], element=element)
     assert force - none == pytest.approx(-0.4 * nodes[2, 0] + 0.7 * nodes[2, 1], abs=1e-12)
-    tether, _ = energies((Tether(),), [3.0, s, 0.2, 0.7], element=element)
-    stretched = np.array([0.2, 0.7]) - nodes[2]
-    assert tether - none == pytest.approx(1.5 * stretched @ stretched, abs=1e-12)
     # A side load q acts like gravity q L / m along x.
     side, _ = energies((SideLoad(),), [0.6], element=element)
     wind = (0.6 * CABLE.length / CABLE.mass, -9.81)
@@ -274,7 +291,7 @@ def test_a_tether_to_its_clamp_buckles_a_cable_at_eulers_load(element):
     model = CableModel(CABLE, 20, element, "clamped", "free", (0.0, 0.0), (Tether(),))
     pose = Pose((0.0, 0.0), start_heading=0.0)
     critical = np.pi**2 * 0.05 / CABLE.length**3
-    straight = np.zeros(model.chain.n_headings)
+    straight = np.zeros(model.chain.n_nodes)
     for share, stable in ((0.98, True), (1.02, False)):  # links: (pi / 20)^2 / 12 = 0.2 % off
         p = np.array([0.05, share * critical, CABLE.length, 0.0, 0.0])
         rest = np.zeros(model.chain.n_cells)
@@ -305,14 +322,40 @@ def test_a_soft_tether_to_a_far_anchor_is_a_point_force():
     )
 
 
+@pytest.mark.parametrize("name", sorted(k for k, kind in EFFECTS.items() if issubclass(kind, Load)))
+def test_nothing_hangs_beyond_the_end(name):
+    """What a spread load pulls at the part beyond s falls to zero at the end."""
+    effect, s = EFFECTS[name](), ca.SX.sym("s")
+    params = {q.name: ca.SX(q.nominal + 0.5 * q.scale) for q in effect.parameters(CABLE)}
+    force = effect.resultant(s, ca.SX(ca.DM([1.0, -9.0])), CABLE, params)
+    at_end = ca.substitute(ca.SX(force), s, CABLE.length)
+    np.testing.assert_allclose(number(at_end), 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("element", ["arc", "link"])
+def test_an_unknown_pull_is_another_force_in_every_pose(element):
+    """The mean over the poses and the pose's own deviation, together a point force."""
+    model = CableModel(CABLE, n=5, element=element, effects=(UnknownPull(),))
+    shapes, given = posed(model, np.array([0.05, 0.3, 0.1, 0.48]))
+    shapes.deviation[0, 4:] = [0.1, -0.8]
+    found = model.assembly.energy(shapes, given)[0]
+    direct, _ = energies((PointForce(),), [0.4, -0.7, 0.48], element=element)
+    assert found == pytest.approx(direct, abs=1e-12)
+
+
 # ---- section laws ------------------------------------------------------------------------------
 
-CELLS = np.array([[0.0, 0.2], [0.2, 0.4], [0.4, 0.6], [0.6, 0.8]])  # m
+CELLS = [Cell(ca.SX(low), ca.SX(0.2), 0.2) for low in (0.0, 0.2, 0.4, 0.6)]  # m
 
 
-def factors(effect: SectionLaw, values: dict[str, float], bend=(1.0, 1.0, 1.0, 1.0)) -> np.ndarray:
+def factors(
+    effect: SectionLaw, values: dict[str, float], bend=(1.0, 1.0, 1.0, 1.0), what="factor"
+) -> np.ndarray:
+    """Factors of the law in each of the four cells, bent by so much [1/m]."""
     params = {key: ca.SX(value) for key, value in values.items()}
-    return number(ca.SX.ones(4) * effect.factor(ca.SX(ca.DM(bend)), CELLS, CABLE, params))
+    law = getattr(effect, what)
+    pairs = zip(bend, CELLS, strict=True)
+    return np.array([number(law(ca.SX(float(k)), cell, CABLE, params)) for k, cell in pairs])
 
 
 def test_taper_in_each_cell():
@@ -349,6 +392,17 @@ def test_moment_of_a_softening_section():
     # share of 0.2 * 0.008 = 1.6e-3.
     np.testing.assert_allclose(moment, k / (1 + np.abs(k) * softness), rtol=2e-3)
     assert np.all(np.diff(moment) > 0)
+    tangent = factors(BendingSoftening(), {"softness": softness}, k, "tangent")
+    slope = 1 / (1 + np.abs(k) * softness) ** 2  # dM/dk over EI
+    np.testing.assert_allclose(tangent, slope, rtol=4e-3)
+    assert BendingSoftening.even
+
+
+@pytest.mark.parametrize("name", sorted(k for k, c in EFFECTS.items() if issubclass(c, SectionLaw)))
+def test_even_laws_are_the_same_all_along_the_cable(name):
+    law = EFFECTS[name]()
+    values = {q.name: q.nominal + 0.5 * q.scale for q in law.parameters(CABLE)}
+    assert law.even == (np.ptp(factors(law, values)) == 0)
 
 
 # ---- boundaries, measurement, state ------------------------------------------------------------
@@ -359,12 +413,11 @@ def test_springs_pull_towards_their_heading():
     for kind, index in ((StartSpring, 0), (EndSpring, -1)):
         model = CableModel(CABLE, n=5, effects=(kind(),))
         bare = CableModel(CABLE, n=5)
-        phi, lam, rest = state(model, "random")
-        p = np.array([0.05, 0.7, -0.4])
-        with_it, _ = model.energy(phi, lam, p, rest, POSE, STILL)
-        without, _ = bare.energy(phi, lam, p[:1], rest, POSE, STILL)
-        exact = 0.7 * (phi[index] + 0.4) ** 2 / 2
-        assert float(with_it - without) == pytest.approx(exact, abs=1e-12)
+        shapes, given = posed(model, np.array([0.05, 0.7, -0.4]))
+        with_it = model.assembly.energy(shapes, given)[0]
+        without = bare.assembly.energy(shapes, replace(given, p=given.p[:, :1]))[0]
+        exact = 0.7 * (shapes.x[0, index, 0] + 0.4) ** 2 / 2
+        assert with_it - without == pytest.approx(exact, abs=1e-12)
 
 
 def test_fixtures_are_where_the_boundary_effects_put_them():

@@ -338,6 +338,15 @@ def test_straight_strut_about_the_euler_load(share, status):
     assert straight.status is status
 
 
+@ALL
+@pytest.mark.parametrize("rest", [0.0, 2.0])
+def test_a_shape_that_nothing_turns_back_is_not_stable(element, rest):
+    """Without weight, a cable on one pin turns about it at no cost."""
+    model = CableModel(HEAVY, 8, element, end="free", gravity=WEIGHTLESS)
+    held = solve(model, 0.1, Pose((0.0, 0.0)), rest)
+    assert held.status is Status.UNSTABLE
+
+
 def test_second_mode_is_flagged_and_avoided():
     """A strip bent to an S is in balance but not stable; on its own the solver bends it to a C."""
     model = CableModel(Cable(1.0, 0.1, 0.01, 0.3), 16, gravity=WEIGHTLESS)

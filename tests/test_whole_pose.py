@@ -20,7 +20,8 @@ from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.whole_pose import PoseSymbols, balance, curve, potential, rest_after
 
 CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
-ENDS = np.array([0.1, 0.2, 0.9, 0.1, 0.2, -0.3])  # start, end [m], headings [rad]
+# Start, end [m], headings [rad], no camera.
+ENDS = np.array([0.1, 0.2, 0.9, 0.1, 0.2, -0.3, 0.0, 0.0, 0.0])
 EFFECTS = (AxialStretch(), LumpedMass(), RestCurvatureDrift(), ImageScale())
 ALL = pytest.mark.parametrize("element", ELEMENTS)
 BOUNDARIES = pytest.mark.parametrize(
@@ -41,7 +42,7 @@ def test_expressions_are_what_the_assembly_says(element, boundary):
     a, s = model.assembly, PoseSymbols.of(model)
     shapes, rest = any_shapes(a), any_rest(a)[0]
     given = Given.of(p, rest, ENDS[None])
-    arguments = [s.x, s.lam, s.p, s.rest, s.ends, s.deviation]
+    arguments = [s.x, s.lam, s.p, s.rest, s.pose, s.deviation]
     expressions = [balance(model, s), curve(model, s), rest_after(model, s)]
     numbers = ca.Function("pose", arguments, expressions)(
         shapes.x.ravel(), shapes.lam[0], p, rest, ENDS, shapes.deviation[0]

@@ -19,9 +19,9 @@ _LARGEST = 500_000
 _MOST_VALUES = _LARGEST // 2
 # Levels of lists and mappings; a configuration has seven.
 _DEEPEST = 30
-# No text: control characters beside tab and line breaks, and halves of surrogate pairs, which
-# names of files cannot hold and a terminal obeys or cannot write.
-_NO_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff]")
+# No text: control characters beside tab and line breaks, which a terminal obeys, and halves of
+# surrogate pairs, except those that stand for the bytes of a file's name that is not UTF-8.
+_NO_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udc7f\udd00-\udfff]")
 
 
 def read_yaml(path: str | Path) -> Any:

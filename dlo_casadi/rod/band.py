@@ -242,22 +242,29 @@ class BandFactor:
             return Vector(x, right.y)
         flat = self.matrix.border.reshape((m, n * b, k))
         gap = right.y - _transposed(flat) @ x.reshape((m, n * b, -1))
-        y = np.linalg.solve(self._held, gap)
+        values, vectors = self._conditions
+        dependent = np.abs(values) < ZERO_PIVOT
+        inverse = np.where(dependent, 0.0, 1 / np.where(dependent, 1.0, values))
+        y = vectors @ (inverse[..., None] * (_transposed(vectors) @ gap))
         return Vector(x - self._arm @ y[:, None], y)
 
     @cached_property
-    def _held(self) -> FloatArray:
-        """The Schur complement, kept away from singular."""
-        size = np.maximum(np.abs(np.diagonal(self.schur, axis1=1, axis2=2)), 1e-300)
-        return self.schur - 1e-16 * size[:, None, :] * np.eye(self.schur.shape[1])
+    def _conditions(self) -> tuple[FloatArray, FloatArray]:
+        """Eigenvalues (m, k) and vectors (m, k, k) of the Schur complement, scaled to ones."""
+        size = np.sqrt(np.abs(np.diagonal(self.schur, axis1=1, axis2=2)))
+        size = np.where(size > 0, size, 1.0)
+        values, vectors = np.linalg.eigh(self.schur / (size[:, :, None] * size[:, None, :]))
+        return values, np.asarray(vectors / size[:, :, None])
 
     def solve(self, right: Vector) -> Vector:
         """Solution of each pose for columns (m, n, b, q), (m, k, q), refined to rounding.
 
+        Conditions that depend on each other share their multiplier, the least one.
+
         Raises
         ------
         numpy.linalg.LinAlgError
-            If a matrix is singular.
+            If a matrix is not finite.
         """
         found = self._once(right)
         size = right.size
@@ -279,8 +286,7 @@ class BandFactor:
         for values in self._eigenvalues:
             total += (values.reshape((len(total), -1)) < 0).sum(axis=1)
         if self.schur.shape[1]:
-            size = np.sqrt(np.maximum(np.abs(np.diagonal(self.schur, axis1=1, axis2=2)), 1e-300))
-            values = np.linalg.eigvalsh(self.schur / (size[:, :, None] * size[:, None, :]))
+            values, _ = self._conditions
             total += (values < 0).sum(axis=1)
             singular = np.abs(values).min(axis=1) < ZERO_PIVOT
         return np.where(singular, -1, total)
