@@ -180,8 +180,9 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
     Joints at their bound count as conditions.
     """
     model, phi = problem.model, shape["headings"]
-    given = Given.of(model.nominal, problem.rest, np.array([[0.0, 0.0, *end, 0.0, 0.0]]))
-    shapes = Shapes(phi[None, :, None], shape["lam"][None], np.zeros((1, 6)))
+    pose = Pose((0.0, 0.0), (float(end[0]), float(end[1])))
+    given = Given.of(model.nominal, problem.rest, pose.vector[None])
+    shapes = Shapes.declared(phi[None, :, None], shape["lam"][None])
     _, slope, matrix = model.assembly.balance(shapes, given)
     force = slope.x[0, :, 0, 0]
     active = np.flatnonzero(np.abs(np.diff(phi)) > JOINT_BOUND - 1e-7)

@@ -27,7 +27,7 @@ int dlo_guess(const dlo_pose *pose, int which, double *headings, double *work)
         return 0;
     there = first_guess(&w, which);
     for (i = 0; i < DLO_N_HEADINGS; ++i)
-        headings[i] = w.at.x[FIRST + i];
+        headings[i] = w.at.x[i];
     return there;
 }
 """

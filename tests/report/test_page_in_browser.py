@@ -215,8 +215,8 @@ def test_deviations_are_enlarged_as_told(visit, photographed):
     shown = find(browser, "#after-0").get_attribute("points")
     points = np.array([pair.split(",") for pair in shown.split()], dtype=float)
 
-    pose, std = photographed.poses[0], photographed.measurement.std
-    tenfold = beside(pose, photographed.stage("batch").shapes[pose.name], std, 10.0)
+    pose = photographed.poses[0]
+    tenfold = beside(pose, photographed.stage("batch").shapes[pose.name], 10.0)
     # The camera's perspective bends a millimetre by far less than a tenth of a pixel.
     assert points == pytest.approx(pose.to_pixels(tenfold), abs=0.1)
     assert find(browser, "#large [value='10']").get_property("checked")
