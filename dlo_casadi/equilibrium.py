@@ -356,7 +356,7 @@ def solve_equilibrium(
     Of the equilibria that the first guesses lead to (see `guesses`), the stable one of lowest
     energy is returned, an unstable one where no other is found. A pose that names its branch
     gets one of that branch or none; between two pins the first stable one, as a rule that of the
-    branch's own arc. With `phi_init`, the equilibrium that it leads to.
+    branch's own arc. With `phi_init`, the equilibrium that it leads to, on whichever branch.
 
     Parameters
     ----------
@@ -388,14 +388,15 @@ def solve_equilibrium(
         )
     check_reach(model, p, pose)
     starts = [phi_init] if phi_init is not None else guesses(model, p, rest, pose)
-    first_suffices = pose.branch is not None and (model.start, model.end) == ("pinned", "pinned")
+    branch = pose.branch if phi_init is None else None
+    first_suffices = branch is not None and (model.start, model.end) == ("pinned", "pinned")
     found: list[Equilibrium] = []
     for phi in starts:
         eq = _from_start(model, p, rest, pose, phi)
         if eq.status is Status.FAILED:
             continue
         found.append(eq)
-        if first_suffices and eq.stable and eq.turns(pose.branch):
+        if first_suffices and eq.stable and eq.turns(branch):
             break
     where = "its end free" if pose.end is None else f"its end at {pose.end} m"
     if not found:
@@ -408,12 +409,12 @@ def solve_equilibrium(
     found.sort(key=lambda eq: (not eq.stable, eq.energy))
     lowest = found[0]
     for eq in found:
-        if eq.turns(pose.branch) and eq.stable is lowest.stable:
+        if eq.turns(branch) and eq.stable is lowest.stable:
             return eq
     there = next((f"branch {branch}" for branch in SIGNS if lowest.turns(branch)), "neither branch")
     kind = "stable equilibrium" if lowest.stable else "equilibrium"
     raise EquilibriumError(
-        f"no {kind} found on the branch {pose.branch} from {len(starts)} first guesses with "
+        f"no {kind} found on the branch {branch} from {len(starts)} first guesses with "
         f"{where}: the lowest one, of {lowest.energy:.4g} J, turns by {lowest.turn:+.3g} rad from "
         f"start to end ({there}).\n"
         "  Try: the other branch, or none.",
