@@ -175,7 +175,7 @@ NEWTON_STEPS = 8
 # In 690 solves of random problems of all boundaries IPOPT took 7 iterations (median), at most 84.
 IPOPT_ITERATIONS = 300
 # First guesses that seldom lead to the lowest equilibrium are left out, see `guesses` [rad].
-# Of 1200 random problems with clamps this loses none.
+# Of 300 random problems with a clamp at the end or at both ends this loses none.
 FAR, CURVED = 1.5, 1.0
 # A joint so near to its bound is at it [rad].
 AT_BOUND = 1e-6
