@@ -49,8 +49,9 @@ _PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 def write_figures(folder: Path, outcome: Outcome) -> None:
     """Draw all figures that the outcome has something for into an existing folder."""
     draw_poses(folder, outcome)
-    draw_residuals(folder / "residuals.png", outcome)
-    draw_rest_curvature(folder / "rest_curvature.png", outcome)
+    if any(stage.shapes for stage in outcome.stages):
+        draw_residuals(folder / "residuals.png", outcome)
+        draw_rest_curvature(folder / "rest_curvature.png", outcome)
     draw_errors(folder / "errors.png", outcome)
     if outcome.candidates:
         draw_candidates(folder / "candidates.png", outcome)

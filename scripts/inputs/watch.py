@@ -30,11 +30,15 @@ class _Worker:
 
 
 def watched(
-    work: Callable[[Any], tuple[str, str]], items: Iterable[Any], jobs: int
+    work: Callable[[Any], tuple[str, str]],
+    items: Iterable[Any],
+    jobs: int,
+    allowed: Callable[[Any], float] = lambda _: MOST_SECONDS,
 ) -> Iterator[tuple[Any, str, str]]:
     """Do the work in `jobs` processes; yield (item, outcome, text) in the order of their ends.
 
-    Outcomes are those of `work`, and "hang", "memory" or "crash".
+    Outcomes are those of `work`, and "hang" (more processor time [s] than `allowed`), "memory" or
+    "crash".
     """
     context = multiprocessing.get_context("fork")
     waiting = iter(items)
@@ -59,12 +63,12 @@ def watched(
         while busy := [worker for worker in workers if worker.item is not None]:
             ready = wait([worker.connection for worker in busy], timeout=0.2)
             for worker in busy:
-                item = worker.item
+                item, most = worker.item, allowed(worker.item)
                 if worker.connection in ready:
                     try:
                         outcome, text = worker.connection.recv()
-                        if _processor_time(worker.process.pid) - worker.spent > MOST_SECONDS:
-                            outcome, text = "hang", f"more than {MOST_SECONDS:g} s\n{text}"
+                        if _processor_time(worker.process.pid) - worker.spent > most:
+                            outcome, text = "hang", f"more than {most:g} s\n{text}"
                         feed(worker)
                         yield item, outcome, text
                         continue
@@ -73,10 +77,10 @@ def watched(
                         outcome = "crash"
                         text = f"the process ended with exit code {worker.process.exitcode}"
                 elif (
-                    _processor_time(worker.process.pid) - worker.spent > MOST_SECONDS
+                    _processor_time(worker.process.pid) - worker.spent > most
                     or time.monotonic() - worker.begin > _MOST_WAITING
                 ):
-                    outcome, text = "hang", f"no end within {MOST_SECONDS:g} s of processor time"
+                    outcome, text = "hang", f"no end within {most:g} s of processor time"
                 else:
                     continue
                 worker.process.kill()

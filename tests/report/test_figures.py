@@ -98,6 +98,14 @@ def test_nothing_is_drawn_of_what_is_missing(outcome, tmp_path):
     assert (tmp_path / "poses.png").exists()
 
 
+def test_stages_without_any_prediction_have_no_residuals(outcome, tmp_path):
+    none = tuple(replace(stage, shapes={}) for stage in outcome.stages)
+    figures.write_figures(tmp_path, replace(outcome, stages=none))
+
+    assert (tmp_path / "poses.png").exists()
+    assert not (tmp_path / "residuals.png").exists()
+
+
 def test_many_poses_take_several_pages(outcome, tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "_POSES_A_PAGE", 8)
     figures.draw_poses(tmp_path, outcome)
