@@ -20,6 +20,7 @@ from scipy.optimize import minimize
 from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium import Pose
 from dlo_casadi.initial import arc_headings
 from dlo_casadi.model import CableModel
 from dlo_casadi.whole_pose import potential
@@ -164,7 +165,7 @@ def by_casadi(n: int, kind: str, repeats: int) -> dict[str, Any]:
     seconds, errors = [], []
     for end in poses():
         start = arc_headings(model.chain.places, CABLE.length, np.zeros(2), end, 1)
-        p = np.concatenate([model.nominal, np.zeros(n - 1), [0, 0, *end, 0, 0], np.zeros(6)])
+        p = np.concatenate([model.nominal, np.zeros(n - 1), Pose((0.0, 0.0), end).vector, np.zeros(6)])
         good = reference.solve(end, branch="ccw").headings
         # Sixteen at a time, so that no conversion of arguments is timed.
         tiled = {
