@@ -165,7 +165,9 @@ def by_casadi(n: int, kind: str, repeats: int) -> dict[str, Any]:
     seconds, errors = [], []
     for end in poses():
         start = arc_headings(model.chain.places, CABLE.length, np.zeros(2), end, 1)
-        p = np.concatenate([model.nominal, np.zeros(n - 1), Pose((0.0, 0.0), end).vector, np.zeros(6)])
+        p = np.concatenate(
+            [model.nominal, np.zeros(n - 1), Pose((0.0, 0.0), end).vector, np.zeros(6)]
+        )
         good = reference.solve(end, branch="ccw").headings
         # Sixteen at a time, so that no conversion of arguments is timed.
         tiled = {
