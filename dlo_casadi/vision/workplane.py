@@ -9,11 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.view import Array, View
 
 CABLE_PX = 6.0  # width of the cable in this picture
 _MAX_PIXELS = 3.0e6
 _MAX_ENLARGEMENT = 1.5
+_LEAST_PIXELS = 8
+"""Sides of a photograph, shrunk until the cable is CABLE_PX wide: below, nothing of it is left."""
+
 _AROUND = 0.3  # of the length: how far beyond its reach other cables are looked for
 _MARKER_MARGIN = 1.45  # of the marker: its white margin is one cell of six or more
 
@@ -88,6 +92,12 @@ def rectify(
         small, factor = image, 1.0
     else:
         factor = shrink
+        if factor * min(height, width) < _LEAST_PIXELS:
+            raise VisionError(
+                f"a cable of {diameter:.4g} m in diameter would be {diameter * view.scale:.4g} "
+                f"pixels wide in a photograph of {width} x {height}: too wide to be followed.\n"
+                "  Try: cable.diameter in metres? board.marker_size, reference.points?"
+            )
         small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     maps = ((at + 0.5) * factor - 0.5).astype(np.float32)
     flat = cv2.remap(small, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -164,3 +164,9 @@ def test_wrong_declarations_are_named():
         extract(image, CABLE, start=(5.0, 5.0), end=(5.3, 5.0))
     with pytest.raises(VisionError, match="no cable found"):
         extract(image, CABLE, width_px=30.0)
+
+
+def test_a_cable_wider_than_the_photograph_is_named():
+    """A diameter in the wrong unit: nothing is left of a picture in which it is six pixels wide."""
+    with pytest.raises(VisionError, match=r"diameter would be 1000 pixels wide in a photograph"):
+        extract(draw(CABLE), CABLE, width_px=1000)
