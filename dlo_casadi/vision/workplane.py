@@ -15,6 +15,9 @@ from dlo_casadi.vision.view import Array, View
 CABLE_PX = 6.0  # width of the cable in this picture
 _MAX_PIXELS = 3.0e6
 _MAX_ENLARGEMENT = 1.5
+_LONGEST_SIDE = 32767
+"""Pixels of one side of this picture at most: what `cv2.remap` takes."""
+
 _LEAST_PIXELS = 8
 """Sides of a photograph, shrunk until the cable is CABLE_PX wide: below, nothing of it is left."""
 
@@ -82,6 +85,13 @@ def rectify(
         1.0 / (_MAX_ENLARGEMENT * view.scale),
         float(np.sqrt(size.prod() / _MAX_PIXELS)),
     )
+    if not np.all(size / pixel < _LONGEST_SIDE):
+        raise VisionError(
+            f"what is seen of the cable's plane, {size[0]:.4g} x {size[1]:.4g} m for a cable of "
+            f"{length:.4g} m, cannot be drawn: the scale of {view.scale:.4g} pixels per metre is "
+            "not that of this photograph.\n"
+            "  Try: board.marker_size, board.marker_centers, reference.points in metres?"
+        )
     columns, rows = (np.ceil(size / pixel)).astype(int) + 1
     origin = np.array([lower[0], upper[1]])
     at = _sources(view, origin, pixel, int(rows), int(columns))
