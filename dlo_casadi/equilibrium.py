@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Given, Shapes
+from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, arc_into_clamps, limited, wrapped
 from dlo_casadi.model import CableModel
@@ -429,7 +429,7 @@ def _from_start(
     """One IPOPT solve from one first guess, and Newton's method on the Lagrangian."""
     chain = model.chain
     solver = _solver(id(model), _Held(model))
-    deviation = np.zeros(len(DEVIATIONS))
+    deviation = np.zeros(len(model.deviation_names))
     given = Given.of(p, rest, pose.vector[None])
     x0 = np.concatenate([phi, np.zeros(2 * model.n_springs + model.n_inner * chain.n_slots)])
     bounds = np.zeros(model.n_multipliers + chain.n_nodes - 1)

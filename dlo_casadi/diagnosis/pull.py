@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model, starting_points
@@ -89,7 +88,7 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
             continue
     if best is None:
         return None
-    columns = [DEVIATIONS.index(axis) for axis in effect.per_pose]
+    columns = [model.deviation_names.index(axis) for axis in effect.per_pose(model.cable)]
     mean = [best.value(f"{effect.label}.{axis}") for axis in ("fx", "fy")]
     forces = best.point.shapes.deviation[np.ix_(best.problem.used, columns)] + mean
     position = best.value(name)

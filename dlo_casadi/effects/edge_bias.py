@@ -38,13 +38,13 @@ class EdgeBias(MeasurementEffect):
             Parameter(f"{kind}{k}", "m", scale=1e-4) for k in HARMONICS for kind in ("a", "b")
         )
 
-    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Move the point along the cable's normal."""
         offset = sum(
             (
-                params[f"a{k}"] * ca.cos(k * heading) + params[f"b{k}"] * ca.sin(k * heading)
+                params[f"a{k}"] * ca.cos(k * frame) + params[f"b{k}"] * ca.sin(k * frame)
                 for k in HARMONICS
             ),
             start=ca.SX(0),
         )
-        return point + offset * ca.vertcat(-ca.sin(heading), ca.cos(heading))
+        return point + offset * ca.vertcat(-ca.sin(frame), ca.cos(frame))

@@ -38,9 +38,9 @@ class StartSpring(_PinSpring):
 
     name = "start_spring"
 
-    def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX:
+    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
         """Energy of the spring [J]."""
-        return self._spring(start_heading, params)
+        return self._spring(first, params)
 
 
 class EndSpring(_PinSpring):
@@ -48,6 +48,6 @@ class EndSpring(_PinSpring):
 
     name = "end_spring"
 
-    def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX:
+    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
         """Energy of the spring [J]."""
-        return self._spring(end_heading, params)
+        return self._spring(last, params)

@@ -39,7 +39,7 @@ class ImageDistortion(MeasurementEffect):
         """Declare the coefficient."""
         return (Parameter("coefficient", "1/m^2", scale=0.005 / cable.length**2),)
 
-    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Move the point along its radius."""
         arm = point - ca.DM(self.center)
         return ca.DM(self.center) + (1 + params["coefficient"] * ca.sumsqr(arm)) * arm

@@ -37,7 +37,7 @@ class StandoffError(MeasurementEffect):
         """Declare the distance."""
         return (Parameter("distance", "m", scale=1e-3),)
 
-    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Follow the ray through the point to the declared plane."""
         d = params["distance"]
         return point + d * (sight.nearness * point - sight.camera) / (1 - d * sight.nearness)

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Shapes
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
@@ -207,7 +207,7 @@ def carried_shapes(problem: BatchProblem, start: Fit) -> Shapes:
             found = solve_equilibrium(start.model, start.p, start.rest, problem.history[index].pose)
         except EquilibriumError as error:
             raise EstimationError(error.message) from error
-        rows.append((found.x, found.multipliers, np.zeros(len(DEVIATIONS))))
+        rows.append((found.x, found.multipliers, np.zeros(len(start.model.deviation_names))))
     x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
     model = problem.unknowns.model
     shapes = with_border_of(Shapes(x, lam, deviation), start.model, model)

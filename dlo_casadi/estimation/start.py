@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Directions, Shapes
+from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.equilibrium import guesses
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import (
@@ -72,7 +72,7 @@ def _each_node(sweep: Sweep) -> Directions:
     q = a.n * a.b
     x = np.broadcast_to(np.eye(q).reshape((a.n, a.b, q)), (m, a.n, a.b, q))
     model = sweep.model
-    counts = (a.k, len(model.parameters), model.chain.n_cells, len(DEVIATIONS))
+    counts = (a.k, len(model.parameters), model.chain.n_rests, len(model.deviation_names))
     return Directions(x, *(np.zeros((m, count, q)) for count in counts))
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Assembly, CurveSlopes, Directions, Given, Shapes
+from dlo_casadi.assembly import Assembly, CurveSlopes, Directions, Given, Shapes
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -51,7 +51,7 @@ class Sweep:
         self.assembly = model.assembly
         self.node = self.assembly.node
         self._ends = np.array([pose.vector for pose in self.poses])
-        self.used_deviations = [DEVIATIONS.index(name) for name in model.deviations]
+        self.used_deviations = [model.deviation_names.index(name) for name in model.deviations]
 
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes of these nodes (m, n_nodes, coordinates), without forces and deviations."""
@@ -234,12 +234,12 @@ class Sweep:
         p_along[:, :, :size] = slopes
         rest_along = np.zeros((m, rest_slopes.shape[0], q))
         rest_along[:, :, :size] = rest_slopes
-        deviation = np.zeros((m, len(DEVIATIONS), q))
+        deviation = np.zeros((m, len(self.model.deviation_names), q))
         deviation[:, self.used_deviations, size + np.arange(own)] = 1.0
         still = replace(_still(self.assembly, m, rest_along, p_along), deviation=deviation)
         if self.model.has_state:
             slopes_after = self.assembly.state_after(shapes, given)
-            if slopes_after[1].any() or np.any(slopes_after[2] != 1):
+            if slopes_after[1].any() or not self.assembly.rest_stays(slopes_after):
                 return self._carried(shapes, given, matrix, still, slopes_after)
             # A state that is not there yet hands on what it finds, and its own parameters' part.
             left = slopes_after[3] @ p_along
@@ -308,7 +308,7 @@ def _still(a: Assembly, m: int, rest: FloatArray, p: FloatArray) -> Directions:
         np.zeros((m, a.k, q)),
         p,
         rest,
-        np.zeros((m, len(DEVIATIONS), q)),
+        np.zeros((m, len(a.model.deviation_names), q)),
     )
 
 
