@@ -288,7 +288,7 @@ class Assembly:
     def strain(self, shapes: Shapes, given: Given) -> FloatArray:
         """Mean curvatures (m, n_rests) [1/m] of the cells, about the axes in turn."""
         (rows,) = self._call_slots("slot_strain", shapes, given)
-        return self._stacked(rows[:, self.chain.layout.bends, :, 0])
+        return self._stacked(rows[..., 0][:, self.chain.layout.bends])
 
     def twist(self, shapes: Shapes, given: Given) -> FloatArray:
         """Mean twist (m, n_cells) [1/m] of the cells; zero in a plane."""
@@ -310,7 +310,7 @@ class Assembly:
         bends = self.chain.layout.bends
         after, *slopes = self._call_slots("slot_state", shapes, given)
         stacked = [self._stacked(part[:, bends]) for part in slopes]
-        return (self._stacked(after[:, bends, :, 0]), *stacked)
+        return (self._stacked(after[..., 0][:, bends]), *stacked)
 
     def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
         """Whether poses hand on the rest curvature that they find, to first order."""

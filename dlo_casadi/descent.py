@@ -75,8 +75,8 @@ def descend(assembly: Assembly, shapes: Shapes, given: Given, max_iterations: in
     for iteration in range(max_iterations):
         here = now.subset(active)
         _, force, matrix = assembly.balance(here, given.subset(active))
-        finite = np.isfinite(matrix.diagonal).all(axis=(1, 2, 3))
-        if not finite.all():
+        finite = np.flatnonzero(np.isfinite(matrix.diagonal).all(axis=(1, 2, 3)))
+        if len(finite) < len(active):
             active, here = active[finite], here.subset(finite)
             force = Vector(force.x[finite], force.y[finite])
             matrix = matrix.subset(finite)
@@ -97,9 +97,7 @@ def descend(assembly: Assembly, shapes: Shapes, given: Given, max_iterations: in
     return Minima(now, converged, assembly.energy(now, given), iterations)
 
 
-def _convex(
-    matrix: BandMatrix, wanted: int, before: FloatArray
-) -> tuple[BandFactor, FloatArray]:
+def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFactor, FloatArray]:
     """Elimination of the matrices shifted until their inertia is a minimum's, and the shifts."""
     scale = matrix.scale
     shift = np.where(before > LEAST_SHIFT * scale, before / SHRINKAGE, 0.0)

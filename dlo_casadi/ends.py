@@ -53,9 +53,9 @@ class EndConditions:
 
     def turned(self, start: ca.SX | None = None, end: ca.SX | None = None) -> EndConditions:
         """Return a copy whose clamps are turned by increments about their own axes."""
-        frames = {}
+        first, last = self.start_frame, self.end_frame
         if start is not None:
-            frames["start_frame"] = self.node.retract(self.start_frame, start)
+            first = self.node.retract(first, start)
         if end is not None:
-            frames["end_frame"] = self.node.retract(self.end_frame, end)
-        return replace(self, **frames)
+            last = self.node.retract(last, end)
+        return replace(self, start_frame=first, end_frame=last)

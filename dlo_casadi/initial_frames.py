@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -21,7 +23,7 @@ def parallel_frames(tangents: FloatArray, first: Rotation) -> Rotation:
     """
     frame = smallest_turn(first.apply([1.0, 0.0, 0.0]), tangents[0]) * first
     out = [frame]
-    for before, after in zip(tangents[:-1], tangents[1:], strict=True):
+    for before, after in pairwise(tangents):
         frame = smallest_turn(before, after) * frame
         out.append(frame)
     return Rotation.concatenate(out)
@@ -51,6 +53,65 @@ def arc_tangents(u: FloatArray, chord: FloatArray, side: FloatArray) -> FloatArr
     across = across / max(float(np.linalg.norm(across)), 1e-12)
     angle = arc_half_angle(float(np.linalg.norm(chord)), 1.0) * (1 - 2 * u)
     return np.cos(angle)[:, None] * along + np.sin(angle)[:, None] * across
+
+
+def guessed_frames_of(
+    u: FloatArray,
+    chord: FloatArray | None,
+    clamps: tuple[FloatArray | None, FloatArray | None],
+    down: FloatArray,
+    bent: FloatArray,
+    turns: float,
+) -> list[FloatArray]:
+    """First guesses of frames (k, 4), see `equilibrium.guessed_frames`.
+
+    Parameters
+    ----------
+    u : (k,)
+        Arc length of the nodes over length, from 0 to 1.
+    chord : (3,) or None
+        End minus start, over length; None for a free end.
+    clamps : (4,) or None, each
+        Frames of the first and the last node; None where the cable may turn.
+    down : (3,)
+        Along gravity; zeros without.
+    bent : (2, k - 1) [rad]
+        Rest bends about the axes y and z from node to node.
+    turns : float
+    """
+    first, last = (None if clamp is None else Rotation.from_quat(clamp) for clamp in clamps)
+    if chord is None:
+        return _hanging(u, first, down, bent)
+    along = chord / max(float(np.linalg.norm(chord)), 1e-12)
+    side = down - (down @ along) * along
+    if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
+        side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    found = []
+    for quarter in range(4):
+        turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
+        tangents = arc_tangents(u, chord, turned)
+        found.append(into_clamps(u, tangents, (first, last), turns))
+    return found
+
+
+def _hanging(
+    u: FloatArray, first: Rotation | None, down: FloatArray, bent: FloatArray
+) -> list[FloatArray]:
+    """Guesses for a cable with a free end."""
+    down = down / max(float(np.linalg.norm(down)), 1e-12)
+    if first is None:
+        start = down if np.any(down) else np.array([1.0, 0.0, 0.0])
+        first = smallest_turn(np.array([1.0, 0.0, 0.0]), start)
+    turns = [Rotation.from_rotvec([0.0, *step]) for step in bent.T]
+    rest = [first]
+    for turn in turns:
+        rest.append(rest[-1] * turn)
+    shapes = [Rotation.concatenate(rest)]
+    if np.any(down):
+        fall = smallest_turn(first.apply([1.0, 0.0, 0.0]), down).as_rotvec()
+        shapes.append(Rotation.from_rotvec((1 - np.exp(-4 * u))[:, None] * fall) * first)
+    shapes.append(Rotation.concatenate([first] * len(u)))
+    return [same_sign(shape.as_quat()) for shape in shapes]
 
 
 def into_clamps(
@@ -92,4 +153,6 @@ def into_clamps(
 def same_sign(quaternions: FloatArray) -> FloatArray:
     """Quaternions (k, 4) of which neighbours have the same sign."""
     flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(axis=1))
-    return quaternions * np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])[:, None]
+    return (
+        quaternions * np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])[:, None]
+    )

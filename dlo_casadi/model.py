@@ -367,9 +367,7 @@ class CableModel:
     def _held(self) -> EndConditions:
         """Where the ends really are: declared, deviation of the pose, boundary effects."""
         d, b = self.node.dimension, self.node.increment
-        place, first, last, _ = ca.vertsplit(
-            self._deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)]
-        )
+        place, first, last, _ = ca.vertsplit(self._deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
         declared = EndConditions.of(self._ends, self.node)
         if END_ROLL in self.names:
             # The material axes of an untwisted cable at the end, against the clamp's.
@@ -709,7 +707,11 @@ class CableModel:
         point, ratio = ca.SX.sym("point", self.node.dimension), ca.SX.sym("ratio")
         before, after = (
             self.node.retract(own, step)
-            for own, step in zip(ca.vertsplit(x, x.numel() // 2), ca.vertsplit(delta, delta.numel() // 2), strict=True)
+            for own, step in zip(
+                ca.vertsplit(x, x.numel() // 2),
+                ca.vertsplit(delta, delta.numel() // 2),
+                strict=True,
+            )
         )
         frame = self.node.middle(before, after)
         slope = ratio * self.node.tangent(frame)
@@ -786,7 +788,7 @@ class CableModel:
 
     @cached_property
     def dead_load(self) -> ca.Function:
-        """P -> sum of the dead loads on the cable (dimension,) [N], without those of single poses."""
+        """P -> sum of the dead loads (dimension,) [N], without those of single poses."""
         still = ca.SX.zeros(len(self.deviation_names))
         load = ca.substitute(self._total_load, self._deviation, still)
         return ca.Function("dead_load", [self._p], [ca.densify(load)])

@@ -176,7 +176,9 @@ def _kernel(
 def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
     """Energy of the holders, without end conditions."""
     x, lam = ca.SX.sym("x", 2), ca.SX.zeros(model.n_conditions)
-    value, _, _ = model.at_ends(x, lam, p, ca.DM.zeros(model.n_pose), ca.DM.zeros(len(model.deviation_names)))
+    value, _, _ = model.at_ends(
+        x, lam, p, ca.DM.zeros(model.n_pose), ca.DM.zeros(len(model.deviation_names))
+    )
     if not ca.depends_on(value, x):
         return None
     return _derivatives(value, [x, _symbols(p)], x)

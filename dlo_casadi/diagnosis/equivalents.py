@@ -44,11 +44,12 @@ def untried_equivalents(fit: Fit, effect: Candidate, tried: Collection[str]) -> 
 
 def _along_gravity(fit: Fit, label: str) -> bool:
     """Whether the force across gravity lies within two of its standard deviations."""
-    x, y = np.array(fit.model.gravity) / max(float(np.hypot(*fit.model.gravity)), 1e-12)
-    names = (f"{label}.fx", f"{label}.fy")
-    fx, fy = (fit.value(name) for name in names)
-    std_x, std_y = (fit.std(name) for name in names)
-    return bool(fx * x + fy * y > 0 and abs(fx * y - fy * x) < 2 * np.hypot(std_x * y, std_y * x))
+    down = np.array(fit.model.gravity) / max(float(np.linalg.norm(fit.model.gravity)), 1e-12)
+    names = [f"{label}.f{axis}" for axis in fit.model.node.axes]
+    force, std = (np.array([get(name) for name in names]) for get in (fit.value, fit.std))
+    along = float(force @ down)
+    across, noise = force - along * down, np.sqrt(std**2 @ (1 - down**2))
+    return bool(along > 0 and np.linalg.norm(across) < 2 * noise)
 
 
 def _place(fit: Fit, label: str) -> float | None:

@@ -89,7 +89,7 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
     if best is None:
         return None
     columns = [model.deviation_names.index(axis) for axis in effect.per_pose(model.cable)]
-    mean = [best.value(f"{effect.label}.{axis}") for axis in ("fx", "fy")]
+    mean = [best.value(f"{effect.label}.f{axis}") for axis in model.node.axes]
     forces = best.point.shapes.deviation[np.ix_(best.problem.used, columns)] + mean
     position = best.value(name)
     half = np.sqrt(RISE) * max(best.std(name), 1e-4 * length)
@@ -185,7 +185,9 @@ def pull_scatter(base: Fit) -> FloatArray:
     along a taut cable hardly shows: there it should be like that of the other poses.
     """
     cable = base.model.cable
-    weight = cable.mass * float(np.hypot(*base.model.gravity))
+    weight = cable.mass * float(np.linalg.norm(base.model.gravity))
     scatter = base.problem.scatter.copy()
-    scatter[4:] = PULL_WEIGHTS * max(weight, cable.bending_stiffness / cable.length**2)
+    scatter[-base.model.node.dimension :] = PULL_WEIGHTS * max(
+        weight, cable.bending_stiffness / cable.length**2
+    )
     return scatter

@@ -26,7 +26,8 @@ class EndOffset(BoundaryEffect):
         bound = 0.3 * cable.length
         scale = 0.002 * cable.length
         return tuple(
-            Parameter(axis, "m", scale=scale, lower=-bound, upper=bound) for axis in (f"d{name}" for name in cable.axes)
+            Parameter(axis, "m", scale=scale, lower=-bound, upper=bound)
+            for axis in (f"d{name}" for name in cable.axes)
         )
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:

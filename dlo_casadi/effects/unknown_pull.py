@@ -25,6 +25,7 @@ class UnknownPull(Load):
     """
 
     name = "unknown_pull"
+
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the mean force and its place."""
         length = cable.length

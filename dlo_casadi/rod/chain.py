@@ -18,7 +18,9 @@ from dlo_casadi.rod.quadratic import Quadratic
 FloatArray = NDArray[np.floating]
 
 ELEMENTS: dict[str, Element] = {element.name: element for element in (Quadratic(), Arc(), Link())}
-ELEMENTS_IN_SPACE: dict[str, Element] = {element.name: element for element in (BowedHelix(), Helix())}
+ELEMENTS_IN_SPACE: dict[str, Element] = {
+    element.name: element for element in (BowedHelix(), Helix())
+}
 DEFAULT_ELEMENT = "quadratic"
 
 

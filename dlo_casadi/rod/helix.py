@@ -8,9 +8,9 @@ with twist phi_x / h and curvatures phi_y / h, phi_z / h about the material axes
 
 References
 ----------
-Kirchhoff rods: Antman, Nonlinear Problems of Elasticity, 2005. Elements of constant strain: Sonneville,
-Cardona, Bruels, Comput. Methods Appl. Mech. Eng. 268 (2014). Strain varying linearly, to fourth order:
-Magnus expansion, e.g. Iserles et al., Acta Numerica 9 (2000).
+Kirchhoff rods: Antman, Nonlinear Problems of Elasticity, 2005. Elements of constant strain:
+Sonneville, Cardona, Bruels, Comput. Methods Appl. Mech. Eng. 268 (2014). Strain varying linearly,
+to fourth order: Magnus expansion, e.g. Iserles et al., Acta Numerica 9 (2000).
 """
 
 from __future__ import annotations
@@ -29,9 +29,7 @@ from dlo_casadi.rod.node import Frame, conjugate, quaternion_product, rotated
 _GAUSS = 0.5 / np.sqrt(3)
 # asin(x) / x in powers of x^2. Of a quarter of the half angle of an element that turns by a
 # quarter turn, x = 0.2, what is left out is 1e-13.
-_ARCSINE = tuple(
-    factorial(2 * k) / (4**k * factorial(k) ** 2 * (2 * k + 1)) for k in range(8)
-)
+_ARCSINE = tuple(factorial(2 * k) / (4**k * factorial(k) ** 2 * (2 * k + 1)) for k in range(8))
 # sin(x) / x and (1 - cos x) / x^2 in powers of x^2, to 1e-15 for x = 0.8: half of a quarter turn.
 _SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(7))
 _COSINE = tuple((-1) ** k / factorial(2 * k + 2) for k in range(7))
@@ -73,7 +71,7 @@ class Helix(Element):
         return [mean]
 
     def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
-        """Energy of bending and twist: the mean over the Gauss points of
+        """Energy of bending and twist [J], the mean over the Gauss points.
 
             W = 1/2 (k - k_0)^T B (k - k_0) + 1/2 GJ tau^2
 
@@ -104,7 +102,7 @@ class Helix(Element):
         """Frame in the middle, and the rotation vector."""
         first = ca.vertsplit(slot.first)
         x, y, z, w = quaternion_product(conjugate(first), ca.vertsplit(slot.last))
-        # Halving the angle three times leaves an arc sine of which few terms are enough.
+        # Halving the angle once more leaves an arc sine of which few terms are enough.
         vector, halves = ca.vertcat(x, y, z), []
         for _ in range(2):
             cosine = ca.sqrt((1 + w) / 2)

@@ -76,7 +76,7 @@ class Node(ABC):
     @staticmethod
     @abstractmethod
     def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Moments (..., increment) about the axes of nodes (..., coordinates), about the world's."""
+        """Moments (..., increment) about the axes of nodes (..., coordinates), to the world's."""
 
 
 class Heading(Node):
