@@ -50,8 +50,8 @@ def start_from(pull: Pull, candidate: Candidate) -> dict[str, float]:
     for spring in effect.springs(params):
         force -= ca.gradient(spring.energy(point), point)
     slopes = ca.Function("slopes", [point], [ca.jacobian(force, linear)])
-    curves = fit.problem.curves(fit.point.theta, fit.point.shapes)
-    places = [curves[j].at(np.array([pull.position]))[0] for j in fit.problem.used]
+    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    places = [seen[j].curve.at(np.array([pull.position]))[0] for j in fit.problem.used]
     arms = np.concatenate([np.array(slopes(place)) for place in places])
     found = np.linalg.lstsq(arms, pull.force_per_pose.ravel(), rcond=None)[0]
     values = dict(zip(names, map(float, found), strict=True)) | {"position": pull.position}
@@ -85,5 +85,5 @@ def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:
     except EstimationError:
         return None
     gain = 2 * (base.point.objective - fit.point.objective)
-    price = len(candidate.frees) * np.log(max(base.problem.n_points, 2))
+    price = len(candidate.frees) * np.log(max(base.problem.n_residuals, 2))
     return Confirmed(screened, fit, cross_validate(fit), gain, gain - float(price))

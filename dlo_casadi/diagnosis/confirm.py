@@ -52,7 +52,7 @@ def confirm(base: Fit, screened: Screened) -> Confirmed | None:
     if fit is None:
         return None
     gain = 2 * (base.point.objective - fit.point.objective)
-    price = len(screened.candidate.frees) * np.log(max(base.problem.n_points, 2))
+    price = len(screened.candidate.frees) * np.log(max(base.problem.n_residuals, 2))
     return Confirmed(screened, fit, cross_validate(fit), gain, gain - float(price))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.observation import MeasuredPose, chord_places
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
@@ -27,8 +27,8 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
     grid = np.linspace(0.02, 0.98, 97) * length
     for item in measured:
         if item.readable and not item.held_out:
-            places = np.maximum.accumulate(chord_places(item, length))
-            line = np.stack([np.interp(grid, places, item.points[:, i]) for i in (0, 1)], axis=1)
+            places = np.maximum.accumulate(item.places(length))
+            line = np.stack([np.interp(grid, places, column) for column in item.points.T], axis=1)
             groups.setdefault(tuple(item.pose.ends), []).append(line)
     squares = []
     for curves in groups.values():

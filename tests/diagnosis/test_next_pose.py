@@ -7,8 +7,8 @@ import pytest
 
 from dlo_casadi.diagnosis.next_pose import _separation
 from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import NodeCurve
 
 LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4
 

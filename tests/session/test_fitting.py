@@ -43,7 +43,7 @@ def test_the_points_that_weigh_less_are_the_outlying_ones():
     for k, (pose, shape) in enumerate(zip(poses, shapes, strict=True)):
         s = np.linspace(0.02, 0.98, 40 + k) * model.cable.length
         points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 2))
-        measured.append(MeasuredPose(pose, points, held_out=k == 0))
+        measured.append(MeasuredPose.of_points(pose, points, held_out=k == 0))
     measured[2].points[20, 1] += 30 * NOISE
 
     found = reweighted(fit_model(model, measured, Tolerances(), NOISE))
