@@ -79,12 +79,15 @@ class Pose:
     def ends(self) -> FloatArray:
         """Start, end [m], start frame, end frame: see `EndConditions.vector`."""
         end = self.end if self.end is not None else (0.0,) * len(self.start)
+        return np.concatenate([self.start, end, *self.frames])
+
+    @property
+    def frames(self) -> tuple[FloatArray, FloatArray]:
+        """Frames (coordinates,) of both ends as nodes carry them: in a plane headings [rad]."""
         if len(self.start) == 2:
-            frames = np.array([self.start_heading or 0.0, self.end_heading or 0.0])
-        else:
-            given = (self.start_orientation, self.end_orientation)
-            frames = np.concatenate([_unit(one or Frame.identity) for one in given])
-        return np.concatenate([self.start, end, frames])
+            return np.array([self.start_heading or 0.0]), np.array([self.end_heading or 0.0])
+        first, last = self.start_orientation, self.end_orientation
+        return _unit(first or Frame.identity), _unit(last or Frame.identity)
 
     @property
     def vector(self) -> FloatArray:
@@ -297,7 +300,7 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
     Parameters
     ----------
     p : (n_parameters,)
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
     """
     chain = model.chain
     ends, length = model.held(p, pose.ends, 0)
@@ -323,6 +326,13 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
     for phi in out:
         phi[[0, -1]] = np.where(held, headings, phi[[0, -1]])
     return out
+
+
+def first_nodes(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> list[FloatArray]:
+    """First guesses of the nodes (n_nodes, coordinates): `guesses`, or `guessed_frames`."""
+    if model.in_space:
+        return guessed_frames(model, p, rest, pose)
+    return [phi[:, None] for phi in guesses(model, p, rest, pose)]
 
 
 def guessed_frames(
@@ -398,7 +408,7 @@ def solve_equilibrium(
     rest: FloatArray,
     pose: Pose,
     *,
-    phi_init: FloatArray | None = None,
+    x_init: FloatArray | None = None,
 ) -> Equilibrium:
     """Shape of the cable held at the ends of a pose.
 
@@ -407,17 +417,17 @@ def solve_equilibrium(
     Of the equilibria that the first guesses lead to (see `guesses`), the stable one of lowest
     energy is returned, an unstable one where no other is found. A pose that names its branch
     gets one of that branch or none; between two pins the first stable one, as a rule that of the
-    branch's own arc. With `phi_init`, the equilibrium that it leads to, on whichever branch.
+    branch's own arc. With `x_init`, the equilibrium that it leads to, on whichever branch.
 
     Parameters
     ----------
     model : CableModel
     p : (n_parameters,)
         In the order of `model.names`, SI units.
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
         Rest curvature of the bending cells: `model.rest_basis @ coefficients`.
     pose : Pose
-    phi_init : (n_nodes,) [rad], optional
+    x_init : (n_nodes, coordinates), optional
 
     Raises
     ------
@@ -439,9 +449,9 @@ def solve_equilibrium(
         )
     check_reach(model, p, pose)
     if model.in_space:
-        return _in_space(model, p, rest, pose, phi_init)
-    starts = [phi_init] if phi_init is not None else guesses(model, p, rest, pose)
-    branch = pose.branch if phi_init is None else None
+        return _in_space(model, p, rest, pose, x_init)
+    starts = [x_init[:, 0]] if x_init is not None else guesses(model, p, rest, pose)
+    branch = pose.branch if x_init is None else None
     first_suffices = branch is not None and (model.start, model.end) == ("pinned", "pinned")
     found: list[Equilibrium] = []
     for phi in starts:
@@ -551,7 +561,7 @@ def _in_space(
     EquilibriumError
         If none leads to one.
     """
-    starts = np.array([x_init] if x_init is not None else guessed_frames(model, p, rest, pose))
+    starts = np.array([x_init] if x_init is not None else first_nodes(model, p, rest, pose))
     count = len(starts)
     given = Given.of(p, rest, np.repeat(pose.vector[None], count, axis=0))
     first = Shapes.declared(starts, np.zeros((count, model.n_border)))

@@ -51,6 +51,7 @@ STIFFNESS_PRIOR_STD = float(np.log(1e3))
 # Nobody knows how a cable's own twist was gripped: tolerances.roll by default [rad].
 ROLL_STD = 1.0
 TORSIONAL_STIFFNESS = "torsional_stiffness"
+STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
 # Roll of the end clamp about the cable against what is declared [rad]: rest twist, see design.
 END_ROLL = "end_roll"
 # Numbers that tell where the camera of a pose stood, see `Pose.vector`.
@@ -189,6 +190,11 @@ class CableModel:
         """
         means = self.rest.cell_means(self.chain.cells)
         return np.kron(np.eye(len(self.node.curvatures)), means)
+
+    @property
+    def roughness(self) -> FloatArray:
+        """Second differences of the rest coefficients, about each axis."""
+        return np.kron(np.eye(len(self.node.curvatures)), self.rest.roughness)
 
     @property
     def n_coefficients(self) -> int:

@@ -134,7 +134,7 @@ def _applies(
     if name == "tether":
         return n_poses > 1
     if issubclass(EFFECTS[name], StateEffect):
-        return n_poses > 1 and model.rest.n_coefficients > 0
+        return n_poses > 1 and model.n_coefficients > 0
     return True
 
 

@@ -137,7 +137,7 @@ class _Search:
         """Equilibria near the measured shapes for a load at a share of the length."""
         problem = self.held_at(share)
         unknowns = problem.unknowns
-        theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.rest.n_coefficients))
+        theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.n_coefficients))
         points = starting_points(problem, theta)
         return points[0] if points else None
 

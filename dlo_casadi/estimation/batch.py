@@ -137,7 +137,7 @@ class _BatchNlp:
         self.n_x, self.n_lam = problem.sweep.assembly.n, model.n_border
         self.columns = problem.sweep.used_deviations
         self.n_dev = len(self.columns)
-        self.n_rest = model.chain.n_cells if model.has_state else 0
+        self.n_rest = model.chain.n_rests if model.has_state else 0
         self.stride = self.n_x + self.n_lam + self.n_dev + self.n_rest
         # Multipliers and balance in units of a typical force: EI turns^2.
         self.force = model.cable.bending_stiffness * model.cable.curvature_scale**2

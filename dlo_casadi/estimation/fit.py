@@ -21,7 +21,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import STIFFNESSES, CableModel
 from dlo_casadi.parallel import map_in_order
 
 FloatArray = NDArray[np.floating]
@@ -48,8 +48,10 @@ def starting_points(
     an executor is given.
     """
     starts = [theta.copy() for _ in decades]
+    # Bending and torsion go together: their ratio is known better than either.
+    stiffnesses = [k for k, name in enumerate(problem.unknowns.names) if name in STIFFNESSES]
     for start, decade in zip(starts, decades, strict=True):
-        start[0] += decade * np.log(10)
+        start[stiffnesses] += decade * np.log(10)
     shapes, feet = measured_shapes(problem)
     problem.refresh(feet)
     held = np.zeros(problem.unknowns.size, dtype=bool)
@@ -117,12 +119,12 @@ def fit_model(
     if start is not None:
         return _continue(unknowns, measured, tolerances, start, max_iterations)
     noise = NoiseModel(std or FIRST_STD, declared=std is not None)
-    scatter = tolerances.deviation
+    scatter = tolerances.deviation(model.node)
     if sum(item.readable and not item.held_out for item in measured) == 1:
         # One pose does not deviate from others: what is wrong with it is wrong with the session.
         scatter = SCATTER_FLOOR * scatter
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
-    theta = unknowns.pack(begin, np.zeros(model.rest.n_coefficients))
+    theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     best = None
     if len(problem.used) > POSES_OF_A_SEARCH and not model.has_state:
         rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)

@@ -60,9 +60,9 @@ class Sweep:
     # ---- state -----------------------------------------------------------------------------------
 
     def rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Rest curvature (m, n_cells) that each pose finds, from the first on.
+        """Rest curvature (m, n_rests) that each pose finds, from the first on.
 
-        A `rest` that is given per pose already, (m, n_cells), is returned as it is.
+        A `rest` that is given per pose already, (m, n_rests), is returned as it is.
         """
         if rest.ndim == 2:
             return rest
@@ -73,17 +73,17 @@ class Sweep:
         return out
 
     def _after(self, j: int, shapes: Shapes, p: FloatArray, rests: FloatArray) -> FloatArray:
-        """Rest curvature (1, n_cells) after pose j."""
+        """Rest curvature (1, n_rests) after pose j."""
         here = [j]
         given = Given.of(p, rests[here], self._ends[here])
         return self.assembly.state_after(shapes.subset(here), given)[0]
 
     def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Rest curvature (n_cells,) that the last pose leaves behind."""
+        """Rest curvature (n_rests,) that the last pose leaves behind."""
         return self._after(self.m - 1, shapes, p, self.rests(shapes, p, rest))[0]
 
     def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Curvature minus the rest curvature that each pose finds (m, n_cells) [1/m]."""
+        """Curvature minus the rest curvature that each pose finds (m, n_rests) [1/m]."""
         given = self._given(shapes, p, rest)
         return self.assembly.strain(shapes, given) - given.rest
 
@@ -118,7 +118,7 @@ class Sweep:
         shapes : Shapes
             Where to start; deviations are kept.
         p : (n_parameters,) or (m, n_parameters)
-        rest : (n_cells,) or (m, n_cells) [1/m]
+        rest : (n_cells,) or (m, n_rests) [1/m]
             Before the first pose, or of each pose.
         tolerance : float [rad]
             Largest step at convergence.

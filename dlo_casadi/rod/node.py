@@ -78,6 +78,11 @@ class Node(ABC):
     def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
         """Moments (..., increment) about the axes of nodes (..., coordinates), to the world's."""
 
+    @classmethod
+    @abstractmethod
+    def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
+        """Whether two rows of nodes (n_nodes, coordinates) are one shape, to a tolerance [rad]."""
+
 
 class Heading(Node):
     """The direction of a planar cable: one angle against the board's x axis [rad]."""
@@ -130,6 +135,12 @@ class Heading(Node):
     def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
         """A moment in a plane is the same about both."""
         return vectors
+
+    @classmethod
+    def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
+        """Full turns of the whole cable make no difference."""
+        gap = cls.difference(x, y)
+        return bool(np.abs(gap - 2 * np.pi * np.round(gap.mean() / (2 * np.pi))).max() < tolerance)
 
 
 class Frame(Node):
@@ -214,6 +225,11 @@ class Frame(Node):
     def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
         """Turned by the frames."""
         return Rotation.from_quat(x).apply(vectors)
+
+    @classmethod
+    def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
+        """Quaternions of either sign."""
+        return bool(np.abs(cls.difference(x, y)).max() < tolerance)
 
 
 def quaternion_product(p: Any, q: Any) -> tuple[Any, Any, Any, Any]:
