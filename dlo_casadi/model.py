@@ -297,6 +297,34 @@ class CableModel:
         return ca.SX.sym("x", 2 * node.coordinates), ca.SX.sym("delta", 2 * node.increment)
 
     @cached_property
+    def _local(self) -> tuple[ca.SX, ca.SX]:
+        """Local coordinates of a slot, and their increments: see `Element.local`."""
+        return ca.SX.sym("local", self._local_of_nodes.numel()), ca.SX.sym(
+            "step", 2 * self.node.increment
+        )
+
+    @property
+    def _local_of_nodes(self) -> ca.SX:
+        return self.chain.kind.local(*ca.vertsplit(self._nodes[0], self.node.coordinates))
+
+    @cached_property
+    def _local_slopes(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Derivative of the local increments by the nodes', weights, and their weighed Hessian."""
+        kind, (x, delta) = self.chain.kind, self._nodes
+        pairs = zip(
+            ca.vertsplit(x, self.node.coordinates),
+            ca.vertsplit(delta, self.node.increment),
+            strict=True,
+        )
+        moved = kind.local(*(self.node.retract(own, step) for own, step in pairs))
+        gap = kind.local_gap(self._local_of_nodes, moved)
+        weights = ca.SX.sym("weight", gap.numel())
+        bend, _ = ca.hessian(ca.dot(weights, gap), delta)
+        still = ca.SX.zeros(delta.shape)
+        slope, bend = ca.substitute([ca.jacobian(gap, delta), bend], [delta], [still])
+        return slope, weights, bend
+
+    @cached_property
     def _rest(self) -> ca.SX:
         """Rest curvature inside a slot, see `Chain.rest_stencils`."""
         return ca.SX.sym("rest", 3 * len(self.node.curvatures))
@@ -456,8 +484,6 @@ class CableModel:
     def _slot(self, ratio: ca.SX, inner: ca.SX, square: ca.SX) -> Slot:
         """The slot's symbols; numbers that all slots share are written in."""
         kind, table = self.chain.kind, self.chain.layout.slots
-        x, delta = self._nodes
-        c, b = kind.node.coordinates, kind.node.increment
         place = ca.vertcat(
             *(
                 ca.SX(column[0]) if np.all(column == column[0]) else self._place[i]
@@ -465,8 +491,7 @@ class CableModel:
             )
         )
         return Slot(
-            first=kind.node.retract(x[:c], delta[:b]),
-            last=kind.node.retract(x[c:], delta[b:]),
+            local=kind.local_moved(*self._local),
             rest=self._rest,
             place=place,
             mesh=self.chain.h,
@@ -647,46 +672,61 @@ class CableModel:
         x, _ = self._nodes
         return [x, self._lam, self._p, self._pose, self._deviation]
 
-    @property
-    def _moving(self) -> ca.SX:
-        """What the Lagrangian of a slot is differentiated by: increments, then multipliers."""
-        return ca.vertcat(self._nodes[1], self._lam)
-
     def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
         """A function at increments of zero, its outputs dense."""
+        local, step = self._local
         _, delta = self._nodes
-        found = ca.substitute(outputs, [delta], [ca.SX.zeros(delta.shape)])
+        symbols = [step, delta, local]
+        values = [ca.SX.zeros(step.shape), ca.SX.zeros(delta.shape), self._local_of_nodes]
+        found = ca.substitute(outputs, symbols, values)
         return ca.Function(name, arguments, [ca.densify(one) for one in ca.cse(found)])
 
-    def _derivatives(self, name: str, value: ca.SX, arguments: list[ca.SX]) -> ca.Function:
-        hessian, gradient = ca.hessian(value, self._moving)
-        return self._here(name, arguments, [value, gradient, hessian])
+    @property
+    def _by_slot(self) -> ca.SX:
+        """What the Lagrangian of a slot is differentiated by: local increments, multipliers."""
+        return ca.vertcat(self._local[1], self._lam)
+
+    @property
+    def _by_ends(self) -> ca.SX:
+        """What that of the ends is differentiated by: increments of the nodes, multipliers."""
+        return ca.vertcat(self._nodes[1], self._lam)
+
+    @property
+    def _to_local(self) -> ca.SX:
+        """Derivative of local increments and multipliers by the nodes' and multipliers."""
+        return ca.diagcat(self._local_slopes[0], ca.SX.eye(self.n_border))
 
     @cached_property
     def slot(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
-        return self._derivatives("slot", self._terms.lagrangian, self._slot_arguments)
+        value = self._terms.lagrangian
+        hessian, gradient = ca.hessian(value, self._by_slot)
+        _, weights, bend = self._local_slopes
+        bend = ca.substitute(bend, weights, gradient[: weights.numel()])
+        by_nodes = self._to_local.T @ hessian @ self._to_local
+        by_nodes += ca.diagcat(bend, ca.SX(self.n_border, self.n_border))
+        outputs = [value, self._to_local.T @ gradient, by_nodes]
+        return self._here("slot", self._slot_arguments, outputs)
 
     @cached_property
     def at_ends(self) -> ca.Function:
         """(x, lam, p, pose, deviation) of the first and last node -> as `slot`."""
-        return self._derivatives("at_ends", self._at_ends, self._end_arguments)
-
-    def _mixed(self, name: str, value: ca.SX, arguments: list[ca.SX], by: ca.SX) -> ca.Function:
-        mixed = ca.jacobian(ca.gradient(value, self._moving), by)
-        return self._here(name, arguments, [mixed])
+        hessian, gradient = ca.hessian(self._at_ends, self._by_ends)
+        return self._here("at_ends", self._end_arguments, [self._at_ends, gradient, hessian])
 
     @cached_property
     def slot_sensitivity(self) -> ca.Function:
         """As `slot` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
         by = ca.vertcat(self._p, self._rest, self._deviation)
-        return self._mixed("slot_sensitivity", self._terms.lagrangian, self._slot_arguments, by)
+        mixed = ca.jacobian(ca.gradient(self._terms.lagrangian, self._by_slot), by)
+        return self._here("slot_sensitivity", self._slot_arguments, [self._to_local.T @ mixed])
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
         """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
         by = ca.vertcat(self._p, self._deviation)
-        return self._mixed("end_sensitivity", self._at_ends, self._end_arguments, by)
+        mixed = ca.jacobian(ca.gradient(self._at_ends, self._by_ends), by)
+        return self._here("end_sensitivity", self._end_arguments, [mixed])
 
     @cached_property
     def _advanced(self) -> ca.SX:
@@ -702,7 +742,8 @@ class CableModel:
     def slot_curve_slopes(self) -> ca.Function:
         """As `slot` -> the same, derivatives by increments and lam, and by p, rest, deviation."""
         others = ca.vertcat(self._p, self._rest, self._deviation)
-        blocks = [ca.jacobian(self._advanced, symbols) for symbols in (self._moving, others)]
+        by_nodes = ca.jacobian(self._advanced, self._by_slot) @ self._to_local
+        blocks = [by_nodes, ca.jacobian(self._advanced, others)]
         return self._here("slot_curve_slopes", self._slot_arguments, [self._advanced, *blocks])
 
     @cached_property
@@ -773,7 +814,8 @@ class CableModel:
             mean = effect.next_rest(mean, curvature, self.cable, local)
         rest = ca.SX.sym("mean", own.numel())
         mean = ca.substitute(mean, own, rest)
-        slopes = [ca.jacobian(mean, symbols) for symbols in (self._nodes[1], rest, self._p)]
+        slopes = [ca.jacobian(mean, symbols) for symbols in (self._local[1], rest, self._p)]
+        slopes[0] = slopes[0] @ self._local_slopes[0]
         mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
         return self._here("slot_state", self._slot_arguments, [mean, *slopes])
 

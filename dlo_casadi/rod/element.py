@@ -121,8 +121,8 @@ class Slot:
 
     Parameters
     ----------
-    first, last : (coordinates,)
-        Its nodes.
+    local : (n_local,)
+        Local coordinates of its nodes, see `Element.local`.
     rest : (3 axes,) [1/m]
         Rest curvature of the cell: mean, and linear and quadratic variation inside, about each
         axis that has one.
@@ -140,8 +140,7 @@ class Slot:
         What stands for the square of the inner unknown.
     """
 
-    first: ca.SX
-    last: ca.SX
+    local: ca.SX
     rest: ca.SX
     place: ca.SX
     mesh: float
@@ -149,6 +148,16 @@ class Slot:
     ratio: ca.SX
     inner: ca.SX
     square: ca.SX
+
+    @property
+    def first(self) -> ca.SX:
+        """Heading of its first node, in a plane [rad]."""
+        return self.local[0]
+
+    @property
+    def last(self) -> ca.SX:
+        """Heading of its last node, in a plane [rad]."""
+        return self.local[1]
 
     @property
     def start(self) -> ca.SX:
@@ -215,6 +224,21 @@ class Element(ABC):
     @abstractmethod
     def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
         """Nodes and slots of a cable of n elements; `clamped`: its start, its end."""
+
+    def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
+        """Local coordinates (n_local,) of two nodes: what the element is written in.
+
+        Derivatives are taken by their increments, and passed on to those of the nodes.
+        """
+        return ca.vertcat(first, last)
+
+    def local_moved(self, local: ca.SX, step: ca.SX) -> ca.SX:
+        """Local coordinates moved by increments (2 b,)."""
+        return local + step
+
+    def local_gap(self, local: ca.SX, other: ca.SX) -> ca.SX:
+        """Increments (2 b,) that move local coordinates to others."""
+        return other - local
 
     @abstractmethod
     def strain(self, slot: Slot) -> ca.SX:

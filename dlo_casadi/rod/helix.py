@@ -57,13 +57,35 @@ class Helix(Element):
         """Nodes at the element boundaries, as those of a planar cable."""
         return Arc().layout(length, n, clamped)
 
+    def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
+        """Frame in the middle (4,), and the rotation vector phi (3,) [rad] from node to node."""
+        x, y, z, w = quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(last))
+        # Halving the angle once more leaves an arc sine of which few terms are enough.
+        vector, halves = ca.vertcat(x, y, z), []
+        for _ in range(2):
+            cosine = ca.sqrt((1 + w) / 2)
+            vector, w = vector / (2 * cosine), cosine
+            halves.append((vector, w))
+        phi = 8 * _series(_ARCSINE, ca.sumsqr(vector)) * vector
+        half, w = halves[0]
+        middle = quaternion_product(ca.vertsplit(first), (*ca.vertsplit(half), w))
+        return ca.vertcat(*middle, phi)
+
+    def local_moved(self, local: ca.SX, step: ca.SX) -> ca.SX:
+        """The frame turned, the rotation vector added to."""
+        return ca.vertcat(Frame.retract(local[:4], step[:3]), local[4:] + step[3:])
+
+    def local_gap(self, local: ca.SX, other: ca.SX) -> ca.SX:
+        """Turn of the frame, difference of the rotation vectors."""
+        return ca.vertcat(Frame.gap(local[:4], other[:4]), other[4:] - local[4:])
+
     def strain(self, slot: Slot) -> ca.SX:
         """Mean curvatures about the axes y and z."""
-        return self.rotation(slot)[1:] / (slot.length * slot.stretch)
+        return slot.local[5:] / (slot.length * slot.stretch)
 
     def twist(self, slot: Slot) -> ca.SX:
         """Mean twist."""
-        return self.rotation(slot)[0] / (slot.length * slot.stretch)
+        return slot.local[4] / (slot.length * slot.stretch)
 
     def bends(self, slot: Slot) -> list[ca.SX]:
         """Twist and curvatures minus rest curvatures (3,) [1/m] at the Gauss points."""
@@ -90,28 +112,7 @@ class Helix(Element):
 
     def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
         """The x axis of the frame at the fraction u."""
-        middle, phi = self._halved(slot)
-        return slot.ratio * rotated(middle, _turned(phi, u - 0.5))
-
-    def rotation(self, slot: Slot) -> ca.SX:
-        """Rotation vector phi (3,) [rad] from the first to the last frame, in the first."""
-        return self._halved(slot)[1]
-
-    @staticmethod
-    def _halved(slot: Slot) -> tuple[ca.SX, ca.SX]:
-        """Frame in the middle, and the rotation vector."""
-        first = ca.vertsplit(slot.first)
-        x, y, z, w = quaternion_product(conjugate(first), ca.vertsplit(slot.last))
-        # Halving the angle once more leaves an arc sine of which few terms are enough.
-        vector, halves = ca.vertcat(x, y, z), []
-        for _ in range(2):
-            cosine = ca.sqrt((1 + w) / 2)
-            vector, w = vector / (2 * cosine), cosine
-            halves.append((vector, w))
-        phi = 8 * _series(_ARCSINE, ca.sumsqr(vector)) * vector
-        half, w = halves[0]
-        middle = quaternion_product(first, (*ca.vertsplit(half), w))
-        return ca.vertcat(*middle), phi
+        return slot.ratio * rotated(slot.local[:4], _turned(slot.local[4:], u - 0.5))
 
 
 def _rest(slot: Slot, x: float) -> ca.SX:
@@ -155,14 +156,14 @@ class BowedHelix(Helix):
 
     def bends(self, slot: Slot) -> list[ca.SX]:
         """At the two Gauss points."""
-        phi, beta = self.rotation(slot), slot.inner
+        phi, beta = slot.local[4:], slot.inner
         mean = phi + 2 / 3 * ca.cross(phi, beta)
         width = slot.length * slot.stretch
         return [(mean - 8 * x * beta) / width - _rest(slot, x) for x in (-_GAUSS, _GAUSS)]
 
     def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
         """The helix's, turned by the bow to first order."""
-        middle, phi = self._halved(slot)
+        middle, phi = slot.local[:4], slot.local[4:]
         x = u - 0.5
         turn = (1 - 4 * x * x) * (slot.inner - x / 3 * ca.cross(phi, slot.inner))
         across = ca.vertcat(0, turn[2], -turn[1])

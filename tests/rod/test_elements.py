@@ -33,8 +33,7 @@ def slots_of(chain: Chain, phi: np.ndarray, *, rest=None, stretch=1.0, bow=0.0) 
     after = np.minimum(np.arange(chain.n_slots) + 1, chain.n_nodes - 1)
     return [
         Slot(
-            first=ca.SX(float(phi[j])),
-            last=ca.SX(float(phi[after[j]])),
+            local=ca.SX([float(phi[j]), float(phi[after[j]])]),
             rest=ca.SX(ca.DM(inside[j])),
             place=ca.SX(ca.DM(chain.layout.slots[j])),
             mesh=chain.h,
