@@ -9,13 +9,9 @@ from numpy.typing import NDArray
 
 from dlo_casadi.estimation.observation import MeasuredPose, chord_places
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import ALIKE, REPEATS
 
 FloatArray = NDArray[np.floating]
-
-# Poses that repeat worse than this many times the noise limit every prediction.
-REPEATS = 1.5
-# Absolute correlation of two nuisances beyond which their effects on the shapes are one.
-ALIKE = 0.9
 
 
 def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | None:

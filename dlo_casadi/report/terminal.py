@@ -21,6 +21,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     StageName,
 )
+from dlo_casadi.thresholds import APART, NOTABLE
 
 # Parts of the run in the order in which they are done.
 TIMED = {
@@ -280,8 +281,6 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     return lines
 
 
-# Rivals so many standard deviations apart are told from one another.
-APART = 3.0
 # Distances [m] that the table of a prediction shows.
 _SHOWN = 5e-6
 # Nobody measures a pose more often.
@@ -310,8 +309,6 @@ DEPENDENCES = {
     "span_z": "the distance of the ends",
     "position_z": "the place in the {plane}",
 }
-# Normal scores beyond it are worth a word.
-NOTABLE = 3.0
 
 
 def structure_lines(outcome: Outcome) -> list[str]:

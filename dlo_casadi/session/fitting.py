@@ -17,11 +17,10 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.session.declared import Declared
+from dlo_casadi.thresholds import MESH_SHARE
 
 # The search over decades of stiffness runs on this mesh.
 FIRST_MESH = 20
-# The mesh is refined until its error is below this share of the noise.
-MESH_SHARE = 0.1
 FINEST_MESH = 160
 # The search for missing effects, a hundred refits, runs on at most so many elements.
 SEARCH_MESH = 80
