@@ -67,6 +67,12 @@ def test_without_a_calibrated_camera_it_is_no_candidate(config):
     assert named[0] - named[1] == {"standoff_error"}
 
 
+def test_a_configuration_that_was_changed_by_hand_is_checked_again(config):
+    options = config.diagnosis.model_copy(update={"exclude": ("stand_off",)})
+    with pytest.raises(ConfigError, match=r"diagnosis\.exclude: no effect is called 'stand_off'"):
+        declared_model(replace(config, diagnosis=options))
+
+
 def test_it_cannot_be_declared_without_a_calibrated_camera(tmp_path):
     document = yaml.safe_load(CLEAN.read_text())
     document["model"] = {"effects": ["standoff_error"]}
