@@ -42,7 +42,7 @@ def threshold(fit: Fit) -> float:
     """
     square = 0.0
     for j, feet in zip(fit.problem.used, fit.point.feet, strict=True):
-        if not fit.noise.declared:
+        if fit.noise.source != "declared":
             break
         weight = fit.problem.measured[j].relative_std
         constant = SYSTEMATIC_SHARE * fit.noise.std * weight
