@@ -68,6 +68,9 @@ ALIKE = 0.9
 # (simulated, white and correlated over 3 % of the length) 1.1 to 1.3 with five hangings, 1.4 to 1.6
 # with two, of which half may thus be flagged without need.
 REPEATS = 1.5
+# Repeats that differ by more than so many times the noise take its place. Below, chi-square per
+# degree of freedom widens the intervals, and the shapes stay those of one line's noise.
+REPEATS_ARE_NOISE = 2.0
 
 # ---- intervals ---------------------------------------------------------------------------------
 

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from dlo_casadi.estimation.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
 from dlo_casadi.estimation.observation import MeasuredPose, chord_places
+from dlo_casadi.thresholds import REPEATS_ARE_NOISE
 
 FloatArray = NDArray[np.floating]
 
-# Repeats that differ by more than so many times the noise take its place. Below, chi-square per
-# degree of freedom widens the intervals, and the shapes stay those of one line's noise.
-APART = 2.0
 # Of the length: beside a fixture all repeats are where it holds them.
 _BESIDE_FIXTURES = 0.02
 
@@ -48,7 +46,7 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
     spread = repeatability(measured, length)
-    if spread is None or spread <= APART * noise.std:
+    if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise
     samples = []
     for group in _groups(measured):
@@ -69,7 +67,7 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     if not tell_of_noise(samples):
         return noise
     found = estimate_noise(samples, length)
-    return replace(found, source="repeats") if found.std > APART * noise.std else noise
+    return replace(found, source="repeats") if found.std > REPEATS_ARE_NOISE * noise.std else noise
 
 
 def _groups(measured: Sequence[MeasuredPose]) -> list[list[MeasuredPose]]:
