@@ -4,6 +4,7 @@ The only package that imports yaml. All units are SI. Every problem of a file is
 each with its line.
 """
 
+from dlo_casadi.config.declared_effects import setup_of
 from dlo_casadi.config.document import dump_yaml, read_document, read_yaml
 from dlo_casadi.config.limits import (
     MESH,
@@ -12,7 +13,7 @@ from dlo_casadi.config.limits import (
     implausible_gravity,
     implausible_sizes,
 )
-from dlo_casadi.config.load import load_config, unknown_effect
+from dlo_casadi.config.load import load_config
 from dlo_casadi.config.problems import Place, show
 from dlo_casadi.config.sections import (
     Board,
@@ -62,6 +63,6 @@ __all__ = [
     "load_config",
     "read_document",
     "read_yaml",
+    "setup_of",
     "show",
-    "unknown_effect",
 ]

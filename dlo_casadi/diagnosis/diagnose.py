@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.diagnosis.candidates import Candidate, candidates
-from dlo_casadi.diagnosis.causes import is_local_load, refit_from
+from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
+from dlo_casadi.diagnosis.causes import refit_from
 from dlo_casadi.diagnosis.confirm import Confirmed, confirm
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.equivalents import untried_equivalents
@@ -26,6 +26,7 @@ from dlo_casadi.diagnosis.structure import (
     screening_degrees,
     structure_of,
 )
+from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.hyperparameters import noise_of, settle
@@ -325,7 +326,7 @@ class _Search:
 
         Two free forces in each pose would gain more than their price if the law were wrong.
         """
-        loads = [item for item in screened if is_local_load(item.candidate)]
+        loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
         refit = partial(refit_from, self.declared, pull)
         free = 2 * len(self.declared.problem.used) + 1
         price = free * np.log(self.declared.problem.n_residuals)
@@ -386,10 +387,15 @@ class _Search:
 def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]) -> list[Screened]:
     """Score tests of all candidates at a fit, best first."""
     problem, shapes = fit.problem, fit.point.shapes
-    directions = (float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean()))
-    bend = float(np.abs(problem.sweep.bends(shapes, fit.p, fit.rest)).max())
-    camera = any(item.pose.camera_center is not None for item in problem.history)
-    listed = candidates(fit.model, center, len(problem.used), exclude, directions, camera, bend)
+    setup = setup_of(
+        fit.model,
+        n_poses=len(problem.used),
+        center=center,
+        camera=any(item.pose.camera_center is not None for item in problem.history),
+        directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
+        largest_bend=float(np.abs(problem.sweep.bends(shapes, fit.p, fit.rest)).max()),
+    )
+    listed = candidates(fit.model, setup, exclude)
     return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
 
 

@@ -90,7 +90,7 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
     if best is None:
         return None
     columns = [DEVIATIONS.index(axis) for axis in effect.per_pose]
-    mean = [best.value(f"{effect.label}.{axis}") for axis in ("fx", "fy")]
+    mean = [best.value(f"{effect.label}.{axis}") for axis in effect.means]
     forces = best.point.shapes.deviation[np.ix_(best.problem.used, columns)] + mean
     position = best.value(name)
     half = np.sqrt(RISE) * max(best.std(name), 1e-4 * length)

@@ -126,10 +126,11 @@ def nuisance_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     """What is known within a tolerance and was adjusted there."""
     fit = outcome.fit
     reported = set(outcome.stages[-1].parameters)
+    hidden = tuple(f"{effect.label}." for effect in fit.model.effects if not effect.shown)
     rows = []
     for q in fit.model.parameters:
         tolerance = fit.model.priors.get(q.name)
-        if tolerance is None or q.name in reported or q.name.startswith("edge_bias."):
+        if tolerance is None or q.name in reported or q.name.startswith(hidden):
             continue
         shift, unit = fit.value(q.name) - q.nominal, f" {q.unit}" if q.unit else ""
         rows.append(
