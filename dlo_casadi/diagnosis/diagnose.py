@@ -175,7 +175,7 @@ def diagnose(
         found = search.with_cause_of(pull, found)
     if found.unexplained and found.added:
         found = search.without_wrong_causes(found, pull)
-        if found.added or not fit.noise.declared:
+        if found.added or not fit.noise.known:
             pull = estimate_pull(found.fit, search.executor)
     tried = {row.name for row in found.ranked}
     added = tuple(
@@ -298,7 +298,7 @@ class _Search:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = _corrected(single, len(screened))
             closed = settle(winner.fit)
-            if not self.declared.noise.declared:
+            if not self.declared.noise.known:
                 again = _p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
             if p_value > self.significance:
@@ -338,7 +338,7 @@ class _Search:
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> _Found:
         """What has been found, and whether it explains the data."""
-        if not added and not fit.noise.declared:
+        if not added and not fit.noise.known:
             fit = settle(fit)
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
         limit = max(UNSEEN * fit.noise.std, self.error / 2)

@@ -60,7 +60,7 @@ class Structure:
 
 def noise_degrees(fit: Fit) -> float:
     """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
-    return float("inf") if fit.noise.declared else max(4.0, fit.noise.slow_dof)
+    return max(4.0, fit.noise.slow_dof)
 
 
 def screening_degrees(fit: Fit) -> float:
@@ -70,8 +70,8 @@ def screening_degrees(fit: Fit) -> float:
     of cable told it, which is too much: what is found so has to pass a second test, under the
     noise that is left once it is in the model.
     """
-    if fit.noise.declared:
-        return float("inf")
+    if fit.noise.known:
+        return noise_degrees(fit)
     if fit.noise.share == 0:
         return float(fit.problem.n_residuals)
     stretches = fit.model.cable.length / (np.sqrt(2 * np.pi) * fit.noise.length)

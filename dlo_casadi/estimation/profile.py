@@ -45,7 +45,7 @@ def threshold(fit: Fit) -> float:
     """
     square = 0.0
     for j, feet in zip(fit.problem.used, fit.point.feet, strict=True):
-        if not fit.noise.declared:
+        if fit.noise.source != "declared":
             break
         item = fit.problem.measured[j]
         constant = SYSTEMATIC_SHARE * fit.noise.std * item.relative_std[item.point_of]
