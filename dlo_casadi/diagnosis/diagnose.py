@@ -324,7 +324,7 @@ class _Search:
         loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
         refit = partial(refit_from, self.declared, pull)
         free = 2 * len(self.declared.problem.used) + 1
-        price = free * np.log(self.declared.problem.n_points)
+        price = free * np.log(self.declared.problem.n_residuals)
         return [
             item
             for item in map_in_order(self.executor, refit, loads)
@@ -367,7 +367,7 @@ class _Search:
         if alone is None or not self.several:
             return False
         pull = estimate_pull(found.fit, self.executor)
-        n = np.log(self.declared.problem.n_points)
+        n = np.log(self.declared.problem.n_residuals)
         extra = sum(len(item.candidate.frees) for item in found.added) * n
         if pull is None:
             return True
@@ -499,7 +499,7 @@ def prune(fit: Fit, added: list[AddedEffect], significance: float) -> tuple[Fit,
             for item in screen(smaller, None, ())
             if item.candidate.name == effect.candidate.name
         ]
-        price = len(effect.candidate.frees) * np.log(fit.problem.n_points)
+        price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
         gain = 2 * (smaller.point.objective - fit.point.objective)
         if gain < price or (again and again[0].p_value > significance):
             fit = settle(smaller)

@@ -35,6 +35,7 @@ from dlo_casadi.estimation.gauss_newton import (
     Point,
 )
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
@@ -97,8 +98,9 @@ class _Linearized:
         along = problem.sweep.directions(shapes, p, rest, slopes, still)
         seen = problem.sweep.observe(shapes, p, rest, along)
         for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
-            curve = problem.curve_of(seen.z[j])
-            moved = problem.measured[j].line.residual_along(curve, s, seen.slopes[j])
+            now = Observed(problem.curve_of(seen.z[j]), shapes.lam[j])
+            change = ObservedChange(seen.slopes[j], along.lam[j])
+            moved = problem.measured[j].residual_along(now, s, change)
             self.lin.by_theta[k][:, columns] = problem.whitening(j, s) @ moved[:, : len(columns)]
 
 

@@ -44,8 +44,8 @@ def threshold(fit: Fit) -> float:
     for j, feet in zip(fit.problem.used, fit.point.feet, strict=True):
         if fit.noise.source != "declared":
             break
-        weight = fit.problem.measured[j].relative_std
-        constant = SYSTEMATIC_SHARE * fit.noise.std * weight
+        item = fit.problem.measured[j]
+        constant = SYSTEMATIC_SHARE * fit.noise.std * item.relative_std[item.point_of]
         square += float(((fit.problem.whitening(j, feet) @ constant) ** 2).sum())
     return (NORMAL_95 + np.sqrt(square)) ** 2 * fit.inflation**2
 

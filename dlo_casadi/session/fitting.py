@@ -97,7 +97,8 @@ def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:
     out = list(fit.problem.history)
     for k, d in zip(fit.problem.fitted, fit.linearization.raw, strict=True):
         item = out[k]
-        score = np.abs(d) / (fit.noise.std * item.relative_std)
+        square = np.bincount(item.point_of, d**2) / np.bincount(item.point_of)
+        score = np.sqrt(square) / (fit.noise.std * item.relative_std)
         grown = np.sqrt(np.maximum(1.0, score / HUBER))
-        out[k] = replace(item, weight=item.relative_std * grown)
+        out[k] = item.weighing(item.relative_std * grown)
     return tuple(out)

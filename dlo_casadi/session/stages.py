@@ -46,16 +46,18 @@ def pose_shape(
     eq: Equilibrium = prediction.equilibrium
     if not item.readable:
         empty = np.zeros(0)
-        return PoseShape(curve.at(places), None, empty, empty, eq.energy, eq.stable)
-    s = curve.nearest(item.points)
+        none = np.zeros((0, curve.d))
+        return PoseShape(curve.at(places), None, empty, none, empty, eq.energy, eq.stable)
+    s = item.nearest(curve)
     gap = item.points - curve.at(s)
-    residual = (gap * curve.normals(s)).sum(axis=1)
+    across = np.einsum("knd,kd->kn", curve.normals(s), gap)
+    residual = across[:, 0] if curve.d == 2 else np.linalg.norm(across, axis=1)
     rmse = float(np.sqrt((gap**2).sum(axis=1).mean()))
     branch = None
     if other is not None:
-        distances = other.prediction.curve.distances(item.points)
+        distances = item.distances(other.prediction.curve)
         branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)
-    return PoseShape(curve.at(places), rmse, s, residual, eq.energy, eq.stable, branch)
+    return PoseShape(curve.at(places), rmse, s, gap, residual, eq.energy, eq.stable, branch)
 
 
 def _stage(

@@ -42,7 +42,7 @@ def photographed(config, cameras) -> tuple[MeasuredPose, ...]:
         seen = camera - rays * (camera[2] / rays[:, 2:])
         points = seen[:, :2] + STD * rng.standard_normal(curve.shape)
         ends = replace(conditions(pose), camera_center=tuple(camera))
-        measured.append(MeasuredPose(ends, points, held_out=pose.role == "held_out"))
+        measured.append(MeasuredPose.of_points(ends, points, held_out=pose.role == "held_out"))
     return tuple(measured)
 
 
