@@ -105,7 +105,7 @@ def test_points_in_space(tmp_path):
         ("x_m,y_m\n1,1\n1,1\n1,1\n", "pose.csv: holds one point only"),
         (
             "0,0\n1,1\n",
-            r"line 1: the header must be x_m,y_m \(metres\), or s_m,x_m,y_m of markers .*, found '0,0'",
+            r"line 1: the header must be x_m,y_m \(metres\), or s_m,x_m,y_m .*, found '0,0'",
         ),
         ("x_mm,y_mm\n0,0\n1,1\n", "line 1: the header must be x_m,y_m .*'x_mm,y_mm'"),
         ("y_m,x_m\n0,0\n1,1\n", "line 1: the header must be x_m,y_m"),

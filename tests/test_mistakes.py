@@ -320,7 +320,7 @@ MISTAKES: list[tuple[Callable[[Path], Session], list[str]]] = [
     (photographs_one_further, ["pose_02 shows the ends of pose_03", "in step"]),
     (start_and_end_exchanged, ["pose_05: its end (0, 0) m", "are start and end exchanged?"]),
     (text_in_a_file("x_m,y_m\n0,0\n0.1,nan\n"), ["line 3: 'nan' is not a finite number", "gaps"]),
-    (text_in_a_file("x_m,y_m\n0,0\n"), ["holds one point only; a centre-line takes two"]),
+    (text_in_a_file("x_m,y_m\n0,0\n"), ["holds one point only; a pose takes two"]),
     (text_in_a_file("x,y\n0,0\n1,0\n"), ["the header must be x_m,y_m (metres)"]),
     (the_same_file_twice, ["is called 'pose_02' too", "give each its own"]),
     (a_copied_file, ["pose_04 holds exactly the points of pose_02", "under two names?"]),

@@ -28,6 +28,7 @@ from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
+from dlo_casadi.thresholds import CLEARLY_WORSE
 
 FloatArray = NDArray[np.floating]
 
@@ -60,15 +61,15 @@ class CrossValidation:
             return float("inf")
         return float(np.sqrt(self.squares.sum() / self.counts.sum()))
 
-    def clearly_worse_than(self, other: CrossValidation, factor: float = 2.0) -> bool:
-        """Whether the mean paired difference of the folds exceeds its standard error."""
+    def clearly_worse_than(self, other: CrossValidation) -> bool:
+        """Whether the mean paired difference of the folds exceeds its standard error clearly."""
         if not self.complete:
             return True
         gap = self._excess_over(other)
         if len(gap) < 2:
             return bool(gap.sum() > 0)
         error = float(gap.std(ddof=1)) / np.sqrt(len(gap))
-        return bool(gap.mean() > factor * error)
+        return bool(gap.mean() > CLEARLY_WORSE * error)
 
     def chance_of_gain(self, other: CrossValidation) -> float:
         """Probability of a gain as large as that of the other, if it predicts no better.

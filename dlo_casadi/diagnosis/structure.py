@@ -12,6 +12,7 @@ from scipy.stats import norm
 from dlo_casadi.diagnosis.screening import survival
 from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import KEPT_INFORMATION, KEPT_VARIANCE, LEAST_NOISE_DEGREES
 
 FloatArray = NDArray[np.floating]
 
@@ -60,7 +61,7 @@ class Structure:
 
 def noise_degrees(fit: Fit) -> float:
     """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
-    return float("inf") if fit.noise.declared else max(4.0, fit.noise.slow_dof)
+    return max(LEAST_NOISE_DEGREES, fit.noise.slow_dof)
 
 
 def screening_degrees(fit: Fit) -> float:
@@ -70,12 +71,12 @@ def screening_degrees(fit: Fit) -> float:
     of cable told it, which is too much: what is found so has to pass a second test, under the
     noise that is left once it is in the model.
     """
-    if fit.noise.declared:
-        return float("inf")
+    if fit.noise.known:
+        return noise_degrees(fit)
     if fit.noise.share == 0:
         return float(fit.problem.n_residuals)
     stretches = fit.model.cable.length / (np.sqrt(2 * np.pi) * fit.noise.length)
-    return float(max(4.0, len(fit.problem.used) * stretches))
+    return float(max(LEAST_NOISE_DEGREES, len(fit.problem.used) * stretches))
 
 
 def structure_of(fit: Fit, noise_dof: float) -> Structure:
@@ -106,7 +107,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         covariance[at : at + len(part), at : at + len(part)] += part
         at += len(part)
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    kept = values > 0.05
+    kept = values > KEPT_VARIANCE
     along = vectors[:, kept].T @ stacked
     statistic, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
     p_value = survival(statistic, max(dof, 1), noise_dof)
@@ -160,7 +161,7 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
     information -= cross @ fit.covariance @ cross.T
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    kept = values > 1e-6
+    kept = values > KEPT_INFORMATION
     along = vectors[:, kept].T @ (slope * scale)
     score, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
     p_value = survival(score, max(dof, 1), noise_dof)

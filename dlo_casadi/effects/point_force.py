@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Load, Params, PointForceAt
+from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
 from dlo_casadi.parameters import Parameter
 
 
-class PointForce(Load):
+class PointForce(PointLoad):
     """A dead force on the cable, the same in every pose: a string over a pulley, a jet.
 
         V = - f . r(s)                                                [J]
@@ -31,18 +31,14 @@ class PointForce(Load):
                 Parameter(f"f{axis}", "N", scale=scale, lower=-30 * scale, upper=30 * scale)
                 for axis in cable.axes
             ),
-            Parameter(
-                "position",
-                "m",
-                nominal=cable.length / 2,
-                scale=0.1 * cable.length,
-                lower=0.0,
-                upper=cable.length,
-                scan=True,
-            ),
+            self.position(cable),
         )
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force."""
-        force = ca.vertcat(*(params[name] for name in params if name.startswith("f")))
-        return (PointForceAt(force, params["position"]),)
+        return (
+            PointForceAt(
+                ca.vertcat(*(params[f"f{axis}"] for axis in "xyz" if f"f{axis}" in params)),
+                params["position"],
+            ),
+        )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Load, Params, PointForceAt
+from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
 from dlo_casadi.parameters import Parameter
 
 
-class UnknownPull(Load):
+class UnknownPull(PointLoad):
     """A force at one place of the cable that may be another one in every pose.
 
         V_j = - (f + f_j) . r(s)                                      [J]
@@ -28,16 +28,13 @@ class UnknownPull(Load):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the mean force and its place."""
-        length = cable.length
         scale = 9.81 * cable.mass
         return (
             *(
                 Parameter(f"f{axis}", "N", scale=scale, lower=-10 * scale, upper=10 * scale)
                 for axis in cable.axes
             ),
-            Parameter(
-                "position", "m", nominal=length / 2, scale=0.1 * length, upper=length, lower=0.0
-            ),
+            self.position(cable),
         )
 
     def per_pose(self, cable: Cable) -> tuple[str, ...]:

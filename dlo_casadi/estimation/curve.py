@@ -148,7 +148,7 @@ class NodeCurve:
         neighbouring points are then compared in the same directions.
         """
         t = self.at(s, 1)
-        t = t / np.linalg.norm(t, axis=1, keepdims=True)
+        t = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
         if self.d == 2:
             return np.stack([-t[:, 1], t[:, 0]], axis=1)[:, None]
         first = np.eye(3)[np.abs(t).argmin(axis=1)]

@@ -14,6 +14,7 @@ from dlo_casadi.estimation.noise import (
     smooth_modes,
     tell_of_noise,
 )
+from dlo_casadi.estimation.repeats import with_repeats
 from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
@@ -34,7 +35,7 @@ def settle(fit: Fit) -> Fit:
     problem, point, converged = refine(
         fit.problem,
         fit.point,
-        estimate=not fit.noise.declared,
+        estimate=not fit.noise.known,
         rounds=2,
         modes=SETTLED_MODES,
     )
@@ -62,8 +63,9 @@ def refine(
     for round_ in range(rounds):
         lin = problem.linearize(point)
         noise = problem.noise
-        if estimate and round_ < 2:
-            noise = noise_of(problem, point, lin, modes)
+        if estimate and round_ < 2 and not noise.known:
+            own = noise_of(problem, point, lin, modes)
+            noise = with_repeats(own, problem.history, problem.unknowns.model.cable.length)
         roughness = roughness_of(problem, point, lin)
         scatter = scatter_of(problem, point, lin)
         ends = np.isfinite(scatter)

@@ -37,10 +37,9 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     model, used = problem.unknowns.model, problem.used
     chain = model.chain
     # Without forces an element does not know its inner unknowns.
-    plain = chain.kind.plain
     sweep = problem.sweep
-    if plain != chain.element:
-        sweep = Sweep(model.with_mesh(chain.n, plain), problem.sweep.poses)
+    if chain.kind.n_inner:
+        sweep = Sweep(model.with_mesh(chain.n, chain.kind.plain), problem.sweep.poses)
     flat = np.zeros(chain.n_rests)
     x = np.array(
         [first_nodes(model, model.nominal, flat, item.pose)[0] for item in problem.measured]

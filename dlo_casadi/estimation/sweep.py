@@ -118,7 +118,7 @@ class Sweep:
         shapes : Shapes
             Where to start; deviations are kept.
         p : (n_parameters,) or (m, n_parameters)
-        rest : (n_cells,) or (m, n_rests) [1/m]
+        rest : (n_rests,) or (m, n_rests) [1/m]
             Before the first pose, or of each pose.
         tolerance : float [rad]
             Largest step at convergence.
@@ -218,7 +218,7 @@ class Sweep:
         ----------
         slopes : (n_parameters, size)
             dp/dtheta.
-        rest_slopes : (n_cells, size)
+        rest_slopes : (n_rests, size)
             d rest / d theta before the first pose.
 
         Returns

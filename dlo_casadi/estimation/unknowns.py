@@ -119,7 +119,7 @@ class Unknowns:
 
     @property
     def rest_slopes(self) -> FloatArray:
-        """Derivative of the rest curvature by theta (n_cells, size)."""
+        """Derivative of the rest curvature by theta (n_rests, size)."""
         out = np.zeros((self.model.chain.n_rests, self.size))
         if self.rest_free:
             out[:, self.n_parameters :] = self.model.rest_basis * self.model.cable.curvature_scale

@@ -19,14 +19,12 @@ from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import conditions, line_without_end
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.plausibility import (
-    CONTRADICTS,
-    MUCH_BETTER,
-    OUT_OF_STEP,
     Lines,
     Suspicion,
     repeated,
     suspicions,
 )
+from dlo_casadi.thresholds import CONTRADICTS, MUCH_BETTER, OUT_OF_STEP
 
 FloatArray = NDArray[np.floating]
 

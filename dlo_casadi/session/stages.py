@@ -29,6 +29,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     StageName,
 )
+from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95
 
 FloatArray = NDArray[np.floating]
 
@@ -127,10 +128,9 @@ def stiffness_stage(
     """Stiffness fitted, straight at rest."""
     p = model.nominal.copy()
     p[0] = found.EI
-    known = found.log_std < np.log(10.0) / 3.92
-    interval = tuple(
-        float(found.EI * np.exp(sign * 1.96 * found.log_std)) if known else None for sign in (-1, 1)
-    )
+    half = NORMAL_95 * found.log_std
+    known = 2 * half < np.log(IDENTIFIABLE)
+    interval = tuple(float(found.EI * np.exp(x)) if known else None for x in (-half, half))
     spread = found.EI * min(found.log_std, 1e3)
     stiffness = ParameterEstimate(
         found.EI, spread, "N m^2", (interval[0], interval[1]), bool(known)

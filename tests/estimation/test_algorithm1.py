@@ -279,7 +279,7 @@ def test_parameters_are_those_of_the_model():
 def test_held_out_and_unread_poses_are_not_used():
     poses = measured(0.3, ENDS)
     extra = [
-        replace(poses[0], held_out=True, points=poses[0].points + 0.1),
+        MeasuredPose.of_points(poses[0].pose, poses[0].points + 0.1, held_out=True),
         MeasuredPose.of_points(poses[1].pose, np.empty((0, 2))),
         MeasuredPose.of_points(Pose((0.0, 0.0), (2.0, 0.0)), poses[2].points),  # out of reach
     ]
