@@ -49,6 +49,7 @@ class Tolerances:
     heading: float = 1e-2
     scale: float = 3e-4
     rotation: float = 5e-3
+    roll: float = 1.0
 
     def deviation(self, node: type[Node]) -> FloatArray:
         """Standard deviations of a pose's deviations, see `deviation_names`; pulls are free."""
