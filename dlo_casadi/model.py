@@ -224,6 +224,11 @@ class CableModel:
         """Qualified names of the parameters, in the order of the vector `p`."""
         return tuple(parameter.name for parameter in self.parameters)
 
+    @property
+    def stiffness_indices(self) -> list[int]:
+        """Where the stiffnesses stand in the vector `p`, bending first."""
+        return [k for k, name in enumerate(self.names) if name in STIFFNESSES]
+
     @cached_property
     def nominal(self) -> FloatArray:
         """Parameter vector `p` at the nominal values."""

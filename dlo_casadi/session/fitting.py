@@ -85,7 +85,12 @@ def _finer(n: int, excess: float, element: str) -> int:
 
 
 def solved_by_ipopt(fit: Fit) -> Fit:
-    """Minimum of the batch NLP, from the Gauss-Newton fit's; that one where IPOPT fails."""
+    """Minimum of the batch NLP, from the Gauss-Newton fit's; that one where IPOPT fails.
+
+    In space the fit's own: third derivatives of all elements would cost IPOPT minutes a run.
+    """
+    if fit.model.in_space:
+        return fit
     try:
         return replace(fit, point=solve_batch(fit.problem, fit.point).point)
     except EstimationError:
