@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
@@ -21,6 +22,8 @@ from dlo_casadi.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
+# In a session a pose may also continue the one before it, see `continued`.
+PoseBranch = Branch | Literal["previous"]
 
 # Sign of the turning from start to end on a branch.
 SIGNS: dict[Branch, int] = {"ccw": 1, "cw": -1}
@@ -50,8 +53,9 @@ class Pose:
         `end` is None for a free end.
     start_heading, end_heading : float [rad] or None
         Directions of clamped ends, continuous along the cable.
-    branch : "ccw" or "cw", optional
-        Which way the cable turns from start to end: the sign of `Equilibrium.turn`.
+    branch : "ccw", "cw" or "previous", optional
+        Which way the cable turns from start to end: the sign of `Equilibrium.turn`; or as in the
+        pose before it, from which whoever predicts a series of poses follows it (`continued`).
     name : str
     camera_center : (float, float, float), optional [m]
         Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
@@ -61,7 +65,7 @@ class Pose:
     end: tuple[float, float] | None = None
     start_heading: float | None = None
     end_heading: float | None = None
-    branch: Branch | None = None
+    branch: PoseBranch | None = None
     name: str = "pose"
     camera_center: tuple[float, float, float] | None = None
 
@@ -111,6 +115,9 @@ class Equilibrium:
         Largest violation of an end condition [m or rad].
     status : Status
     iterations : int
+    tipping : float or None [rad]
+        By how much the clamp of a cable with a free end must turn until the lowest equilibrium on
+        the other branch is as low; None if no stable one was found there, or none looked for.
     """
 
     x: FloatArray
@@ -126,6 +133,7 @@ class Equilibrium:
     residual: float
     status: Status
     iterations: int
+    tipping: float | None = None
 
     @property
     def shapes(self) -> Shapes:
@@ -177,6 +185,11 @@ IPOPT_ITERATIONS = 300
 # First guesses that seldom lead to the lowest equilibrium are left out, see `guesses` [rad].
 # Of 300 random problems with a clamp at the end or at both ends this loses none.
 FAR, CURVED = 1.5, 1.0
+# Nearer than this to where both ways to fall are equally low, nobody knows which one a cable takes
+# [rad]: heavy ones differ by 0.3 1/m from hanging to hanging, over 0.6 m of length.
+EITHER = 0.2
+# Farther no end is moved at once [lengths, rad]: shapes near a fold are followed, not jumped over.
+MOST_MOVED, MOST_TURNED = 0.05, 0.2
 # A joint so near to its bound is at it [rad].
 AT_BOUND = 1e-6
 
@@ -263,7 +276,9 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
 
     1. the rest shape from the start on;
     2. the cable falling down from the start's direction;
-    3. straight on.
+    3. straight on;
+    4. the cable falling down the other way round: where the nearer one turns by more than 1.5 rad,
+       or the rest shape by more than 1 rad.
 
     In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings.
     The generated solver tries the same ones: codegen/templates/guesses.c.in.
@@ -306,8 +321,11 @@ def _hanging(
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
     if first is None:
         first = down
-    fall = wrapped(down - first) * (1 - np.exp(-4 * u))
-    return [first + bent, first + fall, np.full_like(u, first)]
+    drop, decay = wrapped(down - first), 1 - np.exp(-4 * u)
+    found = [first + bent, first + drop * decay, np.full_like(u, first)]
+    if abs(drop) > FAR or np.ptp(bent) > CURVED:
+        found.append(first + (drop - 2 * np.pi * (1 if drop > 0 else -1)) * decay)
+    return found
 
 
 def _curved(n: int, u: FloatArray, bent: FloatArray, chord: FloatArray) -> list[FloatArray]:
@@ -388,7 +406,7 @@ def solve_equilibrium(
         )
     check_reach(model, p, pose)
     starts = [phi_init] if phi_init is not None else guesses(model, p, rest, pose)
-    branch = pose.branch if phi_init is None else None
+    branch = None if phi_init is not None or pose.branch == "previous" else pose.branch
     first_suffices = branch is not None and (model.start, model.end) == ("pinned", "pinned")
     found: list[Equilibrium] = []
     for phi in starts:
@@ -410,7 +428,7 @@ def solve_equilibrium(
     lowest = found[0]
     for eq in found:
         if eq.turns(branch) and eq.stable is lowest.stable:
-            return eq
+            return replace(eq, tipping=_tipping(model, eq, found))
     there = next((f"branch {branch}" for branch in SIGNS if lowest.turns(branch)), "neither branch")
     kind = "stable equilibrium" if lowest.stable else "equilibrium"
     raise EquilibriumError(
@@ -421,6 +439,62 @@ def solve_equilibrium(
         pose.name,
         pose.end,
     )
+
+
+def _tipping(model: CableModel, eq: Equilibrium, found: list[Equilibrium]) -> float | None:
+    """Angle [rad] of the clamp at which another way to fall is as low, to first order.
+
+    dV/d(heading) of the clamp is the moment on it.
+    """
+    others = [other for other in found if other.stable and other.turn * eq.turn < 0]
+    if (model.start, model.end) != ("clamped", "free") or not others:
+        return None
+    lever = abs(float(others[0].moments[0] - eq.moments[0]))
+    return abs(others[0].energy - eq.energy) / max(lever, 1e-300)
+
+
+def continued(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    pose: Pose,
+    before: Pose,
+    phi: FloatArray,
+) -> Equilibrium:
+    """Shape to which a cable comes whose ends are moved from another pose's, slowly.
+
+    Ends and headings move in a straight line from one pose's to the other's. Where the shape
+    loses its stability on the way, the cable snaps to the equilibrium that its last shape leads to.
+
+    Parameters
+    ----------
+    p, rest
+        As in `solve_equilibrium`.
+    pose : Pose
+    before : Pose
+    phi : (n_nodes,) [rad]
+        Headings of the cable in the pose `before`.
+
+    Raises
+    ------
+    EquilibriumError
+        If no equilibrium is found in the pose.
+    """
+    step = pose.ends - before.ends
+    moved = float(np.abs(step[:4]).max()) / (MOST_MOVED * model.cable.length)
+    turned = float(np.abs(step[4:]).max()) / MOST_TURNED
+    for left in range(int(np.ceil(max(moved, turned, 1.0))) - 1, 0, -1):
+        x = pose.ends - step * left / max(moved, turned)
+        on_the_way = replace(
+            pose,
+            start=(x[0], x[1]),
+            end=None if pose.end is None else (x[2], x[3]),
+            start_heading=None if pose.start_heading is None else x[4],
+            end_heading=None if pose.end_heading is None else x[5],
+        )
+        with suppress(EquilibriumError):  # a straight way may lead out of reach
+            phi = solve_equilibrium(model, p, rest, on_the_way, phi_init=phi).phi
+    return solve_equilibrium(model, p, rest, pose, phi_init=phi)
 
 
 def _from_start(

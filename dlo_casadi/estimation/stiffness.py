@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
-from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
 
@@ -33,8 +33,8 @@ class StiffnessFit:
 def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> StiffnessFit:
     """Least squares of the distances of all fit points over EI, the cable straight at rest.
 
-    The equilibria are followed from the prior stiffness along the decades, so that each is on
-    the branch that prediction would choose there.
+    The equilibria are followed from the prior stiffness along the decades, each on the branch that
+    prediction would choose there, or on that on which the pose was measured.
     """
     used = [item for item in measured if item.readable and not item.held_out]
     sweep = Sweep(model, [item.pose for item in used])
@@ -98,10 +98,12 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
 def _cold(
     model: CableModel, p: FloatArray, rest: FloatArray, used: Sequence[MeasuredPose]
 ) -> Shapes | None:
-    """Stable equilibria of lowest energy, or None if one is missing."""
+    """Stable equilibria as predicted or measured, or None if one is missing."""
     predictions = predict_poses(model, p, rest, [item.pose for item in used])
+    others = measured_elsewhere(model, p, rest, used, predictions)
     x, lam = [], []
-    for prediction in predictions:
+    for known, other in zip(predictions, others, strict=True):
+        prediction = other or known
         if prediction is None:
             return None
         x.append(prediction.equilibrium.x)

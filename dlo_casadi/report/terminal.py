@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
+from dlo_casadi.equilibrium import EITHER
 from dlo_casadi.report.canvas import label_of
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.session.outcome import (
@@ -492,7 +493,11 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("energy", f"{shape['energy']:.6g} J"))
     rows.append(("smallest bend radius", _mm(shape["min_bend_radius"])))
     stable = "yes" if shape["stable"] else "NO: the cable would not stay there"
-    return [*rows, ("stable", stable)]
+    rows.append(("stable", stable))
+    if shape["tipping"] is not None and shape["tipping"] < EITHER:
+        turned = f"equally low with the clamp turned by {shape['tipping']:.2g} rad"
+        rows.append(("also stable", f"falling to the other side, {turned}"))
+    return rows
 
 
 def plus_minus(value: float, std: float) -> str:

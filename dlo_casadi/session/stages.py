@@ -43,9 +43,12 @@ def pose_shape(
     curve = prediction.curve
     places = np.linspace(0.0, curve.length, _CURVE_POINTS)
     eq: Equilibrium = prediction.equilibrium
+    tipping = None if item.pose.branch else eq.tipping
     if not item.readable:
         empty = np.zeros(0)
-        return PoseShape(curve.at(places), None, empty, empty, eq.energy, eq.stable)
+        return PoseShape(
+            curve.at(places), None, empty, empty, eq.energy, eq.stable, tipping=tipping
+        )
     s = curve.nearest(item.points)
     gap = item.points - curve.at(s)
     residual = (gap * curve.normals(s)).sum(axis=1)
@@ -54,7 +57,7 @@ def pose_shape(
     if other is not None:
         distances = other.prediction.curve.distances(item.points)
         branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)
-    return PoseShape(curve.at(places), rmse, s, residual, eq.energy, eq.stable, branch)
+    return PoseShape(curve.at(places), rmse, s, residual, eq.energy, eq.stable, branch, tipping)
 
 
 def _stage(
