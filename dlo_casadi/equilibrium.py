@@ -185,9 +185,6 @@ IPOPT_ITERATIONS = 300
 # First guesses that seldom lead to the lowest equilibrium are left out, see `guesses` [rad].
 # Of 300 random problems with a clamp at the end or at both ends this loses none.
 FAR, CURVED = 1.5, 1.0
-# Nearer than this to where both ways to fall are equally low, nobody knows which one a cable takes
-# [rad]: heavy ones differ by 0.3 1/m from hanging to hanging, over 0.6 m of length.
-EITHER = 0.2
 # Farther no end is moved at once [lengths, rad]: shapes near a fold are followed, not jumped over.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
 # A joint so near to its bound is at it [rad].

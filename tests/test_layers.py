@@ -11,16 +11,16 @@ from dlo_casadi.effects import EFFECTS, NUISANCES
 PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-CHAIN = ["errors", "parameters", "rod", "rest", "effects", "assembly", "model", "whole_pose"]
-CHAIN += ["initial", "equilibrium"]
+CHAIN = ["errors", "thresholds", "parameters", "rod", "rest", "effects", "assembly", "model"]
+CHAIN += ["whole_pose", "initial", "equilibrium"]
 MECHANICS = set(CHAIN)
 PARALLEL = {"executors", "parallel"}
 
 # layer -> what it may import beside itself. A new module gets its line here.
 MAY_IMPORT: dict[str, set[str]] = {
     **{layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)},
-    "assembly": {*CHAIN[:5], "model"},  # the model only for its type
-    "config": {"errors", "parameters", "rod", "effects"},
+    "assembly": {*CHAIN[:6], "model"},  # the model only for its type
+    "config": {"errors", "thresholds", "parameters", "rod", "effects"},
     "durable": {"errors"},
     "measurements": {"errors", "config", "durable"},
     "vision": {"errors", "durable"},

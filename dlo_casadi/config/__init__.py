@@ -4,7 +4,7 @@ The only package that imports yaml. All units are SI. Every problem of a file is
 each with its line.
 """
 
-from dlo_casadi.config.declared_effects import setup_of
+from dlo_casadi.config.declared_effects import declared_setup, wrong_effects
 from dlo_casadi.config.document import dump_yaml, read_document, read_yaml
 from dlo_casadi.config.limits import (
     MESH,
@@ -57,12 +57,13 @@ __all__ = [
     "Reference",
     "SkippedPose",
     "Tolerances",
+    "declared_setup",
     "dump_yaml",
     "implausible_gravity",
     "implausible_sizes",
     "load_config",
     "read_document",
     "read_yaml",
-    "setup_of",
     "show",
+    "wrong_effects",
 ]

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from dlo_casadi.config.sections import Config, DeclaredEffect, File
 
 
-def setup_of(config: Config | File) -> Setup:
+def declared_setup(config: Config | File) -> Setup:
     """How the cable is held and measured, as far as a configuration tells."""
     cable, experiment = config.cable, config.experiment
     measurement = experiment.measurement
@@ -37,13 +37,13 @@ def setup_of(config: Config | File) -> Setup:
     )
 
 
-def wrong_effects(file: File) -> list[Problem]:
+def wrong_effects(config: Config | File) -> list[Problem]:
     """Find effects, and parameters of theirs, that do not exist or cannot be as declared."""
-    setup = setup_of(file)
+    setup = declared_setup(config)
     problems = [
-        problem for i, item in enumerate(file.model.effects) for problem in _wrong(item, i, setup)
+        problem for i, item in enumerate(config.model.effects) for problem in _wrong(item, i, setup)
     ]
-    for i, name in enumerate(file.diagnosis.exclude):
+    for i, name in enumerate(config.diagnosis.exclude):
         if name not in EFFECTS:
             text = f"diagnosis.exclude: {_unknown(name)}"
             problems.append(Problem(("diagnosis", "exclude", i), text))

@@ -38,8 +38,8 @@ def start_from(pull: Pull, candidate: Candidate) -> dict[str, float]:
     params = {name: linear[k] for k, name in enumerate(names)} | {"position": ca.SX(pull.position)}
     force = effect.force(place, ca.SX(ca.DM(model.gravity)), params)
     slopes = ca.Function("slopes", [place], [ca.jacobian(force, linear)])
-    curves = fit.problem.curves(fit.point.theta, fit.point.shapes)
-    places = [curves[j].at(np.array([pull.position]))[0] for j in fit.problem.used]
+    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    places = [seen[j].curve.at(np.array([pull.position]))[0] for j in fit.problem.used]
     arms = np.concatenate([np.array(slopes(at)) for at in places])
     found = np.linalg.lstsq(arms, pull.force_per_pose.ravel(), rcond=None)[0]
     values = dict(zip(names, map(float, found), strict=True)) | {"position": pull.position}

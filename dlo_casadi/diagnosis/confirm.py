@@ -44,7 +44,7 @@ class Confirmed:
     def of(cls, screened: Screened, base: Fit, fit: Fit) -> Confirmed:
         """Compare a fit with a candidate with the base, the fit without it."""
         gain = 2 * (base.point.objective - fit.point.objective)
-        price = float(len(screened.candidate.frees) * np.log(max(base.problem.n_points, 2)))
+        price = float(len(screened.candidate.frees) * np.log(max(base.problem.n_residuals, 2)))
         return cls(screened, fit, cross_validate(fit), gain, gain - price)
 
     @property

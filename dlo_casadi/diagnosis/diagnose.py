@@ -33,24 +33,19 @@ from dlo_casadi.estimation.hyperparameters import noise_of, settle
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
+from dlo_casadi.thresholds import (
+    BIC_APART,
+    LEAST_NOISE_DEGREES,
+    LEFT,
+    REFITTED,
+    SIGNIFICANCE,
+    UNSEEN,
+    UNSEEN_LEFT,
+    WORTH,
+)
 
 FloatArray = NDArray[np.floating]
 Verdict = Literal["complete", "effect_found", "unexplained"]
-
-# Candidates that are refitted at most in one step, and the share of the leading score below
-# which one is not worth a refit.
-REFITTED = 6
-WORTH = 0.1
-# A rival whose BIC falls short by more than this is told apart by the data ("very strong",
-# Kass and Raftery 1995), whatever its cross-validated error.
-BIC_APART = 10.0
-# Effects are no explanation if a pose that is left out is predicted worse than so many times the
-# noise, and than half of what it was without them.
-UNSEEN = 2.0
-# Of the mean square error that the declared model makes beyond the noise, what effects beside an
-# unexplained residual may leave. Measured, without their cause: a force for a drift leaves 0.38,
-# a gradient, a scale and an offset for stretch 0.89; softening of a real glass-fibre strip 0.08.
-LEFT = 0.1
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ def diagnose(
     *,
     center: tuple[float, float] | None = None,
     exclude: Sequence[str] = (),
-    significance: float = 0.005,
+    significance: float = SIGNIFICANCE,
     max_effects: int = 4,
     step: Callable[[str, int, int], None] = lambda name, done, total: None,
     executor: Executor | None = None,
@@ -329,7 +324,7 @@ class _Search:
         loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
         refit = partial(refit_from, self.declared, pull)
         free = 2 * len(self.declared.problem.used) + 1
-        price = free * np.log(self.declared.problem.n_points)
+        price = free * np.log(self.declared.problem.n_residuals)
         return [
             item
             for item in map_in_order(self.executor, refit, loads)
@@ -341,7 +336,7 @@ class _Search:
         if not added and not fit.noise.known:
             fit = settle(fit)
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
-        limit = max(UNSEEN * fit.noise.std, self.error / 2)
+        limit = max(UNSEEN * fit.noise.std, UNSEEN_LEFT * self.error)
         unpredicted = bool(added) and validation.rmse > limit
         unexplained = structure.p_value < self.significance or unpredicted
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
@@ -372,7 +367,7 @@ class _Search:
         if alone is None or not self.several:
             return False
         pull = estimate_pull(found.fit, self.executor)
-        n = np.log(self.declared.problem.n_points)
+        n = np.log(self.declared.problem.n_residuals)
         extra = sum(len(item.candidate.frees) for item in found.added) * n
         if pull is None:
             return True
@@ -425,7 +420,7 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
     other, _ = larger.descend(other)
     gain = max(2 * (point.objective - other.objective), 0.0)
     dof = len(winner.candidate.frees)
-    return _corrected(survival(gain, dof, max(4.0, noise.slow_dof)), tried)
+    return _corrected(survival(gain, dof, max(LEAST_NOISE_DEGREES, noise.slow_dof)), tried)
 
 
 def _improving(
@@ -504,7 +499,7 @@ def prune(fit: Fit, added: list[AddedEffect], significance: float) -> tuple[Fit,
             for item in screen(smaller, None, ())
             if item.candidate.name == effect.candidate.name
         ]
-        price = len(effect.candidate.frees) * np.log(fit.problem.n_points)
+        price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
         gain = 2 * (smaller.point.objective - fit.point.objective)
         if gain < price or (again and again[0].p_value > significance):
             fit = settle(smaller)

@@ -7,13 +7,9 @@ from numpy.typing import NDArray
 
 from dlo_casadi.estimation.repeats import repeatability
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import ALIKE, REPEATS
 
 FloatArray = NDArray[np.floating]
-
-# Poses that repeat worse than this many times the noise limit every prediction.
-REPEATS = 1.5
-# Absolute correlation of two nuisances beyond which their effects on the shapes are one.
-ALIKE = 0.9
 
 
 def limiting_spread(fit: Fit) -> float | None:

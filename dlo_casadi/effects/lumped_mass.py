@@ -8,6 +8,7 @@ import numpy as np
 from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
 from dlo_casadi.effects.setup import Fitted
 from dlo_casadi.parameters import Parameter
+from dlo_casadi.thresholds import ALONG_GRAVITY
 
 
 class LumpedMass(PointLoad):
@@ -51,5 +52,5 @@ class LumpedMass(PointLoad):
         place, field = ca.SX.zeros(len(down)), ca.SX(ca.DM(gravity))
         force, moved = found.propagated(lambda params: effect.force(place, field, params))
         across = np.eye(len(down)) - np.outer(down, down)
-        limit = 2 * np.linalg.norm(across @ moved)
+        limit = ALONG_GRAVITY * np.linalg.norm(across @ moved)
         return bool(force @ down > 0 and np.linalg.norm(across @ force) < limit)

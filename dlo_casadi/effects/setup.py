@@ -10,10 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.effects.effect import Cable, Effect, Params
-
-# A load so near to a held end (share of the length) bends the cable beyond it as an error of the
-# fixture does: shapes show what is transmitted, not how it is applied (Saint-Venant).
-NEAR_END = 0.1
+from dlo_casadi.thresholds import NEAR_END
 
 
 @dataclass(frozen=True)

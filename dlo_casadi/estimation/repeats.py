@@ -8,16 +8,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
-from dlo_casadi.estimation.observation import MeasuredPose, chord_places
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.thresholds import REPEATS_ARE_NOISE
 
 FloatArray = NDArray[np.floating]
 
-# Repeats that differ by more than so many times the noise take its place. Below, chi-square per
-# degree of freedom widens the intervals, and the shapes stay those of one line's noise.
-APART = 2.0
 # Of the length: beside a fixture all repeats are where it holds them.
 _BESIDE_FIXTURES = 0.02
+# Of the mean of repeats, a polyline.
+_NODES = 201
 
 
 def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | None:
@@ -38,7 +39,7 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
 def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: float) -> NoiseModel:
     """Noise of one line, or of repeats of one pose where they differ by more than twice that.
 
-    Pure error: the normal distances of repeats from their mean, sqrt(m / (m - 1)) larger for
+    Pure error: the distances of repeats from their mean, sqrt(m / (m - 1)) larger for
     its loss of one degree of freedom in m, with their correlation along the cable. A fit that
     trusts each line to the noise of its points bends the rest shape to whatever is left, and may
     end in one whose lowest equilibrium is far from all that was measured.
@@ -48,28 +49,29 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
     spread = repeatability(measured, length)
-    if spread is None or spread <= APART * noise.std:
+    if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise
     samples = []
+    nodes = np.linspace(0.0, length, _NODES)
     for group in _groups(measured):
+        lines = [_line(other, nodes, length) for other in group]
+        mean = NodeCurve(length, np.mean(lines, axis=0), None)
         for item in group:
-            places = chord_places(item, length)
+            places = item.places(length)
+            gap = np.sqrt(len(group) / (len(group) - 1)) * (item.points - mean.at(places))
+            residual = item.components(mean, places, gap[..., None])[:, 0]
             inside = np.abs(places / length - 0.5) < 0.5 - _BESIDE_FIXTURES
-            s = places[inside]
-            if len(s) < 2:
-                continue
-            mean = np.mean([_line(other, s, length) for other in group], axis=0)
-            tangent = np.gradient(mean, axis=0)
-            normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-            normal /= np.maximum(np.hypot(*tangent.T), 1e-300)[:, None]
-            gap = ((item.points[inside] - mean) * normal).sum(axis=1)
-            none = np.zeros((len(s), 0))
-            grown = np.sqrt(len(group) / (len(group) - 1)) * gap
-            samples.append(NoiseSample(grown, s, item.relative_std[inside], none, none))
+            for sensor, points, rows in item.slices:
+                kept = np.repeat(inside[points], sensor.per_point)
+                e, s = residual[rows][kept], places[points][inside[points]]
+                none = np.zeros((len(e), 0))
+                if len(s):
+                    weight = sensor.weight[inside[points]]
+                    samples.append(NoiseSample(e, s, weight, none, none))
     if not tell_of_noise(samples):
         return noise
     found = estimate_noise(samples, length)
-    return replace(found, source="repeats") if found.std > APART * noise.std else noise
+    return replace(found, source="repeats") if found.std > REPEATS_ARE_NOISE * noise.std else noise
 
 
 def _groups(measured: Sequence[MeasuredPose]) -> list[list[MeasuredPose]]:
@@ -82,6 +84,6 @@ def _groups(measured: Sequence[MeasuredPose]) -> list[list[MeasuredPose]]:
 
 
 def _line(item: MeasuredPose, s: FloatArray, length: float) -> FloatArray:
-    """Places (K, 2) [m] of a measured line at arc lengths s (K,) [m]."""
-    places = np.maximum.accumulate(chord_places(item, length))
-    return np.stack([np.interp(s, places, item.points[:, i]) for i in (0, 1)], axis=1)
+    """Places (K, d) [m] of a measured line at arc lengths s (K,) [m]."""
+    places = np.maximum.accumulate(item.places(length))
+    return np.stack([np.interp(s, places, column) for column in item.points.T], axis=1)

@@ -12,7 +12,6 @@ from rich.table import Table
 from rich.text import Text
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
-from dlo_casadi.equilibrium import EITHER
 from dlo_casadi.report.canvas import label_of
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.session.outcome import (
@@ -22,6 +21,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     StageName,
 )
+from dlo_casadi.thresholds import APART, EITHER, NOTABLE
 
 # Parts of the run in the order in which they are done.
 TIMED = {
@@ -281,8 +281,6 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     return lines
 
 
-# Rivals so many standard deviations apart are told from one another.
-APART = 3.0
 # Distances [m] that the table of a prediction shows.
 _SHOWN = 5e-6
 # Nobody measures a pose more often.
@@ -311,8 +309,6 @@ DEPENDENCES = {
     "span_z": "the distance of the ends",
     "position_z": "the place in the {plane}",
 }
-# Normal scores beyond it are worth a word.
-NOTABLE = 3.0
 
 
 def structure_lines(outcome: Outcome) -> list[str]:

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.config import Config
-from dlo_casadi.config import setup_of as config_setup
+from dlo_casadi.config import Config, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
 from dlo_casadi.effects import EFFECTS, NUISANCES
+from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.model import CableModel
 
@@ -77,8 +77,15 @@ def declared_model(
         Middle of the photographs in the board frame.
     pixel : float, optional [m]
         Size of a pixel on the board, for photographs.
+
+    Raises
+    ------
+    ConfigError
+        If a configuration that was changed since it was loaded names effects that cannot be.
     """
-    setup = replace(config_setup(config), center=center)
+    if problems := wrong_effects(config):
+        raise ConfigError("; ".join(problem.message for problem in problems), config.path)
+    setup = replace(declared_setup(config), center=center)
     experiment, options = config.experiment, config.model
     coefficients = config.estimation.rest_curvature_coefficients or REST_COEFFICIENTS
     model = CableModel(

@@ -9,14 +9,11 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import FITS, Suspicion
+from dlo_casadi.session.plausibility import Suspicion
+from dlo_casadi.thresholds import FITS, HEADING_NEAR, HEADING_OFF
 
 FloatArray = NDArray[np.floating]
 
-# What a clamp and a line may differ by [rad]; a clamp that is askew is up to 0.9 off.
-_OFF = 1.0
-# An explanation is that near [rad].
-_NEAR = 0.5
 # A full turn [rad], as somebody may round it; beyond it the line itself must turn so far.
 _TURN = 6.3
 # Of the length: pieces of which the direction is taken, and the part at an end that is used.
@@ -44,7 +41,7 @@ def wrong_headings(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion
                 continue
             judged += 1
             declared = getattr(poses[item.name], f"{side}_heading")
-            if abs(shown - declared) > _OFF:
+            if abs(shown - declared) > HEADING_OFF:
                 wrong[item.name] = (declared, shown)
         texts = {
             name: f"its {side}_heading is {declared:g} rad, the line {side}s at {shown:.3g} rad"
@@ -129,6 +126,6 @@ def _guess(declared: float, shown: float) -> str:
         "counter-clockwise is positive:": -declared,
     }
     for question, value in guesses.items():
-        if abs(_wrapped(value - shown)) < _NEAR:
+        if abs(_wrapped(value - shown)) < HEADING_NEAR:
             return f". Try: {question} then {value:.4g}."
     return ". Try: headings in radians, counter-clockwise from x, along the cable."

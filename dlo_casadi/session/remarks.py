@@ -9,13 +9,10 @@ import numpy as np
 from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
-from dlo_casadi.equilibrium import EITHER
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.session.fitting import MESH_SHARE, allowed_mesh_error
+from dlo_casadi.session.fitting import allowed_mesh_error
 from dlo_casadi.session.outcome import PoseInput, Stage
-
-# Fixtures that move a prediction by more than this share of the noise get a warning.
-FIXTURES = 0.5
+from dlo_casadi.thresholds import EITHER, FIXTURES, MESH_SHARE
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:

@@ -106,7 +106,7 @@ def fit_session(
     clock.lap("batch")
     progress.step("fit the declared model", 1, 1)
 
-    stages = before_stages(config, declared, measured, fit.model.n, clock, progress)
+    stages = before_stages(config, declared, inputs, measured, fit.model.n, clock, progress)
     reported = _declared_names(config, fit.model)
     stages.append(fit_stage("batch", fit, measured, stiffness_interval(fit), reported))
     clock.lap("fit")
@@ -195,6 +195,7 @@ def close_the_loop(
 def before_stages(
     config: Config,
     declared: Declared,
+    inputs: Sequence[PoseInput],
     measured: Sequence[MeasuredPose],
     n: int,
     clock: Clock,
@@ -212,6 +213,9 @@ def before_stages(
         stages.append(algorithm1_stage(None, measured, length, "switched off"))
     elif not applies(declared.model):
         note = "the paper's loop needs two pinned ends"
+        stages.append(algorithm1_stage(None, measured, length, note))
+    elif any(item.s is not None for item in inputs):
+        note = "the paper's loop needs lines along the cable, not single markers"
         stages.append(algorithm1_stage(None, measured, length, note))
     else:
         progress.step("the paper's loop", 0, 1)

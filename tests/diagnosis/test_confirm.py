@@ -38,7 +38,9 @@ def base():
     rng = np.random.default_rng(0)
     s = np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
     measured = [
-        MeasuredPose(shape_pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2)))
+        MeasuredPose.of_points(
+            shape_pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2))
+        )
         for shape_pose, shape in zip(
             poses, predict_poses(truth, p, np.zeros(truth.chain.n_cells), poses), strict=True
         )

@@ -38,7 +38,7 @@ def session(name: str, *values: float):
     rng = np.random.default_rng(0)
     s = np.linspace(0.02, 0.98, 30) * CABLE.length
     measured = [
-        MeasuredPose(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(30, 2)))
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(30, 2)))
         for pose, shape in zip(poses, shapes, strict=True)
     ]
     plain = nuisances(CableModel(CABLE, 10, n_rest=5), Tolerances())
@@ -109,8 +109,8 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     """Forces k (a - r_j) at the places r_j of the poses' own shapes, by least squares."""
     fit = session("tether", *TETHER)
     stiffness, position, *anchor = TETHER
-    curves = fit.problem.curves(fit.point.theta, fit.point.shapes)
-    places = [curves[j].at(np.array([position]))[0] for j in fit.problem.used]
+    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    places = [seen[j].curve.at(np.array([position]))[0] for j in fit.problem.used]
     pull = Pull(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), 0.0, fit)
     listed = {c.name: c for c in candidates(fit.model, setup_of(fit.model, n_poses=len(ENDS)))}
     start = start_from(pull, listed["tether"])

@@ -53,7 +53,7 @@ def test_the_residual_of_a_declared_noise_is_tested_against_chi_square(factor, l
 def test_fewer_points_than_unknowns():
     with pytest.raises(
         EstimationError,
-        match=r"the 4 points of 4 fit poses determine \d+\.\d unknowns .* "
+        match=r"the 4 distances of 4 fit poses determine \d+\.\d unknowns .* "
         r"3 are needed.\n  Try: more points on each line, more poses, the noise as "
         r"measurement.std, or rest_shape: straight.",
     ):

@@ -27,7 +27,7 @@ def lines(noise: NoiseModel, count: int, pose: Pose) -> list[MeasuredPose]:
     s = np.linspace(0.03, 0.97, 60) * LENGTH
     factor = np.linalg.cholesky(noise.covariance(s, np.ones(60)))
     return [
-        MeasuredPose(pose, np.stack([s, factor @ rng.normal(size=60)], axis=1))
+        MeasuredPose.of_points(pose, np.stack([s, factor @ rng.normal(size=60)], axis=1))
         for _ in range(count)
     ]
 
@@ -80,5 +80,5 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
 
 def test_repeats_of_a_point_each_tell_of_no_noise():
     pose = Pose((0.0, 0.0), (LENGTH, 0.0))
-    points = [MeasuredPose(pose, np.array([[0.5, y]])) for y in (-0.01, 0.01)]
+    points = [MeasuredPose.of_points(pose, np.array([[0.5, y]])) for y in (-0.01, 0.01)]
     assert with_repeats(DECLARED, points, LENGTH) is DECLARED

@@ -39,7 +39,7 @@ def turned_over(points=30, branch=None, model=MODEL):
     poses = [held(b, None if k == 0 else "previous") for k, b in enumerate((1.2, 0.6, 0.1, -0.3))]
     s = np.linspace(0.0, model.cable.length, points)
     return [
-        MeasuredPose(
+        MeasuredPose.of_points(
             replace(pose, branch=pose.branch if branch else None),
             shape.curve.at(s) + STD * rng.normal(size=(points, 2)),
         )

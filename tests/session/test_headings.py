@@ -5,7 +5,7 @@ import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.measurements import write_centerline
+from dlo_casadi.measurements import write_points
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import read_inputs
@@ -28,7 +28,7 @@ def session(folder, change=lambda pose, k: None, turn=TURN, apart=5):
         points = np.cumsum(steps, axis=0)
         end = points[-1].tolist()
         noisy = points[::apart] + 3e-4 * rng.standard_normal((len(points[::apart]), 2))
-        write_centerline(folder / f"arc_{k}.csv", noisy)
+        write_points(folder / f"arc_{k}.csv", noisy)
         pose = {"file": f"arc_{k}.csv", "start": [0, 0], "end": end, "role": "fit"}
         pose |= {"start_heading": begin, "end_heading": begin + turn}
         change(pose, k)

@@ -42,7 +42,7 @@ def photographed(config, cameras) -> tuple[MeasuredPose, ...]:
         seen = camera - rays * (camera[2] / rays[:, 2:])
         points = seen[:, :2] + STD * rng.standard_normal(curve.shape)
         ends = replace(conditions(pose), camera_center=tuple(camera))
-        measured.append(MeasuredPose(ends, points, held_out=pose.role == "held_out"))
+        measured.append(MeasuredPose.of_points(ends, points, held_out=pose.role == "held_out"))
     return tuple(measured)
 
 
@@ -65,6 +65,12 @@ def test_without_a_calibrated_camera_it_is_no_candidate(config):
     setups = [setup_of(model, center=(0, 0), n_poses=8, camera=known) for known in (True, False)]
     named = [{item.name for item in candidates(model, setup)} for setup in setups]
     assert named[0] - named[1] == {"standoff_error"}
+
+
+def test_a_configuration_that_was_changed_by_hand_is_checked_again(config):
+    options = config.diagnosis.model_copy(update={"exclude": ("stand_off",)})
+    with pytest.raises(ConfigError, match=r"diagnosis\.exclude: no effect is called 'stand_off'"):
+        declared_model(replace(config, diagnosis=options))
 
 
 def test_it_cannot_be_declared_without_a_calibrated_camera(tmp_path):
