@@ -20,7 +20,7 @@ from dlo_casadi.equilibrium import (
     solve_equilibrium,
 )
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.estimation.chords import line_headings
+from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.model import CableModel
@@ -37,7 +37,7 @@ class Prediction:
     equilibrium : Equilibrium
     curve : NodeCurve
         As the camera would see it.
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
         Rest curvature that the pose finds.
     """
 
@@ -78,10 +78,10 @@ def predict_poses(
     Parameters
     ----------
     p : (n_parameters,)
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
         Before the first pose.
-    starts : sequence of (n_nodes,) [rad] or None, optional
-        Headings from which a pose is solved instead, whichever branch that leads to.
+    starts : sequence of (n_nodes, coordinates) or None, optional
+        Nodes from which a pose is solved instead, whichever branch that leads to.
     """
     out: list[Prediction | None] = []
     last: tuple[Pose, FloatArray] | None = None
@@ -90,11 +90,11 @@ def predict_poses(
             if start is None and last is not None and pose.branch == "previous":
                 eq = continued(model, p, rest, pose, *last)
             else:
-                eq = solve_equilibrium(model, p, rest, pose, phi_init=start)
+                eq = solve_equilibrium(model, p, rest, pose, x_init=start)
         except EquilibriumError:
             out.append(None)
             continue
-        last = pose, eq.phi
+        last = pose, eq.x
         shapes, given = eq.shapes, Given.of(p, rest, pose.vector[None])
         z = model.assembly.curve(shapes, given)[0]
         out.append(Prediction(eq, NodeCurve.of(model.cable.length, z), rest))
@@ -116,7 +116,7 @@ def measured_elsewhere(
     and the measured one where it is nearer to the points.
     """
     starts = [
-        line_headings(item.points, item.pose, model.chain, item.places(model.cable.length))
+        line_nodes(item.points, item.pose, model.chain, item.places(model.cable.length))
         if item.readable
         else None
         for item in measured
@@ -128,7 +128,7 @@ def measured_elsewhere(
         and known is not None
         and found is not None
         and found.equilibrium.stable
-        and not _same(known.equilibrium, found.equilibrium)
+        and not model.node.same(known.equilibrium.x, found.equilibrium.x, NEARBY)
         and _square(found, item) < _square(known, item)
         else None
         for item, known, found in zip(measured, predictions, solved, strict=True)
@@ -152,20 +152,13 @@ def measured_branches(
             branch = MeasuredBranch(found, _name_of(model, p, item.pose, found, last))
         out.append(branch)
         there = found or known
-        last = last if there is None else (item.pose, there.equilibrium.phi)
+        last = last if there is None else (item.pose, there.equilibrium.x)
     return out
 
 
 def _square(prediction: Prediction, item: MeasuredPose) -> float:
     """Mean square distance [m^2] of measured points to a prediction."""
     return float((item.distances(prediction.curve) ** 2).mean())
-
-
-def _same(one: Equilibrium, other: Equilibrium) -> bool:
-    """Whether two equilibria are one; headings may differ by full turns of the whole cable."""
-    gap = one.phi - other.phi
-    gap = gap - 2 * np.pi * np.round(gap.mean() / (2 * np.pi))
-    return bool(np.abs(gap).max() < NEARBY)
 
 
 def _name_of(
@@ -177,19 +170,20 @@ def _name_of(
 ) -> PoseBranch | None:
     """The branch that a pose has to name for an equilibrium to be predicted.
 
-    `last` is the pose before it and its headings (n_nodes,), as measured.
+    `last` is the pose before it and its nodes (n_nodes, coordinates), as measured.
     """
-    names: tuple[Branch, Branch] = ("ccw", "cw")
+    names: tuple[Branch, ...] = () if model.in_space else ("ccw", "cw")
     for name in names:
         try:
             eq = solve_equilibrium(model, p, found.rest, replace(pose, branch=name))
         except EquilibriumError:
             continue
-        if _same(eq, found.equilibrium):
+        if model.node.same(eq.x, found.equilibrium.x, NEARBY):
             return name
     if last is not None:
         with suppress(EquilibriumError):
-            if _same(continued(model, p, found.rest, pose, *last), found.equilibrium):
+            eq = continued(model, p, found.rest, pose, *last)
+            if model.node.same(eq.x, found.equilibrium.x, NEARBY):
                 return "previous"
     return None
 
