@@ -148,6 +148,8 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
                 )
         if held.end != "free" and pose.end is None:
             wrong(f"a {held.end} end needs its position: end: {_axes(experiment)}")
+        if pose.branch == "previous" and i == 0:
+            wrong("the first pose continues none; branch: ccw or cw?", key="branch")
         if held.end == "free":
             for key in ("end", "end_heading", "end_orientation"):
                 if getattr(pose, key) is not None:
@@ -196,7 +198,7 @@ def _frame_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, s
             yield f"a clamped {key} needs a{'n' * (key == 'end')} {key}_heading{how}", None
     if pose.turns and not (space and held.start == held.end == "clamped"):
         yield "turns are of a cable in space that is clamped at both ends", "turns"
-    if pose.branch is not None and space:
+    if pose.branch in ("ccw", "cw") and space:
         yield f"branch: {pose.branch} is of a cable in a plane", "branch"
 
 

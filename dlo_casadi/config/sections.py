@@ -338,8 +338,8 @@ class Pose(Section):
     """Full turns of twist at the end about its x axis, beside the roll nearest to none."""
     role: Literal["fit", "held_out"] = "fit"
     """fit, or held_out to check the prediction."""
-    branch: Literal["ccw", "cw"] | None = None
-    """Which way the cable turns from start to end, where several equilibria exist."""
+    branch: Literal["ccw", "cw", "previous"] | None = None
+    """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
 
     @property
     def name(self) -> str:
