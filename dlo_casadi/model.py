@@ -714,6 +714,12 @@ class CableModel:
         return self._here("slot", self._slot_arguments, outputs)
 
     @cached_property
+    def slot_slope(self) -> ca.Function:
+        """As `slot` -> its gradient alone, for a small part of the operations."""
+        gradient = ca.gradient(self._terms.lagrangian, self._by_slot)
+        return self._here("slot_slope", self._slot_arguments, [self._to_local.T @ gradient])
+
+    @cached_property
     def at_ends(self) -> ca.Function:
         """(x, lam, p, pose, deviation) of the first and last node -> as `slot`."""
         hessian, gradient = ca.hessian(self._at_ends, self._by_ends)
