@@ -1,10 +1,11 @@
-"""Centre-lines as CSV files: points along a cable in metres, from its start to its end."""
+"""Lines and markers as CSV files: points along a cable in metres, from its start to its end."""
 
 from __future__ import annotations
 
 import csv
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from dlo_casadi.config.problems import show
 from dlo_casadi.durable import write_file
 from dlo_casadi.errors import MeasurementError
 
-HEADER = ["x_m", "y_m"]
+AXES = ["x_m", "y_m", "z_m"]
+PLACE = "s_m"
 
 _LONGEST = 100.0
 """Length of a centre-line [m] from which on it is not in metres."""
@@ -25,64 +27,103 @@ _LARGEST = 20_000_000
 _SAME_POINT = 1e-9
 """Distance [m] below which two points in a row are one."""
 
+_COUNTS = {2: "two", 3: "three", 4: "four"}
 
-def read_centerline(
+
+@dataclass(frozen=True)
+class MeasuredPoints:
+    """Points (K, d) [m] from start to end; of markers also the arc lengths `s` (K,) [m]."""
+
+    points: npt.NDArray[np.float64]
+    s: npt.NDArray[np.float64] | None = None
+
+
+def read_points(
     path: str | Path,
     start: Sequence[float],
     end: Sequence[float] | None = None,
-) -> npt.NDArray[np.float64]:
-    """Read a measured centre-line and put it in order.
+    length: float = math.inf,
+) -> MeasuredPoints:
+    """Read a measured line, or markers at known arc lengths, and put them in order.
 
     Parameters
     ----------
     path : str or Path
-        CSV file with the header `x_m,y_m`; one point a line, in order along the cable [m].
-    start : (2,) [m]
-        Where the start of the cable is held.
-    end : (2,) [m], optional
+        CSV file, one point a line [m]. With the header `x_m,y_m` (in space `x_m,y_m,z_m`) a line,
+        in order along the cable; with `s_m,x_m,y_m` (`s_m,x_m,y_m,z_m`) markers at the arc length
+        s_m from the start.
+    start : (d,) [m]
+        Where the start of the cable is held, d = 2 or 3.
+    end : (d,) [m], optional
         Where its end is held.
+    length : float [m]
+        Of the cable: no marker lies beyond it.
 
     Returns
     -------
-    points : (K, 2) [m]
-        From start to end, K >= 2, without repeated points. A file that runs from end to start is
+    MeasuredPoints
+        From start to end, K >= 2, without repeated points. A line that runs from end to start is
         put right: the first point is the one nearer to `start` (with `end` given, the order with
         the smaller sum of both distances, which also tells the order of a part of a loop).
 
     Raises
     ------
     MeasurementError
-        If the file cannot be read as a centre-line; the message names the file and the line.
+        If the file cannot be read so; the message names the file and the line.
     """
     source = Path(path)
-    points = _parse(source)
-    if len(points) == 0:
+    table, marked = _parse(source, len(start))
+    if len(table) == 0:
         raise MeasurementError("has a header but no points", pose=source.name)
+    if marked:
+        return _markers(source, table, length)
+    step = np.linalg.norm(np.diff(table, axis=0), axis=1)
+    points = table[np.concatenate(([True], step > _SAME_POINT))]
+    _check_points(source, points)
+    return MeasuredPoints(points[::-1].copy() if _runs_backwards(points, start, end) else points)
 
-    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    points = points[np.concatenate(([True], step > _SAME_POINT))]
-    if len(points) == 1:
+
+def _markers(source: Path, table: npt.NDArray[np.float64], length: float) -> MeasuredPoints:
+    """Markers in the order of their arc lengths, the first column."""
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    s, points = table[:, 0], table[:, 1:]
+    twice = s[1:][np.diff(s) <= _SAME_POINT]
+    if len(twice):
+        raise MeasurementError(f"{PLACE} {twice[0]:g} m stands twice", pose=source.name)
+    outside = s[(s < 0) | (s > length + _SAME_POINT)]
+    if len(outside):
         raise MeasurementError(
-            "holds one point only; a centre-line takes two or more", pose=source.name
+            f"{PLACE} {outside[0]:g} m is not between 0 and cable.length {length:g} m: arc length "
+            "from the start, in metres?",
+            pose=source.name,
         )
-    if step.sum() > _LONGEST:
+    _check_points(source, points)
+    return MeasuredPoints(points, s)
+
+
+def _check_points(source: Path, points: npt.NDArray[np.float64]) -> None:
+    """Raise if there are too few points, or if they are not in metres."""
+    if len(points) == 1:
+        raise MeasurementError("holds one point only; a pose takes two or more", pose=source.name)
+    along = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    if along > _LONGEST:
         raise MeasurementError(
-            f"the centre-line is {step.sum():.4g} m long: are the points in metres? If "
+            f"the centre-line is {along:.4g} m long: are the points in metres? If "
             "they are in millimetres, divide them by 1000",
             pose=source.name,
         )
-    return points[::-1].copy() if _runs_backwards(points, start, end) else points
 
 
-def write_centerline(path: str | Path, points: npt.ArrayLike) -> None:
-    """Write a centre-line as CSV, whole or not at all.
+def write_points(path: str | Path, points: npt.ArrayLike, s: npt.ArrayLike | None = None) -> None:
+    """Write a line, or markers at arc lengths s, as CSV, whole or not at all.
 
     Parameters
     ----------
     path : str or Path
         The file; an older one is replaced only once the new one is complete.
-    points : (K, 2) [m]
-        From start to end.
+    points : (K, d) [m]
+        From start to end, d = 2 or 3.
+    s : (K,) [m], optional
 
     Raises
     ------
@@ -93,18 +134,22 @@ def write_centerline(path: str | Path, points: npt.ArrayLike) -> None:
     """
     target = Path(path)
     array = np.asarray(points, dtype=float)
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise MeasurementError(f"points of shape {array.shape}; (K, 2) expected", pose=target.name)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise MeasurementError(
+            f"points of shape {array.shape}; (K, 2) or (K, 3) expected", pose=target.name
+        )
     if not np.all(np.isfinite(array)):
         bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise MeasurementError(f"point {bad} is {array[bad]}, not finite", pose=target.name)
-
-    lines = [",".join(HEADER), *(f"{x!r},{y!r}" for x, y in array.tolist())]
+    header = AXES[: array.shape[1]]
+    if s is not None:
+        header, array = [PLACE, *header], np.column_stack([np.asarray(s, dtype=float), array])
+    lines = [",".join(header), *(",".join(map(repr, row)) for row in array.tolist())]
     write_file(target, "\n".join(lines) + "\n")
 
 
-def _parse(source: Path) -> npt.NDArray[np.float64]:
-    """Read header and numbers; (K, 2) with K >= 0."""
+def _parse(source: Path, dimension: int) -> tuple[npt.NDArray[np.float64], bool]:
+    """Read header and numbers (K, columns), K >= 0, and whether arc lengths are the first."""
     try:
         with source.open("rb") as file:
             content = file.read(_LARGEST + 1)
@@ -125,26 +170,31 @@ def _parse(source: Path) -> npt.NDArray[np.float64]:
             cells = next(csv.reader([line]), [])
         except csv.Error as error:
             raise MeasurementError(
-                f"line {number}: {error}; two numbers x,y belong here", pose=source.name
+                f"line {number}: {error}; one point a line belongs here", pose=source.name
             ) from None
         if any(cell.strip() for cell in cells) or len(cells) > 1:
             rows.append((number, [cell.strip() for cell in cells]))
+    axes = AXES[:dimension]
+    line, markers = ",".join(axes), ",".join([PLACE, *axes])
     if not rows:
-        raise MeasurementError("is empty; a header x_m,y_m and points belong here", source.name)
+        raise MeasurementError(f"is empty; a header {line} and points belong here", source.name)
     number, header = rows[0]
-    if header != HEADER:
+    if header not in (axes, [PLACE, *axes]):
         raise MeasurementError(
-            f"line {number}: the header must be x_m,y_m (metres), found {show(lines[number - 1])}",
+            f"line {number}: the header must be {line} (metres), or {markers} of markers at known "
+            f"arc lengths, found {show(lines[number - 1])}",
             pose=source.name,
         )
-    return np.array([_point(source, *row) for row in rows[1:]]).reshape(-1, 2)
+    table = [_numbers(source, *row, header) for row in rows[1:]]
+    return np.array(table).reshape(-1, len(header)), header[0] == PLACE
 
 
-def _point(source: Path, number: int, cells: list[str]) -> tuple[float, float]:
-    if len(cells) != 2:
+def _numbers(source: Path, number: int, cells: list[str], header: list[str]) -> list[float]:
+    if len(cells) != len(header):
+        names = ",".join(name.removesuffix("_m") for name in header)
         raise MeasurementError(
-            f"line {number}: two numbers x,y belong here, found {len(cells)}: "
-            f"{show(','.join(cells))}",
+            f"line {number}: {_COUNTS[len(header)]} numbers {names} belong here, found "
+            f"{len(cells)}: {show(','.join(cells))}",
             pose=source.name,
         )
     values = []
@@ -161,7 +211,7 @@ def _point(source: Path, number: int, cells: list[str]) -> tuple[float, float]:
                 "were not measured, gaps are allowed",
                 pose=source.name,
             )
-    return values[0], values[1]
+    return values
 
 
 def _runs_backwards(

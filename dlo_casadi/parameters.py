@@ -34,8 +34,6 @@ class Parameter:
         natural logarithm if `log`].
     log : bool
         Estimated as its natural logarithm (positive, uncertain by decades).
-    scan : bool
-        A place along the cable, tried on a grid before it is refined.
     """
 
     name: str
@@ -46,7 +44,6 @@ class Parameter:
     upper: float = inf
     prior_std: float = inf
     log: bool = False
-    scan: bool = False
 
     def __post_init__(self) -> None:
         if not (isfinite(self.scale) and self.scale > 0):

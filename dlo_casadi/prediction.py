@@ -16,7 +16,7 @@ from dlo_casadi.assembly import Given
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium import Branch, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.model import CableModel
 from dlo_casadi.report.drawing import prediction_figure
 from dlo_casadi.report.notebook import shape_html, shape_text

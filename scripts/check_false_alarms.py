@@ -26,8 +26,9 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.durable import write_file
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
@@ -81,7 +82,7 @@ def simulate(config, generator):
         s = np.sort(generator.uniform(0.01, 0.99, 200)) * cable.length
         factor = np.linalg.cholesky(noise.covariance(s, np.ones(len(s))))
         points = curve.at(s) + factor @ generator.standard_normal((len(s), 2))
-        measured.append(MeasuredPose(own, points, held_out=pose.role == "held_out"))
+        measured.append(MeasuredPose.of_points(own, points, held_out=pose.role == "held_out"))
     return measured
 
 

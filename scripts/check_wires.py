@@ -18,7 +18,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from dlo_casadi.config import load_config
-from dlo_casadi.estimation.observation import chord_places
 from dlo_casadi.session import run_session
 from dlo_casadi.session.measure import read_poses
 
@@ -30,7 +29,7 @@ def floor(measured, k: int, length: float) -> float:
     grid = np.linspace(0.0, 1.0, 101) * length
     curves = []
     for item in measured:
-        places = np.maximum.accumulate(chord_places(item, length))
+        places = np.maximum.accumulate(item.places(length))
         curves.append(np.stack([np.interp(grid, places, item.points[:, i]) for i in (0, 1)], 1))
     mean = np.mean([curve for i, curve in enumerate(curves) if i != k], axis=0)
     gap = measured[k].points[:, None] - mean[None]

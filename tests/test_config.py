@@ -360,12 +360,24 @@ def test_a_declared_effect_lies_within_its_own_bounds(tmp_path, effect, paramete
     assert f"{effect}.{parameter.split(':')[0]}: {message}" in str(caught.value)
 
 
+def load_for_all(folder: Path, options: str) -> Config:
+    """Load a session in which every effect can act: clamps, a calibrated camera."""
+    return load(
+        folder,
+        ("{start: pinned, end: pinned}", "{start: clamped, end: clamped}"),
+        ("start: [0, 0]", "start: [0, 0], start_heading: 0, end_heading: 0"),
+        ("{kind: centerlines, std: 3e-4}", f"{{kind: images, {CAMERA}, {BOARD}}}"),
+        (".csv", ".jpg"),
+        text=GOOD + options,
+    )
+
+
 @pytest.mark.parametrize("name", EFFECTS)
 def test_no_parameter_of_an_effect_takes_any_number(tmp_path, name):
     for q in EFFECTS[name]().parameters(Cable(0.8, 0.23, 0.0128, 0.6)):
         options = f"model: {{effects: [{{name: {name}, parameters: {{{q.name}: 1e300}}}}]}}\n"
         with pytest.raises(ConfigError, match=rf"{name}.{q.name}: 1e\+300.* is possible"):
-            load(tmp_path, text=GOOD + options)
+            load_for_all(tmp_path, options)
 
 
 @pytest.mark.parametrize(
@@ -409,9 +421,38 @@ def test_names_that_no_file_system_takes(tmp_path):
 
 
 def test_every_effect_can_be_declared(tmp_path):
-    names = ", ".join(EFFECTS)
-    config = load(tmp_path, text=f"{GOOD}model: {{effects: [{names}]}}\n")
+    config = load_for_all(tmp_path, f"model: {{effects: [{', '.join(EFFECTS)}]}}\n")
     assert [item.name for item in config.model.effects] == list(EFFECTS)
+
+
+@pytest.mark.parametrize(
+    ("effect", "message"),
+    [
+        ("clamp_angle", r"clamp_angle: it turns a clamp, .* Try: experiment\.boundary"),
+        ("standoff_error", r"standoff_error: .* calibrated camera, .* Try: measurement\.camera"),
+        (
+            "{name: stiff_section, parameters: {start: 0.5, end: 0.3}}",
+            r"stiff_section: it starts at 0\.5 m and ends at 0\.3 m .* Try: start smaller than end",
+        ),
+        # The other end is where it is without being declared, 0.36 m of 0.8 m.
+        ("{name: stiff_section, parameters: {end: 0.3}}", r"starts at 0\.36 m and ends at 0\.3 m"),
+    ],
+)
+def test_an_effect_that_cannot_act_as_declared_is_refused_by_name(tmp_path, effect, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        load(tmp_path, text=f"{GOOD}model:\n  effects:\n    - {effect}\n")
+    assert caught.value.line == 17
+
+
+def test_a_parameter_of_an_end_that_is_not_clamped_is_unknown(tmp_path):
+    effect = "{name: clamp_angle, parameters: {start_heading_error: 0.1}}"
+    with pytest.raises(ConfigError, match="no parameter 'start_heading_error'; did you mean 'end_"):
+        load(
+            tmp_path,
+            ("end: pinned", "end: clamped"),
+            ("start: [0, 0]", "start: [0, 0], end_heading: 0"),
+            text=f"{GOOD}model: {{effects: [{effect}]}}\n",
+        )
 
 
 def test_headings_follow_the_boundary(tmp_path):

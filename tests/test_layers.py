@@ -6,19 +6,21 @@ from pathlib import Path
 
 import pytest
 
+from dlo_casadi.effects import EFFECTS, NUISANCES
+
 PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-CHAIN = ["errors", "parameters", "rod", "rest", "effects", "assembly", "model", "whole_pose"]
-CHAIN += ["initial", "equilibrium"]
+CHAIN = ["errors", "thresholds", "parameters", "rod", "rest", "effects", "assembly", "model"]
+CHAIN += ["whole_pose", "initial", "equilibrium"]
 MECHANICS = set(CHAIN)
 PARALLEL = {"executors", "parallel"}
 
 # layer -> what it may import beside itself. A new module gets its line here.
 MAY_IMPORT: dict[str, set[str]] = {
     **{layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)},
-    "assembly": {*CHAIN[:5], "model"},  # the model only for its type
-    "config": {"errors", "parameters", "effects"},
+    "assembly": {*CHAIN[:6], "model"},  # the model only for its type
+    "config": {"errors", "thresholds", "parameters", "rod", "effects"},
     "durable": {"errors"},
     "measurements": {"errors", "config", "durable"},
     "vision": {"errors", "durable"},
@@ -80,6 +82,20 @@ def test_a_library_with_one_place(library, layer):
     users = {name(f) for f in FILES if any(m.split(".")[0] == library for m in imports(f))}
     assert users, f"nothing imports {library}"
     assert all(user.startswith(f"{layer}/") or user == f"{layer}.py" for user in users), users
+
+
+def test_effects_are_named_by_themselves_alone():
+    """A new effect is its file and one line in EFFECTS."""
+    kinds = {**EFFECTS, **NUISANCES}
+    names = {*kinds, *(kind.__name__ for kind in kinds.values())}
+    for file in FILES:
+        if layer_of(file) == "effects":
+            continue
+        for node in ast.walk(ast.parse(file.read_text())):
+            said = [node.value] if isinstance(node, ast.Constant) else []
+            if isinstance(node, ast.ImportFrom):
+                said = [alias.name for alias in node.names]
+            assert names.isdisjoint(said), f"{name(file)}: {said}"
 
 
 def test_only_the_commands_print_or_exit():

@@ -10,7 +10,7 @@ import pytest
 
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml, read_yaml
-from dlo_casadi.measurements import read_centerline, write_centerline
+from dlo_casadi.measurements import read_points, write_points
 
 ROOT = Path(__file__).parents[1]
 BENCH = ROOT / "tests/data/bench"
@@ -28,16 +28,16 @@ class Session:
             file = source.parent / pose["file"]
             pose["file"] = file.name
             if file.suffix == ".csv":
-                points = read_centerline(file, pose["start"], pose.get("end"))
-                write_centerline(folder / file.name, points)
+                points = read_points(file, pose["start"], pose.get("end")).points
+                write_points(folder / file.name, points)
             else:
                 (folder / file.name).write_bytes(file.read_bytes())
 
     def points(self, change: Callable[[np.ndarray], np.ndarray]) -> None:
         """Change the points of all centre-lines."""
         for pose in self.poses:
-            points = read_centerline(self.folder / pose["file"], (0, 0))
-            write_centerline(self.folder / pose["file"], change(points))
+            points = read_points(self.folder / pose["file"], (0, 0)).points
+            write_points(self.folder / pose["file"], change(points))
 
     def image(self, change: Callable[[np.ndarray], np.ndarray]) -> None:
         """Change all photographs."""
@@ -320,7 +320,7 @@ MISTAKES: list[tuple[Callable[[Path], Session], list[str]]] = [
     (photographs_one_further, ["pose_02 shows the ends of pose_03", "in step"]),
     (start_and_end_exchanged, ["pose_05: its end (0, 0) m", "are start and end exchanged?"]),
     (text_in_a_file("x_m,y_m\n0,0\n0.1,nan\n"), ["line 3: 'nan' is not a finite number", "gaps"]),
-    (text_in_a_file("x_m,y_m\n0,0\n"), ["holds one point only; a centre-line takes two"]),
+    (text_in_a_file("x_m,y_m\n0,0\n"), ["holds one point only; a pose takes two"]),
     (text_in_a_file("x,y\n0,0\n1,0\n"), ["the header must be x_m,y_m (metres)"]),
     (the_same_file_twice, ["is called 'pose_02' too", "give each its own"]),
     (a_copied_file, ["pose_04 holds exactly the points of pose_02", "under two names?"]),

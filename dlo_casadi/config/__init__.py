@@ -4,6 +4,7 @@ The only package that imports yaml. All units are SI. Every problem of a file is
 each with its line.
 """
 
+from dlo_casadi.config.declared_effects import declared_setup, wrong_effects
 from dlo_casadi.config.document import dump_yaml, read_document, read_yaml
 from dlo_casadi.config.limits import (
     MESH,
@@ -12,7 +13,7 @@ from dlo_casadi.config.limits import (
     implausible_gravity,
     implausible_sizes,
 )
-from dlo_casadi.config.load import load_config, unknown_effect
+from dlo_casadi.config.load import load_config
 from dlo_casadi.config.problems import Place, show
 from dlo_casadi.config.sections import (
     Board,
@@ -56,6 +57,7 @@ __all__ = [
     "Reference",
     "SkippedPose",
     "Tolerances",
+    "declared_setup",
     "dump_yaml",
     "implausible_gravity",
     "implausible_sizes",
@@ -63,5 +65,5 @@ __all__ = [
     "read_document",
     "read_yaml",
     "show",
-    "unknown_effect",
+    "wrong_effects",
 ]

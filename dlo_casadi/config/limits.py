@@ -11,12 +11,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from dlo_casadi.config.problems import Place, Problem
-from dlo_casadi.effects import EFFECTS, ClampAngle, Effect, EndOffset, ImageScale, LengthError
+from dlo_casadi.effects import EFFECTS
 from dlo_casadi.effects import Cable as EffectsCable
 from dlo_casadi.parameters import STIFFNESS_BOUNDS
 
 if TYPE_CHECKING:
-    from dlo_casadi.config.sections import Experiment, File
+    from dlo_casadi.config.sections import Experiment
 
 
 class Range(NamedTuple):
@@ -72,15 +72,6 @@ MESH = Range(2, 2000, "elements")
 # Cubic splines need four coefficients. A line of 240 points has four between two knots of 64; the
 # covariance that a result holds grows with their square.
 REST_COEFFICIENTS = Range(4, 64, "coefficients")
-
-# Tolerance -> the parameter that takes it up. It must leave the parameter within its bounds, or
-# these, and not the tolerance, decide.
-_TAKEN_UP: dict[str, tuple[Effect, str, str]] = {
-    "length": (LengthError(), "length_difference", "m"),
-    "end": (EndOffset(), "dx", "m"),
-    "heading": (ClampAngle(), "start_heading_error", "rad"),
-    "scale": (ImageScale(), "factor", ""),
-}
 
 
 def implausible_sizes(
@@ -140,12 +131,8 @@ def implausible_camera(
     return problems + [p for k in distortion for p in DISTORTION.problems(("distortion",), k)]
 
 
-def impossible_values(file: File) -> list[Problem]:
-    """Find what lies beyond the ranges above, and values of effects beyond their bounds."""
-    return [*_of_experiment(file.experiment, file.cable.length), *_of_effects(file)]
-
-
-def _of_experiment(experiment: Experiment, length: float) -> Iterator[Problem]:
+def impossible_values(experiment: Experiment, length: float) -> Iterator[Problem]:
+    """Find what lies beyond the ranges above, for a cable of that length [m]."""
     at = ("experiment",)
     for place, message in implausible_gravity(experiment.gravity):
         yield Problem((*at, *place), f"gravity: {message}")
@@ -155,11 +142,17 @@ def _of_experiment(experiment: Experiment, length: float) -> Iterator[Problem]:
             (*at, "measurement", "std"), std, "; without it, it is estimated from the data"
         ):
             yield Problem(place, f"std: {message}")
+    # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
     cable = EffectsCable(length, 1.0, 1.0, 1.0)
-    for key, (effect, name, unit) in _TAKEN_UP.items():
-        (q,) = (q for q in effect.parameters(cable) if q.name == name)
+    taken_up = {
+        kind.tolerances[q.name]: q
+        for kind in EFFECTS.values()
+        for q in kind().parameters(cable)
+        if q.name in kind.tolerances
+    }
+    for key, q in taken_up.items():
         most = min(q.upper - q.nominal, q.nominal - q.lower)
-        for place, message in Range(_FINEST_TOLERANCE, most, unit).problems(
+        for place, message in Range(_FINEST_TOLERANCE, most, q.unit).problems(
             (*at, "tolerances", key), getattr(experiment.tolerances, key)
         ):
             yield Problem(place, f"tolerances.{key}: {message}")
@@ -168,19 +161,3 @@ def _of_experiment(experiment: Experiment, length: float) -> Iterator[Problem]:
             for k, value in enumerate(getattr(pose, key) or ()):
                 for place, message in COORDINATE.problems((*at, "poses", i, key, k), value):
                     yield Problem(place, f"pose {i + 1} ({pose.file.name}) {key}: {message}")
-
-
-def _of_effects(file: File) -> Iterator[Problem]:
-    cable = EffectsCable(
-        file.cable.length, file.cable.mass, file.cable.diameter, file.cable.prior_bending_stiffness
-    )
-    for i, item in enumerate(file.model.effects):
-        if item.name not in EFFECTS:
-            continue
-        for q in EFFECTS[item.name]().parameters(cable):
-            if q.name not in item.parameters:
-                continue
-            for place, message in Range(*q.range, q.unit).problems(
-                ("model", "effects", i, "parameters", q.name), item.parameters[q.name].value
-            ):
-                yield Problem(place, f"model.effects: {item.name}.{q.name}: {message}")

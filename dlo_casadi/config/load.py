@@ -10,10 +10,11 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from dlo_casadi.config.declared_effects import wrong_effects
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.explain import explain
 from dlo_casadi.config.limits import impossible_values
-from dlo_casadi.config.problems import Problem, did_you_mean, kind_of, show
+from dlo_casadi.config.problems import Problem, kind_of, show
 from dlo_casadi.config.sections import (
     Cable,
     Config,
@@ -23,9 +24,8 @@ from dlo_casadi.config.sections import (
     SkippedPose,
     Tolerances,
 )
-from dlo_casadi.effects import EFFECTS
-from dlo_casadi.effects import Cable as EffectsCable
 from dlo_casadi.errors import ConfigError
+from dlo_casadi.rod.chain import ELEMENTS
 
 
 def load_config(path: str | Path) -> Config:
@@ -63,8 +63,8 @@ def load_config(path: str | Path) -> Config:
 
     if problems := [
         *_contradictions(file.experiment),
-        *_unknown_effects(file),
-        *impossible_values(file),
+        *wrong_effects(file),
+        *impossible_values(file.experiment, file.cable.length),
     ]:
         raise document.error(problems)
 
@@ -102,9 +102,9 @@ _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 # Results are named after a pose, with up to forty characters more; file systems take 255 bytes.
 _LONGEST_NAME = 200
 
-# The mesh that is chosen from the data has 20 elements at least, which error and time suggest:
-# quadratic ones converge with the fourth order, the others with the second.
-_COARSE = {"quadratic": 10, "arc": 20, "link": 20}
+# The mesh that is chosen from the data has 20 elements at least, which error and time suggest. By
+# the order with which elements converge.
+_COARSE = {4: 10, 2: 20}
 # And it has 160 at most.
 _FINE = 160
 # Seconds of COBYLA for one pose: measured 1 for 10 links, 4 for 20; it grows with the square.
@@ -159,36 +159,6 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
     if not any(pose.role == "fit" for pose in experiment.poses):
         at = ("experiment", "poses")
         problems.append(Problem(at, "no pose has role: fit, there is nothing to fit to"))
-    return problems
-
-
-def unknown_effect(name: str) -> str | None:
-    """What is wrong with the name of an effect, if no effect is called so."""
-    return None if name in EFFECTS else f"no effect is called {name!r}{did_you_mean(name, EFFECTS)}"
-
-
-def _unknown_effects(file: File) -> list[Problem]:
-    """Find names of effects, and of their parameters, that do not exist."""
-    problems: list[Problem] = []
-    cable = EffectsCable(
-        file.cable.length, file.cable.mass, file.cable.diameter, file.cable.prior_bending_stiffness
-    )
-    for i, item in enumerate(file.model.effects):
-        if (wrong := unknown_effect(item.name)) is not None:
-            problems.append(Problem(("model", "effects", i, "name"), f"model.effects: {wrong}"))
-            continue
-        known = [q.name for q in EFFECTS[item.name]().parameters(cable)]
-        problems += [
-            Problem(
-                ("model", "effects", i, "parameters", name),
-                f"model.effects: {item.name} has no parameter {name!r}{did_you_mean(name, known)}",
-            )
-            for name in item.parameters
-            if name not in known
-        ]
-    for i, name in enumerate(file.diagnosis.exclude):
-        if (wrong := unknown_effect(name)) is not None:
-            problems.append(Problem(("diagnosis", "exclude", i), f"diagnosis.exclude: {wrong}"))
     return problems
 
 
@@ -273,7 +243,7 @@ def _oddities(file: File) -> list[str]:
     if std is not None and std > 0.02 * cable.length:
         warnings.append(f"std {std:g} m is large for a cable of {cable.length:g} m: in metres?")
     n, element, links = file.model.n, file.model.element, file.estimation.algorithm1_n
-    if n is not None and n < _COARSE[element]:
+    if n is not None and n < _COARSE[ELEMENTS[element].order]:
         warnings.append(
             f"model.n: {n} {element} elements are so coarse that the mesh's own error can look "
             "like a missing effect. Without model.n the mesh is chosen from the data"

@@ -31,6 +31,7 @@ from dlo_casadi.config.limits import (
 )
 from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean, show
 from dlo_casadi.errors import well_formed
+from dlo_casadi.thresholds import SIGNIFICANCE
 
 
 def _optional(section: type[Section]) -> BeforeValidator:
@@ -401,7 +402,7 @@ class DiagnosisOptions(Section):
     """Whether missing effects are searched for."""
     exclude: tuple[str, ...] = ()
     """Names of effects that are not tried."""
-    significance: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)] = 0.005
+    significance: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)] = SIGNIFICANCE
     """Largest p-value with which an effect is added."""
     max_effects: Annotated[int, Field(strict=True, ge=0)] = 4
     """Largest number of effects that are added."""

@@ -46,7 +46,7 @@ _IMAGES = """\
 """
 
 _CENTERLINES = """\
-  measurement: {kind: centerlines}   # CSV files with the header x_m,y_m; or kind: images
+  measurement: {kind: centerlines}   # CSV files, x_m,y_m or s_m,x_m,y_m; or kind: images
 """
 
 _POSES = """\

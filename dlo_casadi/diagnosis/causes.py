@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.confirm import Confirmed
-from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.pull import Pull
 from dlo_casadi.diagnosis.screening import Screened
-from dlo_casadi.effects import Load
+from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
@@ -28,36 +27,27 @@ FloatArray = NDArray[np.floating]
 MOST_STEPS = 60
 
 
-def is_local_load(candidate: Candidate) -> bool:
-    """Whether the candidate is a load at one place of the cable."""
-    own = {name.split(".")[-1] for name in candidate.frees}
-    return isinstance(candidate.effect, Load) and "position" in own
-
-
 def start_from(pull: Pull, candidate: Candidate) -> dict[str, float]:
     """Qualified parameters of a load at one place that come closest to the forces of a pull."""
     fit, model = pull.fit, pull.fit.model
     effect = candidate.effect.linear()
-    assert isinstance(effect, Load)
-    prefix = f"{effect.label}."
-    point = ca.SX.sym("r", 2)
+    assert isinstance(effect, PointLoad)
+    place = ca.SX.sym("r", len(model.gravity))
     names = [q.name for q in effect.parameters(model.cable) if q.name != "position"]
     linear = ca.SX.sym("linear", len(names))
     params = {name: linear[k] for k, name in enumerate(names)} | {"position": ca.SX(pull.position)}
-    force = ca.SX.zeros(2)
-    for dead in effect.forces(ca.SX(ca.DM(model.gravity)), params):
-        force += dead.force
-    for spring in effect.springs(params):
-        force -= ca.gradient(spring.energy(point), point)
-    slopes = ca.Function("slopes", [point], [ca.jacobian(force, linear)])
-    curves = fit.problem.curves(fit.point.theta, fit.point.shapes)
-    places = [curves[j].at(np.array([pull.position]))[0] for j in fit.problem.used]
-    arms = np.concatenate([np.array(slopes(place)) for place in places])
+    force = effect.force(place, ca.SX(ca.DM(model.gravity)), params)
+    slopes = ca.Function("slopes", [place], [ca.jacobian(force, linear)])
+    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    places = [seen[j].curve.at(np.array([pull.position]))[0] for j in fit.problem.used]
+    arms = np.concatenate([np.array(slopes(at)) for at in places])
     found = np.linalg.lstsq(arms, pull.force_per_pose.ravel(), rcond=None)[0]
     values = dict(zip(names, map(float, found), strict=True)) | {"position": pull.position}
     own = candidate.effect.of_linear(model.cable, values)
-    bounds = {q.name: (q.lower, q.upper) for q in candidate.effect.parameters(model.cable)}
-    return {prefix + name: float(np.clip(own[name], *bounds[name])) for name in own}
+    return {
+        f"{effect.label}.{q.name}": float(np.clip(own[q.name], q.lower, q.upper))
+        for q in candidate.effect.parameters(model.cable)
+    }
 
 
 def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:
@@ -68,10 +58,9 @@ def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:
     base : Fit
         Without either.
     """
-    candidate = screened.candidate
-    model = candidate.add_to(base.model)
+    model = screened.candidate.add_to(base.model)
     values = pull.fit.values_in(model)
-    for name, value in start_from(pull, candidate).items():
+    for name, value in start_from(pull, screened.candidate).items():
         values[model.names.index(name)] = value
     try:
         fit = fit_model(
@@ -84,6 +73,4 @@ def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:
         )
     except EstimationError:
         return None
-    gain = 2 * (base.point.objective - fit.point.objective)
-    price = len(candidate.frees) * np.log(max(base.problem.n_points, 2))
-    return Confirmed(screened, fit, cross_validate(fit), gain, gain - float(price))
+    return Confirmed.of(screened, base, fit)

@@ -40,6 +40,13 @@ class Confirmed:
     gain: float
     bic: float
 
+    @classmethod
+    def of(cls, screened: Screened, base: Fit, fit: Fit) -> Confirmed:
+        """Compare a fit with a candidate with the base, the fit without it."""
+        gain = 2 * (base.point.objective - fit.point.objective)
+        price = float(len(screened.candidate.frees) * np.log(max(base.problem.n_residuals, 2)))
+        return cls(screened, fit, cross_validate(fit), gain, gain - price)
+
     @property
     def candidate(self) -> Candidate:
         """The candidate."""
@@ -49,11 +56,7 @@ class Confirmed:
 def confirm(base: Fit, screened: Screened) -> Confirmed | None:
     """Refit with a candidate added; None if no equilibria can be followed to it."""
     fit = refit_with(base, screened)
-    if fit is None:
-        return None
-    gain = 2 * (base.point.objective - fit.point.objective)
-    price = len(screened.candidate.frees) * np.log(max(base.problem.n_points, 2))
-    return Confirmed(screened, fit, cross_validate(fit), gain, gain - float(price))
+    return None if fit is None else Confirmed.of(screened, base, fit)
 
 
 def refit_with(base: Fit, screened: Screened) -> Fit | None:

@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from scipy.stats import ttest_1samp
 
 from dlo_casadi.assembly import Shapes
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
-from dlo_casadi.estimation.observation import NodeCurve
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
+from dlo_casadi.thresholds import CLEARLY_WORSE
 
 FloatArray = NDArray[np.floating]
 
@@ -60,15 +61,15 @@ class CrossValidation:
             return float("inf")
         return float(np.sqrt(self.squares.sum() / self.counts.sum()))
 
-    def clearly_worse_than(self, other: CrossValidation, factor: float = 2.0) -> bool:
-        """Whether the mean paired difference of the folds exceeds its standard error."""
+    def clearly_worse_than(self, other: CrossValidation) -> bool:
+        """Whether the mean paired difference of the folds exceeds its standard error clearly."""
         if not self.complete:
             return True
         gap = self._excess_over(other)
         if len(gap) < 2:
             return bool(gap.sum() > 0)
         error = float(gap.std(ddof=1)) / np.sqrt(len(gap))
-        return bool(gap.mean() > factor * error)
+        return bool(gap.mean() > CLEARLY_WORSE * error)
 
     def chance_of_gain(self, other: CrossValidation) -> float:
         """Probability of a gain as large as that of the other, if it predicts no better.
@@ -108,13 +109,13 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
     squares, counts, complete = [], [], True
     curves = _predicted(fit, thetas, executor or InProcess())
     for j, curve in zip(problem.used, curves, strict=True):
-        points = problem.measured[j].points
-        counts.append(len(points))
+        item = problem.measured[j]
+        counts.append(len(item.points))
         if curve is None:
             complete = False
             squares.append(np.inf)
         else:
-            squares.append(float((curve.distances(points) ** 2).sum()))
+            squares.append(float((item.distances(curve) ** 2).sum()))
     return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)
 
 
@@ -168,7 +169,8 @@ def _stretches(fit: Fit) -> CrossValidation:
     """Cross-validation along the arc of a single pose."""
     problem, lin = fit.problem, fit.linearization
     j = problem.used[0]
-    points = problem.measured[j].points
+    item = problem.measured[j]
+    points = np.arange(len(item.points))
     joint = np.concatenate([lin.by_theta[0], lin.by_deviation[0]], axis=1)
     size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
     prior = np.zeros((size + n_dev, size + n_dev))
@@ -178,8 +180,8 @@ def _stretches(fit: Fit) -> CrossValidation:
     pull = np.concatenate([fit.point.theta - problem.mean, own])
     squares, counts, complete = [], [], True
     sweep = problem.sweep
-    for rows in np.array_split(np.arange(len(points)), STRETCHES):
-        kept = np.setdiff1d(np.arange(len(points)), rows)
+    for left_out in np.array_split(points, min(STRETCHES, len(points))):
+        kept = ~np.isin(item.point_of, left_out)
         a, e = joint[kept], lin.residuals[0][kept]
         hessian = a.T @ a + prior
         hessian += 1e-9 * np.diag(np.diag(hessian)) + NO_INFORMATION * np.eye(len(hessian))
@@ -190,11 +192,11 @@ def _stretches(fit: Fit) -> CrossValidation:
         plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
         p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
         solved, converged = sweep.solve(plain, p, rest)
-        counts.append(len(rows))
+        counts.append(len(left_out))
         if not converged.all():
             squares.append(np.inf)
             complete = False
             continue
         curve = problem.curve_of(sweep.seen(solved, p, rest)[j])
-        squares.append(float((curve.distances(points[rows]) ** 2).sum()))
+        squares.append(float((item.distances(curve)[left_out] ** 2).sum()))
     return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)

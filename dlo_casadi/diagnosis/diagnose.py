@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.diagnosis.candidates import Candidate, candidates
-from dlo_casadi.diagnosis.causes import is_local_load, refit_from
+from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
+from dlo_casadi.diagnosis.causes import refit_from
 from dlo_casadi.diagnosis.confirm import Confirmed, confirm
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.equivalents import untried_equivalents
@@ -26,30 +26,26 @@ from dlo_casadi.diagnosis.structure import (
     screening_degrees,
     structure_of,
 )
+from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.hyperparameters import noise_of, settle
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
+from dlo_casadi.thresholds import (
+    BIC_APART,
+    LEAST_NOISE_DEGREES,
+    LEFT,
+    REFITTED,
+    SIGNIFICANCE,
+    UNSEEN,
+    UNSEEN_LEFT,
+    WORTH,
+)
 
 FloatArray = NDArray[np.floating]
 Verdict = Literal["complete", "effect_found", "unexplained"]
-
-# Candidates that are refitted at most in one step, and the share of the leading score below
-# which one is not worth a refit.
-REFITTED = 6
-WORTH = 0.1
-# A rival whose BIC falls short by more than this is told apart by the data ("very strong",
-# Kass and Raftery 1995), whatever its cross-validated error.
-BIC_APART = 10.0
-# Effects are no explanation if a pose that is left out is predicted worse than so many times the
-# noise, and than half of what it was without them.
-UNSEEN = 2.0
-# Of the mean square error that the declared model makes beyond the noise, what effects beside an
-# unexplained residual may leave. Measured, without their cause: a force for a drift leaves 0.38,
-# a gradient, a scale and an offset for stretch 0.89; softening of a real glass-fibre strip 0.08.
-LEFT = 0.1
 
 
 @dataclass(frozen=True)
@@ -137,7 +133,7 @@ def diagnose(
     *,
     center: tuple[float, float] | None = None,
     exclude: Sequence[str] = (),
-    significance: float = 0.005,
+    significance: float = SIGNIFICANCE,
     max_effects: int = 4,
     step: Callable[[str, int, int], None] = lambda name, done, total: None,
     executor: Executor | None = None,
@@ -174,7 +170,7 @@ def diagnose(
         found = search.with_cause_of(pull, found)
     if found.unexplained and found.added:
         found = search.without_wrong_causes(found, pull)
-        if found.added or not fit.noise.declared:
+        if found.added or not fit.noise.known:
             pull = estimate_pull(found.fit, search.executor)
     tried = {row.name for row in found.ranked}
     added = tuple(
@@ -297,7 +293,7 @@ class _Search:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = _corrected(single, len(screened))
             closed = settle(winner.fit)
-            if not self.declared.noise.declared:
+            if not self.declared.noise.known:
                 again = _p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
             if p_value > self.significance:
@@ -325,10 +321,10 @@ class _Search:
 
         Two free forces in each pose would gain more than their price if the law were wrong.
         """
-        loads = [item for item in screened if is_local_load(item.candidate)]
+        loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
         refit = partial(refit_from, self.declared, pull)
         free = 2 * len(self.declared.problem.used) + 1
-        price = free * np.log(self.declared.problem.n_points)
+        price = free * np.log(self.declared.problem.n_residuals)
         return [
             item
             for item in map_in_order(self.executor, refit, loads)
@@ -337,10 +333,10 @@ class _Search:
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> _Found:
         """What has been found, and whether it explains the data."""
-        if not added and not fit.noise.declared:
+        if not added and not fit.noise.known:
             fit = settle(fit)
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
-        limit = max(UNSEEN * fit.noise.std, self.error / 2)
+        limit = max(UNSEEN * fit.noise.std, UNSEEN_LEFT * self.error)
         unpredicted = bool(added) and validation.rmse > limit
         unexplained = structure.p_value < self.significance or unpredicted
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
@@ -371,7 +367,7 @@ class _Search:
         if alone is None or not self.several:
             return False
         pull = estimate_pull(found.fit, self.executor)
-        n = np.log(self.declared.problem.n_points)
+        n = np.log(self.declared.problem.n_residuals)
         extra = sum(len(item.candidate.frees) for item in found.added) * n
         if pull is None:
             return True
@@ -386,10 +382,15 @@ class _Search:
 def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]) -> list[Screened]:
     """Score tests of all candidates at a fit, best first."""
     problem, shapes = fit.problem, fit.point.shapes
-    directions = (float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean()))
-    bend = float(np.abs(problem.sweep.bends(shapes, fit.p, fit.rest)).max())
-    camera = any(item.pose.camera_center is not None for item in problem.history)
-    listed = candidates(fit.model, center, len(problem.used), exclude, directions, camera, bend)
+    setup = setup_of(
+        fit.model,
+        n_poses=len(problem.used),
+        center=center,
+        camera=any(item.pose.camera_center is not None for item in problem.history),
+        directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
+        largest_bend=float(np.abs(problem.sweep.bends(shapes, fit.p, fit.rest)).max()),
+    )
+    listed = candidates(fit.model, setup, exclude)
     return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
 
 
@@ -419,7 +420,7 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
     other, _ = larger.descend(other)
     gain = max(2 * (point.objective - other.objective), 0.0)
     dof = len(winner.candidate.frees)
-    return _corrected(survival(gain, dof, max(4.0, noise.slow_dof)), tried)
+    return _corrected(survival(gain, dof, max(LEAST_NOISE_DEGREES, noise.slow_dof)), tried)
 
 
 def _improving(
@@ -498,7 +499,7 @@ def prune(fit: Fit, added: list[AddedEffect], significance: float) -> tuple[Fit,
             for item in screen(smaller, None, ())
             if item.candidate.name == effect.candidate.name
         ]
-        price = len(effect.candidate.frees) * np.log(fit.problem.n_points)
+        price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
         gain = 2 * (smaller.point.objective - fit.point.objective)
         if gain < price or (again and again[0].p_value > significance):
             fit = settle(smaller)

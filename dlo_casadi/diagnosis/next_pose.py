@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium import Pose
-from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
 
@@ -29,10 +29,10 @@ class NextPose:
     difference : float [m]
         RMS difference of the two predictions.
     separation : float
-        The same in standard deviations of one measured line, its noise and the correlation along
-        the cable included: sqrt(d^T C^-1 d) with the normal distances d between the predictions
-        at the places of the points that the nearest pose has. What a new fit of either rival
-        could adapt to is not taken off.
+        The same in standard deviations of one measurement, its noise and the correlation along
+        the cable included: sqrt(d^T C^-1 d) with the differences d between the predictions, as
+        the sensors see them, at the places of the points that the nearest pose has. What a new
+        fit of either rival could adapt to is not taken off.
     """
 
     end: tuple[float, float]
@@ -87,9 +87,9 @@ def _separation(fit: Fit, end: FloatArray, curves: tuple[NodeCurve, NodeCurve]) 
     problem = fit.problem
     ends = np.array([problem.measured[j].pose.end for j in problem.used])
     k = int(((ends - end) ** 2).sum(axis=1).argmin())
-    s, weight = fit.point.feet[k], problem.measured[problem.used[k]].relative_std
-    gap = ((curves[0].at(s) - curves[1].at(s)) * curves[0].normals(s)).sum(axis=1)
-    return float(np.linalg.norm(fit.noise.whitening(s, weight) @ gap))
+    s, item = fit.point.feet[k], problem.measured[problem.used[k]]
+    gap = item.components(curves[0], s, (curves[0].at(s) - curves[1].at(s))[..., None])
+    return float(np.linalg.norm(item.whitening(fit.noise, s) @ gap))
 
 
 def _rest_now(fit: Fit) -> FloatArray:

@@ -18,11 +18,11 @@ from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel
 from dlo_casadi.parallel import map_in_order
+from dlo_casadi.thresholds import NORMAL_95
 
 FloatArray = NDArray[np.floating]
 
-# Places kept from the scan for a full fit, and the rise of twice the objective that bounds the
-# interval (95 % of chi-square with one degree of freedom).
+# Places kept from the scan for a full fit.
 TRIED = 3
 PULL_PLACES = tuple(float(share) for share in np.linspace(0.1, 0.9, 9))
 COARSE = 20
@@ -30,7 +30,6 @@ COARSE = 20
 PULL_WEIGHTS = 1.0
 # Gauss-Newton steps along the flat valley of stiffness against force.
 MOST_STEPS = 150
-RISE = 3.84
 
 
 @dataclass(frozen=True)
@@ -90,10 +89,10 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
     if best is None:
         return None
     columns = [DEVIATIONS.index(axis) for axis in effect.per_pose]
-    mean = [best.value(f"{effect.label}.{axis}") for axis in ("fx", "fy")]
+    mean = [best.value(f"{effect.label}.{axis}") for axis in effect.means]
     forces = best.point.shapes.deviation[np.ix_(best.problem.used, columns)] + mean
     position = best.value(name)
-    half = np.sqrt(RISE) * max(best.std(name), 1e-4 * length)
+    half = NORMAL_95 * max(best.std(name), 1e-4 * length)
     interval = (float(max(0.0, position - half)), float(min(length, position + half)))
     gain = 2 * (base.point.objective - best.point.objective)
     return Pull(forces, position, interval, gain, best)

@@ -2,47 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.observation import MeasuredPose, chord_places
+from dlo_casadi.estimation.repeats import repeatability
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import ALIKE, REPEATS
 
 FloatArray = NDArray[np.floating]
-
-# Poses that repeat worse than this many times the noise limit every prediction.
-REPEATS = 1.5
-# Absolute correlation of two nuisances beyond which their effects on the shapes are one.
-ALIKE = 0.9
-
-
-def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | None:
-    """RMS distance [m] of a fit pose from the mean of the others held in the same way.
-
-    The floor of any prediction of the next one; None where no pose was taken twice.
-    """
-    groups: dict[tuple[float, ...], list[FloatArray]] = {}
-    grid = np.linspace(0.02, 0.98, 97) * length
-    for item in measured:
-        if item.readable and not item.held_out:
-            places = np.maximum.accumulate(chord_places(item, length))
-            line = np.stack([np.interp(grid, places, item.points[:, i]) for i in (0, 1)], axis=1)
-            groups.setdefault(tuple(item.pose.ends), []).append(line)
-    squares = []
-    for curves in groups.values():
-        for k, curve in enumerate(curves):
-            others = curves[:k] + curves[k + 1 :]
-            if others:
-                squares.append(((curve - np.mean(others, axis=0)) ** 2).sum(axis=1).mean())
-    return float(np.sqrt(np.mean(squares))) if squares else None
 
 
 def limiting_spread(fit: Fit) -> float | None:
     """How badly the same pose repeats [m], where that is what limits a prediction, else None."""
-    spread = repeatability(fit.problem.measured, fit.model.cable.length)
-    return spread if spread is not None and spread > REPEATS * fit.noise.std else None
+    spread = repeatability(fit.problem.history, fit.model.cable.length)
+    if spread is None or fit.noise.source == "repeats":
+        return spread
+    return spread if spread > REPEATS * fit.noise.std else None
 
 
 def alike(fit: Fit) -> list[tuple[str, ...]]:

@@ -35,15 +35,13 @@ from dlo_casadi.estimation.gauss_newton import (
     Point,
 )
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
+from dlo_casadi.thresholds import COLLINEAR, SCANS_PER_TEST
 
 FloatArray = NDArray[np.floating]
-
-# Directions whose information is below this share of what it was before projection are not
-# told apart from the fit's own.
-COLLINEAR = 1e-7
 
 
 @dataclass(frozen=True)
@@ -100,8 +98,9 @@ class _Linearized:
         along = problem.sweep.directions(shapes, p, rest, slopes, still)
         seen = problem.sweep.observe(shapes, p, rest, along)
         for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
-            curve = problem.curve_of(seen.z[j])
-            moved = problem.measured[j].line.residual_along(curve, s, seen.slopes[j])
+            now = Observed(problem.curve_of(seen.z[j]), shapes.lam[j])
+            change = ObservedChange(seen.slopes[j], along.lam[j])
+            moved = problem.measured[j].residual_along(now, s, change)
             self.lin.by_theta[k][:, columns] = problem.whitening(j, s) @ moved[:, : len(columns)]
 
 
@@ -232,7 +231,7 @@ class Screen:
             score, step[inside], _ = _best_step((part + part.T) / 2, (u / scale)[inside])
             step[~inside] = 0.0
         step = step / scale
-        n_places = max(1.0, len(candidate.scans) / 3)
+        n_places = max(1.0, len(candidate.scans) / SCANS_PER_TEST)
         single = survival(score, max(dof, 1), noise_dof)
         p_value = float(min(1.0, -np.expm1(n_places * np.log1p(-min(single, 1 - 1e-16)))))
         values = dict(candidate.scans[k])

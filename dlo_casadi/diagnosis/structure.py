@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from scipy.stats import norm
 from dlo_casadi.diagnosis.screening import survival
 from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import KEPT_INFORMATION, KEPT_VARIANCE, LEAST_NOISE_DEGREES
 
 FloatArray = NDArray[np.floating]
 
@@ -59,7 +61,7 @@ class Structure:
 
 def noise_degrees(fit: Fit) -> float:
     """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
-    return float("inf") if fit.noise.declared else max(4.0, fit.noise.slow_dof)
+    return max(LEAST_NOISE_DEGREES, fit.noise.slow_dof)
 
 
 def screening_degrees(fit: Fit) -> float:
@@ -69,12 +71,12 @@ def screening_degrees(fit: Fit) -> float:
     of cable told it, which is too much: what is found so has to pass a second test, under the
     noise that is left once it is in the model.
     """
-    if fit.noise.declared:
-        return float("inf")
+    if fit.noise.known:
+        return noise_degrees(fit)
     if fit.noise.share == 0:
-        return float(fit.problem.n_points)
+        return float(fit.problem.n_residuals)
     stretches = fit.model.cable.length / (np.sqrt(2 * np.pi) * fit.noise.length)
-    return float(max(4.0, len(fit.problem.used) * stretches))
+    return float(max(LEAST_NOISE_DEGREES, len(fit.problem.used) * stretches))
 
 
 def structure_of(fit: Fit, noise_dof: float) -> Structure:
@@ -85,7 +87,8 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     inner = normal.inner or [NO_DEVIATION] * len(problem.used)
     for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
         modes = smooth_modes(s, model.cable.length, SLOW_MODES, model.end == "free")
-        basis, _ = np.linalg.qr(problem.whitening(j, s) @ modes)
+        seen = problem.measured[j].slow_rows(modes)
+        basis, _ = np.linalg.qr(problem.whitening(j, s) @ seen)
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
         covariance = np.eye(basis.shape[1])
         block = inner[k]
@@ -104,7 +107,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         covariance[at : at + len(part), at : at + len(part)] += part
         at += len(part)
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    kept = values > 0.05
+    kept = values > KEPT_VARIANCE
     along = vectors[:, kept].T @ stacked
     statistic, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
     p_value = survival(statistic, max(dof, 1), noise_dof)
@@ -130,18 +133,21 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
 
 
 def _position_score(fit: Fit, noise_dof: float) -> float:
-    """Score test of the ten terms of first and second degree of a displacement field (x, y)."""
+    """Score test of a displacement field's terms of first and second degree, in the plane ten."""
     problem, lin, inner = fit.problem, fit.linearization, fit.normal.inner
-    curves = problem.curves(fit.point.theta, fit.point.shapes)
-    information: FloatArray = np.zeros((10, 10))
-    cross: FloatArray = np.zeros((10, len(fit.point.theta)))
-    slope: FloatArray = np.zeros(10)
+    observed = problem.observed(fit.point.theta, fit.point.shapes)
+    d = observed[0].curve.d
+    pairs = list(combinations_with_replacement(range(d), 2))
+    size = d * (d + len(pairs))
+    information: FloatArray = np.zeros((size, size))
+    cross: FloatArray = np.zeros((size, len(fit.point.theta)))
+    slope: FloatArray = np.zeros(size)
     for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
-        x, y = problem.measured[j].points.T / fit.model.cable.length
-        terms = np.stack([x, y, x * x, x * y, y * y], axis=1)
-        normals = curves[j].normals(s)
-        moves = np.concatenate([normals[:, :1] * terms, normals[:, 1:] * terms], axis=1)
-        seen = problem.whitening(j, s) @ moves
+        item = problem.measured[j]
+        x = item.points / fit.model.cable.length
+        terms = np.column_stack([x, *(x[:, a] * x[:, b] for a, b in pairs)])
+        moved = np.einsum("dc,kt->kdct", np.eye(d), terms).reshape((len(x), d, size))
+        seen = problem.whitening(j, s) @ item.components(observed[j].curve, s, moved)
         information += seen.T @ seen
         cross += seen.T @ lin.by_theta[k]
         slope += seen.T @ lin.residuals[k]
@@ -155,7 +161,7 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
     information -= cross @ fit.covariance @ cross.T
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    kept = values > 1e-6
+    kept = values > KEPT_INFORMATION
     along = vectors[:, kept].T @ (slope * scale)
     score, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
     p_value = survival(score, max(dof, 1), noise_dof)

@@ -13,6 +13,7 @@ from dlo_casadi.effects.effect import (
     Load,
     MeasurementEffect,
     PointForceAt,
+    PointLoad,
     SectionLaw,
     Sight,
     SpringAt,
@@ -28,6 +29,7 @@ from dlo_casadi.effects.lumped_mass import LumpedMass
 from dlo_casadi.effects.plastic_set import PlasticSet
 from dlo_casadi.effects.point_force import PointForce
 from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
+from dlo_casadi.effects.setup import Fitted, Setup
 from dlo_casadi.effects.side_load import SideLoad
 from dlo_casadi.effects.standoff_error import StandoffError
 from dlo_casadi.effects.stiff_section import StiffSection
@@ -60,8 +62,18 @@ EFFECTS: dict[str, type[Effect]] = {
     )
 }
 
+# What a measurement has beside them: never declared, and never blamed for a residual.
+NUISANCES: dict[str, type[Effect]] = {EdgeBias.name: EdgeBias}
+
+
+def known_effect(name: str) -> type[Effect] | None:
+    """The effect or nuisance of that name."""
+    return EFFECTS.get(name) or NUISANCES.get(name)
+
+
 __all__ = [
     "EFFECTS",
+    "NUISANCES",
     "AxialStretch",
     "BendingSoftening",
     "BoundaryEffect",
@@ -72,6 +84,7 @@ __all__ = [
     "EndConditions",
     "EndOffset",
     "EndSpring",
+    "Fitted",
     "GravityTilt",
     "ImageDistortion",
     "ImageScale",
@@ -83,8 +96,10 @@ __all__ = [
     "PlasticSet",
     "PointForce",
     "PointForceAt",
+    "PointLoad",
     "RestCurvatureDrift",
     "SectionLaw",
+    "Setup",
     "SideLoad",
     "Sight",
     "SpringAt",
@@ -95,4 +110,5 @@ __all__ = [
     "StiffnessGradient",
     "Tether",
     "UnknownPull",
+    "known_effect",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 
 from dlo_casadi.effects.effect import Cable, Kinematics, Params
@@ -21,6 +23,7 @@ class AxialStretch(Kinematics):
     """
 
     name = "axial_stretch"
+    inverses: ClassVar = {"compliance": ("axial_stiffness", "N")}
     extensible = True
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:

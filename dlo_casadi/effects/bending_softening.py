@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 import numpy as np
 
@@ -35,6 +37,7 @@ class BendingSoftening(SectionLaw):
     """
 
     name = "bending_softening"
+    inverses: ClassVar = {"softness": ("curvature_scale", "1/m")}
     even = True
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:

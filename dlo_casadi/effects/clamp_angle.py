@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar, Self
 
 from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params
+from dlo_casadi.effects.setup import Fitted, Setup
 from dlo_casadi.parameters import Parameter
 
 
@@ -21,6 +24,7 @@ class ClampAngle(BoundaryEffect):
     """
 
     name = "clamp_angle"
+    tolerances: ClassVar = {"start_heading_error": "heading", "end_heading_error": "heading"}
 
     start: bool = True
     end: bool = True
@@ -32,6 +36,29 @@ class ClampAngle(BoundaryEffect):
             Parameter(f"{side}_heading_error", "rad", scale=0.05, lower=-0.9, upper=0.9)
             for side in held
         )
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where an end is clamped."""
+        return "clamped" in (setup.start, setup.end)
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """With the errors of those ends that are clamped."""
+        return cls(start=setup.start == "clamped", end=setup.end == "clamped")
+
+    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
+        """Without a clamp it has no parameters."""
+        if self.start or self.end:
+            return ""
+        return (
+            "it turns a clamp, and no end is clamped. "
+            "Try: experiment.boundary, with start or end clamped"
+        )
+
+    def may_be(self, found: Fitted) -> bool:
+        """A local effect beside a clamp may be the clamp's."""
+        return (self.start and found.near_start) or (self.end and found.near_end)
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Turn the clamps."""

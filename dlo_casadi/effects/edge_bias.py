@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 
 from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
 # Harmonics of the cable's direction: light from one side shifts all of its picture, which is the
@@ -13,6 +16,8 @@ from dlo_casadi.parameters import Parameter
 # with one, or up to the third, two of them are `unexplained`; with four all are as they should be,
 # and six are no closer.
 HARMONICS = range(1, 5)
+# Standard deviation of each harmonic, in pixels.
+PIXELS = 0.05
 
 
 class EdgeBias(MeasurementEffect):
@@ -31,12 +36,23 @@ class EdgeBias(MeasurementEffect):
     """
 
     name = "edge_bias"
+    shown: ClassVar = False
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare two coefficients for each harmonic."""
         return tuple(
             Parameter(f"{kind}{k}", "m", scale=1e-4) for k in HARMONICS for kind in ("a", "b")
         )
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where there are photographs."""
+        return setup.pixel is not None
+
+    def prior(self, setup: Setup) -> dict[str, float]:
+        """A share of a pixel for each coefficient; none without pixels."""
+        std = PIXELS * (setup.pixel or 0.0)
+        return {q.name: std for q in self.parameters(setup.cable)} if std else {}
 
     def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Move the point along the cable's normal."""

@@ -1,7 +1,9 @@
 """The contract of an effect and its six slots.
 
 An effect declares parameters and fills one slot of the model. It sees the curve, never the
-solver's coordinates; it creates no symbol, keeps no state and calls no solver.
+solver's coordinates; it creates no symbol, keeps no state and calls no solver. What else concerns
+it is its own: where it applies, where it is looked for, what it may be taken for, how it is told.
+All of that has defaults, so that most effects declare `name`, `parameters` and their law.
 """
 
 from __future__ import annotations
@@ -9,14 +11,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import pi
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import casadi as ca
+import numpy as np
 
 from dlo_casadi.parameters import Parameter
 from dlo_casadi.rod.element import Cell
 
+if TYPE_CHECKING:
+    from dlo_casadi.effects.setup import Fitted, Setup
+
 Params = Mapping[str, ca.SX]
+Scan = dict[str, float]
+
+# Places along the cable at which loads at one place are tried, as shares of its length.
+PLACES = np.linspace(0.06, 0.94, 23)
 
 
 @dataclass(frozen=True)
@@ -93,6 +103,10 @@ class SpringAt:
         """Energy [J] at a place."""
         return self.stiffness * ca.sumsqr(place) / 2 - ca.dot(self.force, place) + self.constant
 
+    def pull(self, place: ca.SX) -> ca.SX:
+        """Force (dimension,) [N] on the cable at a place: minus the slope of the energy."""
+        return self.force - self.stiffness * place
+
 
 @dataclass(frozen=True)
 class Sight:
@@ -127,6 +141,13 @@ class Effect:
     slot: ClassVar[str]
     # Unknowns of each pose that the effect uses beside its parameters; see model.DEVIATIONS.
     per_pose: ClassVar[tuple[str, ...]] = ()
+    # Own parameters that lie within a declared tolerance, by its name there: until more is needed
+    # the effect is a nuisance of every model that it applies to.
+    tolerances: ClassVar[Mapping[str, str]] = {}
+    # Parameters that are estimated as the inverse of what is known: its name and unit.
+    inverses: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    # Whether tables of parameters show it while it is a nuisance.
+    shown: ClassVar[bool] = True
 
     label: str = ""
 
@@ -137,6 +158,40 @@ class Effect:
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Parameters with units, bounds and the nominal value at which the effect vanishes."""
         raise TypeError(f"{type(self).__name__} declares no parameters")
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Whether the effect makes sense in a setup, and measurements there can show it."""
+        return True
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """Return the effect as it acts in a setup."""
+        return cls()
+
+    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
+        """Why it cannot be declared with these values, and what to try; empty if it can."""
+        return ""
+
+    def prior(self, setup: Setup) -> dict[str, float]:
+        """Standard deviations of what is known of it before any shape; empty where nothing is."""
+        return {
+            q.name: setup.tolerances[self.tolerances[q.name]]
+            for q in self.parameters(setup.cable)
+            if self.tolerances.get(q.name) in setup.tolerances
+        }
+
+    def scans(self, setup: Setup) -> tuple[Scan, ...]:
+        """Values of the parameters by which it enters nonlinearly, at each of which to look."""
+        return ({},)
+
+    def place(self, values: Mapping[str, float]) -> float | None:
+        """Arc length [m] about which it acts; None if that is no single place."""
+        return None
+
+    def may_be(self, found: Fitted) -> bool:
+        """Whether another effect that was found may stand for this one, as the shapes go."""
+        return False
 
     def linear(self) -> Effect:
         """Return the same effect, of the same label, in parameters for its score test.
@@ -227,6 +282,29 @@ class Load(Effect):
         return ()
 
 
+class PointLoad(Load):
+    """A load at one place of the cable, its parameter `position` [m]."""
+
+    def position(self, cable: Cable) -> Parameter:
+        """Arc length of the place from the start fixture."""
+        length = cable.length
+        return Parameter("position", "m", length / 2, 0.1 * length, 0.0, length)
+
+    def scans(self, setup: Setup) -> tuple[Scan, ...]:
+        """Look for it all along the cable."""
+        return tuple({"position": float(share * setup.cable.length)} for share in PLACES)
+
+    def place(self, values: Mapping[str, float]) -> float:
+        """Its place."""
+        return values["position"]
+
+    def force(self, place: ca.SX, gravity: ca.SX, params: Params) -> ca.SX:
+        """Force (dimension,) [N] on the cable when its place is at `place` (dimension,) [m]."""
+        dead = (item.force for item in self.forces(gravity, params))
+        pulls = (spring.pull(place) for spring in self.springs(params))
+        return sum((*dead, *pulls), start=ca.SX.zeros(place.numel()))
+
+
 class BoundaryEffect(Effect):
     """Slot `boundary`: how the ends are held."""
 
@@ -265,3 +343,8 @@ class StateEffect(Effect):
     def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Rest curvature [1/m] of a cell after a pose of this curvature has been held."""
         raise TypeError(f"{self.name} has no law of the state")
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where the rest curvature is free to move, from one pose to another."""
+        return setup.n_poses > 1 and setup.curved

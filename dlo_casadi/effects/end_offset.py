@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 
 from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
 
@@ -20,6 +23,7 @@ class EndOffset(BoundaryEffect):
     """
 
     name = "end_offset"
+    tolerances: ClassVar = {"dx": "end", "dy": "end"}
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the offset."""
@@ -28,6 +32,11 @@ class EndOffset(BoundaryEffect):
         return tuple(
             Parameter(axis, "m", scale=scale, lower=-bound, upper=bound) for axis in ("dx", "dy")
         )
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where the end is held."""
+        return setup.end != "free"
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Move the end fixture."""

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import BoundaryEffect, Cable, Params
+from dlo_casadi.effects.effect import BoundaryEffect, Cable, Params, Scan
+from dlo_casadi.effects.setup import Fitted, Setup
 from dlo_casadi.parameters import Parameter
+
+# Directions in which a pin may hold the cable, relative to the mean heading there [rad].
+HEADINGS = (-1.2, -0.6, 0.0, 0.6, 1.2)
 
 
 class _PinSpring(BoundaryEffect):
@@ -26,7 +30,7 @@ class _PinSpring(BoundaryEffect):
         scale = cable.bending_stiffness / cable.length
         return (
             Parameter("stiffness", "N m/rad", scale=scale, lower=0.0),
-            Parameter("heading", "rad", scale=0.5, lower=-10.0, upper=10.0, scan=True),
+            Parameter("heading", "rad", scale=0.5, lower=-10.0, upper=10.0),
         )
 
     def _spring(self, heading: ca.SX, params: Params) -> ca.SX:
@@ -38,6 +42,19 @@ class StartSpring(_PinSpring):
 
     name = "start_spring"
 
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where the start is a pin."""
+        return setup.start == "pinned"
+
+    def scans(self, setup: Setup) -> tuple[Scan, ...]:
+        """Look about the cable's mean heading at the start."""
+        return tuple({"heading": setup.directions[0] + turn} for turn in HEADINGS)
+
+    def may_be(self, found: Fitted) -> bool:
+        """A local effect beside the start pin may be the pin's."""
+        return found.near_start
+
     def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX:
         """Energy of the spring [J]."""
         return self._spring(start_heading, params)
@@ -47,6 +64,19 @@ class EndSpring(_PinSpring):
     """A torsional spring at the end pin: V = k (phi(L) - heading)^2 / 2."""
 
     name = "end_spring"
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where the end is a pin."""
+        return setup.end == "pinned"
+
+    def scans(self, setup: Setup) -> tuple[Scan, ...]:
+        """Look about the cable's mean heading at the end."""
+        return tuple({"heading": setup.directions[1] + turn} for turn in HEADINGS)
+
+    def may_be(self, found: Fitted) -> bool:
+        """A local effect beside the end pin may be the pin's."""
+        return found.near_end
 
     def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX:
         """Energy of the spring [J]."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import casadi as ca
 
 from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
 
@@ -38,6 +40,16 @@ class ImageDistortion(MeasurementEffect):
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the coefficient."""
         return (Parameter("coefficient", "1/m^2", scale=0.005 / cable.length**2),)
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where there are photographs."""
+        return setup.center is not None
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """About the middle of the photographs."""
+        return cls(center=setup.center or (0.0, 0.0))
 
     def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Move the point along its radius."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 
 from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
@@ -20,6 +22,7 @@ class ImageScale(MeasurementEffect):
     """
 
     name = "image_scale"
+    tolerances: ClassVar = {"factor": "scale"}
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the factor."""

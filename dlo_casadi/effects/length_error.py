@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 
 from dlo_casadi.effects.effect import Cable, Kinematics, Params
@@ -20,6 +22,7 @@ class LengthError(Kinematics):
     """
 
     name = "length_error"
+    tolerances: ClassVar = {"length_difference": "length"}
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the difference."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import casadi as ca
+import numpy as np
 
-from dlo_casadi.effects.effect import Cable, Load, Params, PointForceAt
+from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
+from dlo_casadi.effects.setup import Fitted
 from dlo_casadi.parameters import Parameter
+from dlo_casadi.thresholds import ALONG_GRAVITY
 
 
-class LumpedMass(Load):
+class LumpedMass(PointLoad):
     """A compact mass on the cable: a connector, a clip, a sensor.
 
         V = -m g . r(s)                                               [J]
@@ -33,17 +36,21 @@ class LumpedMass(Load):
         """Declare mass and position."""
         return (
             Parameter("mass", "kg", lower=0.0, scale=0.1 * cable.mass, upper=3 * cable.mass),
-            Parameter(
-                "position",
-                "m",
-                nominal=cable.length / 2,
-                scale=0.1 * cable.length,
-                lower=0.0,
-                upper=cable.length,
-                scan=True,
-            ),
+            self.position(cable),
         )
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """Weight of the mass."""
         return (PointForceAt(params["mass"] * gravity, params["position"]),)
+
+    def may_be(self, found: Fitted) -> bool:
+        """A dead force is a weight if it is along gravity, within two standard deviations."""
+        effect, gravity = found.effect, np.array(found.setup.gravity)
+        if not isinstance(effect, PointLoad) or not effect.dead:
+            return False
+        down = gravity / max(float(np.linalg.norm(gravity)), 1e-12)
+        place, field = ca.SX.zeros(len(down)), ca.SX(ca.DM(gravity))
+        force, moved = found.propagated(lambda params: effect.force(place, field, params))
+        across = np.eye(len(down)) - np.outer(down, down)
+        limit = ALONG_GRAVITY * np.linalg.norm(across @ moved)
+        return bool(force @ down > 0 and np.linalg.norm(across @ force) < limit)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Params, StateEffect
+from dlo_casadi.effects.effect import Cable, Params, Scan, StateEffect
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
 # A kink max(x, 0) is rounded to (x + sqrt(x^2 + d^2)) / 2 with d this share of one turn per length:
 # off by d / 2 at the kink, by d^2 / (4 |x|) away from it.
 _ROUNDING = 0.01
+# Yield curvatures that are tried, as shares of the largest bend.
+YIELDS = (0.15, 0.3, 0.45, 0.6, 0.75)
 
 
 class PlasticSet(StateEffect):
@@ -40,9 +43,14 @@ class PlasticSet(StateEffect):
         """Declare yield curvature and share."""
         turn = cable.curvature_scale
         return (
-            Parameter("yield_curvature", "1/m", 0.5 * turn, 0.1 * turn, 0.0, 100 * turn, scan=True),
+            Parameter("yield_curvature", "1/m", 0.5 * turn, 0.1 * turn, 0.0, 100 * turn),
             Parameter("share", scale=0.1, lower=0.0, upper=0.99),
         )
+
+    def scans(self, setup: Setup) -> tuple[Scan, ...]:
+        """Look for a yield below the largest bend; without one, a turn per length."""
+        bend = setup.largest_bend or setup.cable.curvature_scale
+        return tuple({"yield_curvature": share * bend} for share in YIELDS)
 
     def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Rest curvature after the pose [1/m]."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Load, Params, PointForceAt
+from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
 from dlo_casadi.parameters import Parameter
 
 
-class PointForce(Load):
+class PointForce(PointLoad):
     """A dead force on the cable, the same in every pose: a string over a pulley, a jet.
 
         V = - f . r(s)                                                [J]
@@ -29,15 +29,7 @@ class PointForce(Load):
         return (
             Parameter("fx", "N", scale=scale, lower=-30 * scale, upper=30 * scale),
             Parameter("fy", "N", scale=scale, lower=-30 * scale, upper=30 * scale),
-            Parameter(
-                "position",
-                "m",
-                nominal=cable.length / 2,
-                scale=0.1 * cable.length,
-                lower=0.0,
-                upper=cable.length,
-                scan=True,
-            ),
+            self.position(cable),
         )
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import casadi as ca
 
 from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
 
@@ -36,6 +39,20 @@ class StandoffError(MeasurementEffect):
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the distance."""
         return (Parameter("distance", "m", scale=1e-3),)
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where it is known from where the photographs were taken."""
+        return setup.camera
+
+    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
+        """Without a camera there are no rays."""
+        if setup.camera:
+            return ""
+        return (
+            "it is a shift along the rays of a calibrated camera, and none is declared. "
+            "Try: measurement.camera, or image_scale"
+        )
 
     def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Follow the ray through the point to the declared plane."""

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Params, SectionLaw
+from dlo_casadi.effects.effect import PLACES, Cable, Params, Scan, SectionLaw
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 from dlo_casadi.rod.element import Cell
+
+# Lengths of sections that are tried, as shares of the cable's length.
+SECTIONS = (0.08, 0.2)
 
 
 class StiffSection(SectionLaw):
@@ -21,6 +27,7 @@ class StiffSection(SectionLaw):
     Parameters
     ----------
     start, end : scalar [m], in [0, L]
+        The start comes before the end.
     factor : scalar, > 0
         Vanishes at 1; below 1 the section is softer, e.g. a worn place.
     """
@@ -31,10 +38,36 @@ class StiffSection(SectionLaw):
         """Declare the section's ends and its factor."""
         length = cable.length
         return (
-            Parameter("start", "m", 0.45 * length, 0.05 * length, 0.0, length, scan=True),
-            Parameter("end", "m", 0.55 * length, 0.05 * length, 0.0, length, scan=True),
+            Parameter("start", "m", 0.45 * length, 0.05 * length, 0.0, length),
+            Parameter("end", "m", 0.55 * length, 0.05 * length, 0.0, length),
             Parameter("factor", nominal=1.0, scale=0.5, lower=0.02, upper=100.0),
         )
+
+    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
+        """A section has a length."""
+        start, end = values["start"], values["end"]
+        if start < end:
+            return ""
+        return (
+            f"it starts at {start:g} m and ends at {end:g} m from the start of the cable, "
+            "which leaves no section between. Try: start smaller than end"
+        )
+
+    def scans(self, setup: Setup) -> tuple[Scan, ...]:
+        """Look for short and long sections all along the cable."""
+        length = setup.cable.length
+        return tuple(
+            {
+                "start": float(max(share - width / 2, 0.0) * length),
+                "end": float(min(share + width / 2, 1.0) * length),
+            }
+            for width in SECTIONS
+            for share in PLACES
+        )
+
+    def place(self, values: Mapping[str, float]) -> float:
+        """Its middle."""
+        return (values["start"] + values["end"]) / 2
 
     def factor(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
         """Harmonic mean of the stiffness over the cell."""

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.effect import Cable, Effect, Load, Params, SpringAt
+from dlo_casadi.effects.effect import Cable, Effect, Params, PointLoad, SpringAt
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
 # How far an anchor may lie from the board's origin, in lengths of the cable: the force of one
@@ -15,7 +16,7 @@ from dlo_casadi.parameters import Parameter
 FARTHEST = 10.0
 
 
-class Tether(Load):
+class Tether(PointLoad):
     """A spring of no length from one place of the cable to a fixed point: a strap, a rubber band.
 
         V = k |r(s) - a|^2 / 2                                        [J]
@@ -37,16 +38,20 @@ class Tether(Load):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare stiffness, place and anchor."""
-        stiffness, position = _stiffness(cable), _position(cable)
         reach = FARTHEST * cable.length
         return (
-            stiffness,
-            position,
+            _stiffness(cable),
+            self.position(cable),
             *(
-                Parameter(name, "m", scale=0.1 * cable.length, lower=-reach, upper=reach, scan=True)
+                Parameter(name, "m", scale=0.1 * cable.length, lower=-reach, upper=reach)
                 for name in ("anchor_x", "anchor_y")
             ),
         )
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """In one pose it is a point force."""
+        return setup.n_poses > 1
 
     def springs(self, params: Params) -> tuple[SpringAt, ...]:
         """The spring."""
@@ -71,7 +76,7 @@ class Tether(Load):
         }
 
 
-class _LinearTether(Load):
+class _LinearTether(PointLoad):
     """A tether in the parameters that its energy is linear in: V = k |r(s)|^2 / 2 - f . r(s).
 
     With f = k a it differs from the tether's by a constant; at k = 0, where an anchor tells
@@ -86,7 +91,7 @@ class _LinearTether(Load):
         scale = 0.1 * 9.81 * cable.mass
         return (
             _stiffness(cable),
-            _position(cable),
+            self.position(cable),
             Parameter("fx", "N", scale=scale),
             Parameter("fy", "N", scale=scale),
         )
@@ -100,8 +105,3 @@ class _LinearTether(Load):
 def _stiffness(cable: Cable) -> Parameter:
     scale = 9.81 * cable.mass / cable.length
     return Parameter("stiffness", "N/m", scale=scale, lower=0.0, upper=1e3 * scale)
-
-
-def _position(cable: Cable) -> Parameter:
-    length = cable.length
-    return Parameter("position", "m", length / 2, 0.1 * length, 0.0, length, scan=True)

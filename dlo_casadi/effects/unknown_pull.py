@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Load, Params, PointForceAt
+from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
 from dlo_casadi.parameters import Parameter
 
 
-class UnknownPull(Load):
+class UnknownPull(PointLoad):
     """A force at one place of the cable that may be another one in every pose.
 
         V_j = - (f + f_j) . r(s)                                      [J]
@@ -26,17 +28,16 @@ class UnknownPull(Load):
 
     name = "unknown_pull"
     per_pose = ("pull_x", "pull_y")
+    # The parameters that they are deviations from, in the same order.
+    means: ClassVar = ("fx", "fy")
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the mean force and its place."""
-        length = cable.length
         scale = 9.81 * cable.mass
         return (
             Parameter("fx", "N", scale=scale, lower=-10 * scale, upper=10 * scale),
             Parameter("fy", "N", scale=scale, lower=-10 * scale, upper=10 * scale),
-            Parameter(
-                "position", "m", nominal=length / 2, scale=0.1 * length, upper=length, lower=0.0
-            ),
+            self.position(cable),
         )
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:

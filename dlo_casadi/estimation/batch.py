@@ -7,8 +7,9 @@
     s.t.  grad_(phi, lam) Lagrangian(phi_j, lam_j; theta) = 0           (balance and end conditions)
           rest_(j+1) = rest_after(x_j, rest_j)                         (only with a state)
 
-The measured points enter through R_j, the triangular factor of whitening x normals x Hermite
-interpolation: |R_j z - b_j|^2 equals the sum of squares over all points up to a constant. Feet
+What is measured enters through R_j, the triangular factor of the whitened residuals' Jacobian by
+the numbers z of the curve and the multipliers (of lines: whitening x normals x Hermite
+interpolation): |R_j z - b_j|^2 equals the sum of squares up to a constant. Feet
 and normals are brought up to date between solves, until they stand still; at a foot the normal
 distance is stationary in s, so that the fixed point is that of the consistent problem.
 
@@ -29,7 +30,7 @@ from dlo_casadi.assembly import DEVIATIONS, Shapes
 from dlo_casadi.equilibrium import stats_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
-from dlo_casadi.estimation.observation import normal_rows
+from dlo_casadi.estimation.sensors import ObservedChange
 from dlo_casadi.model import POSE_SIZE
 from dlo_casadi.whole_pose import PoseSymbols, balance, curve, rest_after
 
@@ -96,17 +97,18 @@ def solve_batch(problem: BatchProblem, start: Point, max_solves: int = 4) -> Bat
 
 
 def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, FloatArray]]:
-    """Triangular factor (n_rows, nz) and target (n_rows,) of each fitted pose's points."""
-    curves = problem.curves(point.theta, point.shapes)
-    count = _n_rows(problem)
-    out = []
+    """Triangular factor (n_rows, n_z) and target (n_rows,) of each fitted pose's residuals."""
+    seen = problem.observed(point.theta, point.shapes)
+    count, size = _n_rows(problem), problem.observed_size
+    unit = np.eye(size)
+    out: list[tuple[FloatArray, FloatArray]] = []
     for j, s in zip(problem.used, point.feet, strict=True):
-        line = curves[j]
-        normals = line.normals(s)
-        white = problem.whitening(j, s)
-        rows = white @ normal_rows(line, s, normals)
-        target = white @ (problem.measured[j].points * normals).sum(axis=1)
-        size = rows.shape[1]
+        curve, lam = seen[j].curve.numbers, seen[j].lam
+        each = ObservedChange(unit[: curve.size].reshape((*curve.shape, size)), unit[curve.size :])
+        item, white = problem.measured[j], problem.whitening(j, s)
+        rows = -white @ item.residual_along(seen[j], s, each)
+        here = np.concatenate([curve.ravel(), lam])
+        target = white @ item.residual(seen[j], s) + rows @ here
         triangle = np.linalg.qr(np.column_stack([rows, target]), mode="r")
         padded = np.zeros((count, size + 1))
         keep = min(count, len(triangle))
@@ -116,13 +118,13 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
 
 
 def _n_rows(problem: BatchProblem) -> int:
-    """Rows of a pose's compressed points: no more than the numbers of its shape, or points."""
-    most = max(len(problem.measured[j].points) for j in problem.used)
-    return min(most, problem.curve_size)
+    """Rows of a pose's compressed residuals: no more than what they depend on, or residuals."""
+    most = max(len(problem.measured[j].point_of) for j in problem.used)
+    return min(most, problem.observed_size)
 
 
 class _BatchNlp:
-    """The NLP's expressions, built once; the points' factors are its parameters.
+    """The NLP's expressions, built once; the residuals' factors are its parameters.
 
     First and second derivatives of one pose are generated once and mapped over the poses; the
     NLP's own are put together from these blocks. That is what its structure costs, while
@@ -168,7 +170,7 @@ class _BatchNlp:
             ]
         )
         imbalance = balance(model, symbols) * scale
-        z = curve(model, symbols)
+        z = ca.vertcat(curve(model, symbols), symbols.lam)
         after = ca.SX.zeros(0)
         if model.has_state:
             after = rest_after(model, symbols) / model.cable.curvature_scale
@@ -192,7 +194,7 @@ class _BatchNlp:
         """NLP, gradient, Jacobian and Hessian from the poses' blocks."""
         problem, m = self.problem, len(self.poses)
         unknowns, model = problem.unknowns, problem.unknowns.model
-        size, n_z, n_rows = unknowns.size, problem.curve_size, _n_rows(problem)
+        size, n_z, n_rows = unknowns.size, problem.observed_size, _n_rows(problem)
         x = ca.MX.sym("x", size + self.stride * m)
         factor = ca.MX.sym("factor", n_rows, n_z * len(problem.used))
         target = ca.MX.sym("target", n_rows, len(problem.used))

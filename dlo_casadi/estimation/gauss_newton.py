@@ -1,13 +1,14 @@
 """Gauss-Newton for the batch problem, with the equilibria eliminated pose by pose.
 
     min over theta, deviations of
-        1/2 sum_j |W_j N_j (x_j - r_j(s_j))|^2 + 1/2 sum_j |deviation_j / std|^2
+        1/2 sum_j |W_j e_j|^2 + 1/2 sum_j |deviation_j / std|^2
         + 1/2 (theta - mean)^T P (theta - mean)
     subject to every pose being an equilibrium
 
-The feet s_j of the measured points move with the curve; at a foot the normal distance does not
-change to first order with s, so that the Jacobian at fixed feet is the exact one. The
-deviations of a pose are eliminated by a Schur complement.
+with the residuals e_j of the pose's sensors, of a line N_j (x_j - r_j(s_j)). The feet s_j of its
+points move with the curve; at a foot the normal distance does not change to first order with s,
+so that the Jacobian at fixed feet is the exact one. The deviations of a pose are eliminated by a
+Schur complement.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.assembly import Directions, Shapes
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.rod.band import Vector
@@ -60,10 +63,11 @@ class Point:
     theta : (size,)
     shapes : Shapes
     feet : list of (K_j,) [m]
+        Arc lengths at which the fitted poses' points are compared.
     objective : float
         Half the sum of squares, priors included.
     data : float
-        Sum of squares of the whitened normal distances alone.
+        Sum of squares of the whitened residuals alone.
     """
 
     theta: FloatArray
@@ -79,14 +83,14 @@ class Linearization:
 
     Parameters
     ----------
-    residuals : list of (K_j,)
-        Whitened normal distances, measured minus model.
-    by_theta : list of (K_j, size)
+    residuals : list of (R_j,)
+        Whitened residuals of the sensors, measured minus model.
+    by_theta : list of (R_j, size)
         Derivative of the residuals.
-    by_deviation : list of (K_j, n_deviations)
-    raw : list of (K_j,) [m]
-        Normal distances.
-    raw_directions : list of (K_j, size + n_deviations)
+    by_deviation : list of (R_j, n_deviations)
+    raw : list of (R_j,)
+        Residuals, not whitened.
+    raw_directions : list of (R_j, size + n_deviations)
         Their derivatives, not whitened.
     shapes : Directions
         Derivatives of the equilibria, by the unknowns and by each pose's deviations.
@@ -160,31 +164,31 @@ class BatchProblem:
         self._whitening: dict[int, FloatArray] = {}
 
     @property
-    def n_points(self) -> int:
-        """Number of measured points that are fitted."""
-        return sum(len(self.measured[j].points) for j in self.used)
+    def n_residuals(self) -> int:
+        """Number of residuals of the fitted poses: in the plane one of a point, two of a marker."""
+        return sum(len(self.measured[j].point_of) for j in self.used)
 
     # ---- evaluation --------------------------------------------------------------------------
 
-    def curves(self, theta: FloatArray, shapes: Shapes) -> list[NodeCurve]:
-        """Curves of all poses as the camera sees them."""
+    def observed(self, theta: FloatArray, shapes: Shapes) -> list[Observed]:
+        """All poses as the sensors see them."""
         z = self.sweep.seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
-        return [self.curve_of(row) for row in z]
+        return [Observed(self.curve_of(row), lam) for row, lam in zip(z, shapes.lam, strict=True)]
 
     @property
-    def curve_size(self) -> int:
-        """Numbers that a measured curve is made of."""
+    def observed_size(self) -> int:
+        """Numbers that residuals depend on: those of a measured curve, and multipliers."""
         model = self.unknowns.model
-        return (model.chain.n + 1) * int(model.station.size1_out(0))
+        return (model.chain.n + 1) * int(model.station.size1_out(0)) + model.n_border
 
     def curve_of(self, z: FloatArray) -> NodeCurve:
         """Curve of what the model says of its nodes."""
         return NodeCurve.of(self.unknowns.model.cable.length, z)
 
     def whitening(self, j: int, feet: FloatArray) -> FloatArray:
-        """Whitening matrix (K_j, K_j) of pose j [1/m], computed for the feet at `refresh`."""
+        """Whitening matrix (R_j, R_j) of pose j, computed for the feet at `refresh`."""
         if j not in self._whitening:
-            self._whitening[j] = self.noise.whitening(feet, self.measured[j].relative_std)
+            self._whitening[j] = self.measured[j].whitening(self.noise, feet)
         return self._whitening[j]
 
     def refresh(self, feet: Sequence[FloatArray]) -> None:
@@ -200,25 +204,16 @@ class BatchProblem:
             for mine, theirs in zip(self.used, other.used, strict=True)
         }
 
-    def raw_residuals(
-        self, curves: list[NodeCurve], feet: list[FloatArray]
-    ) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Normal distances [m] of the fitted poses and the feet they belong to."""
-        distances, moved = [], []
-        for j, guess in zip(self.used, feet, strict=True):
-            line = self.measured[j].line
-            s = curves[j].feet(line.points, guess)
-            distances.append(line.residual(curves[j], s))
-            moved.append(s)
-        return distances, moved
-
     def evaluate(self, theta: FloatArray, shapes: Shapes, feet: list[FloatArray]) -> Point:
         """Objective at given unknowns and equilibria."""
-        distances, moved = self.raw_residuals(self.curves(theta, shapes), feet)
-        white = [
-            self.whitening(j, s) @ d for j, s, d in zip(self.used, moved, distances, strict=True)
-        ]
-        data = float(sum(row @ row for row in white))
+        seen = self.observed(theta, shapes)
+        moved, data = [], 0.0
+        for j, guess in zip(self.used, feet, strict=True):
+            item = self.measured[j]
+            s = item.located(seen[j], guess)
+            white = self.whitening(j, s) @ item.residual(seen[j], s)
+            moved.append(s)
+            data += float(white @ white)
         gap = theta - self.mean
         used = shapes.deviation[np.ix_(self.used, self.sweep.used_deviations)]
         prior = float(gap @ self.precision @ gap + ((used / self.deviation_std) ** 2).sum())
@@ -248,18 +243,19 @@ class BatchProblem:
         """
         p, rest = self.unknowns.p(point.theta), self.unknowns.rest(point.theta)
         seen = self.sweep.observe(point.shapes, p, rest, along)
-        moved = None
+        ahead = None
         if correction is not None:
-            moved = self.sweep.observe(point.shapes, p, rest, correction).slopes
+            ahead = self.sweep.observe(point.shapes, p, rest, correction)
         out = Linearization([], [], [], [], [], along)
         size = self.unknowns.size
         for j, s in zip(self.used, point.feet, strict=True):
-            curve, line = self.curve_of(seen.z[j]), self.measured[j].line
+            now, item = Observed(self.curve_of(seen.z[j]), point.shapes.lam[j]), self.measured[j]
             white = self.whitening(j, s)
-            d = line.residual(curve, s)
-            if moved is not None:
-                d = d + line.residual_along(curve, s, moved[j])[:, 0]
-            directions = line.residual_along(curve, s, seen.slopes[j])
+            d = item.residual(now, s)
+            if ahead is not None and correction is not None:
+                change = ObservedChange(ahead.slopes[j], correction.lam[j])
+                d = d + item.residual_along(now, s, change)[:, 0]
+            directions = item.residual_along(now, s, ObservedChange(seen.slopes[j], along.lam[j]))
             whitened = white @ directions
             out.residuals.append(white @ d)
             out.by_theta.append(whitened[:, :size])
@@ -344,7 +340,7 @@ class BatchProblem:
             point = trial
             lin = self.linearize(point)
             # Where the residual exceeds the noise, so does a standard deviation's decrease.
-            excess = max(1.0, point.data / max(self.n_points, 1))
+            excess = max(1.0, point.data / max(self.n_residuals, 1))
             if gains[-1] < tolerance * excess and damping < 1e-2:
                 return point, True
             if sum(gains) < tolerance * excess:

@@ -14,6 +14,7 @@ from dlo_casadi.estimation.noise import (
     smooth_modes,
     tell_of_noise,
 )
+from dlo_casadi.estimation.repeats import with_repeats
 from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
@@ -34,7 +35,7 @@ def settle(fit: Fit) -> Fit:
     problem, point, converged = refine(
         fit.problem,
         fit.point,
-        estimate=not fit.noise.declared,
+        estimate=not fit.noise.known,
         rounds=2,
         modes=SETTLED_MODES,
     )
@@ -62,8 +63,9 @@ def refine(
     for round_ in range(rounds):
         lin = problem.linearize(point)
         noise = problem.noise
-        if estimate and round_ < 2:
-            noise = noise_of(problem, point, lin, modes)
+        if estimate and round_ < 2 and not noise.known:
+            own = noise_of(problem, point, lin, modes)
+            noise = with_repeats(own, problem.history, problem.unknowns.model.cable.length)
         roughness = roughness_of(problem, point, lin)
         scatter = scatter_of(problem, point, lin)
         moved = max(
@@ -104,17 +106,18 @@ def noise_of(
 def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
     """White noise of the size of the residuals over their degrees of freedom."""
     fit = Fit(problem, point, converged=True)
-    spare = problem.n_points - fit.determined_unknowns
+    spare = problem.n_residuals - fit.determined_unknowns
     if spare < LEAST_SPARE:
         raise EstimationError(
-            f"the {problem.n_points} points of {len(problem.used)} fit poses determine "
+            f"the {problem.n_residuals} distances of {len(problem.used)} fit poses determine "
             f"{fit.determined_unknowns:.1f} unknowns (stiffness, rest curvature, deviations within "
             f"the tolerances): {max(spare, 0.0):.1f} degrees of freedom are left to estimate the "
             f"noise from, {LEAST_SPARE:g} are needed.\n"
             "  Try: more points on each line, more poses, the noise as measurement.std, or "
             "rest_shape: straight."
         )
-    weight = np.concatenate([problem.measured[j].relative_std for j in problem.used])
+    items = [problem.measured[j] for j in problem.used]
+    weight = np.concatenate([item.relative_std[item.point_of] for item in items])
     raw = np.concatenate(fit.linearization.raw) / weight
     return NoiseModel(float(np.sqrt((raw**2).sum() / spare)), slow_dof=spare)
 
@@ -128,9 +131,9 @@ def _noise_samples(
     size = problem.unknowns.size
     bases, left_over = [], []
     scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in lin.raw_directions], axis=0)
-    for directions, s in zip(lin.raw_directions, point.feet, strict=True):
+    for j, directions, s in zip(problem.used, lin.raw_directions, point.feet, strict=True):
         own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
-        slow = smooth_modes(s, length, modes, model.end == "free")
+        slow = problem.measured[j].slow_rows(smooth_modes(s, length, modes, model.end == "free"))
         basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
         basis = basis[:, values > 1e-3 * values[0]]
         shared = directions[:, :size] / np.maximum(scale, 1e-300)
@@ -138,11 +141,14 @@ def _noise_samples(
         left_over.append(shared - basis @ (basis.T @ shared))
     # A direction that the poses' own ones hold already costs no further degree of freedom.
     left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
-    blocks = np.split(left[:, values > 1e-6], np.cumsum([len(s) for s in point.feet])[:-1])
-    return [
-        NoiseSample(lin.raw[k], s, problem.measured[problem.used[k]].relative_std, own, block)
-        for k, (s, own, block) in enumerate(zip(point.feet, bases, blocks, strict=True))
-    ]
+    blocks = np.split(left[:, values > 1e-6], np.cumsum([len(raw) for raw in lin.raw])[:-1])
+    samples = []
+    for j, raw, s, own, block in zip(problem.used, lin.raw, point.feet, bases, blocks, strict=True):
+        samples += [
+            NoiseSample(raw[rows], s[points], sensor.weight, own[rows], block[rows])
+            for sensor, points, rows in problem.measured[j].slices
+        ]
+    return samples
 
 
 def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> float:

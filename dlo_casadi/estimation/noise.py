@@ -1,10 +1,10 @@
-"""Noise of a measured centre-line: white plus correlated along the cable.
+"""Noise of measured points: white plus correlated along the cable.
 
     cov(d_i, d_k) = std^2 w_i w_k [ (1 - share) delta_ik + share k(|s_i - s_k| / l) ]
 
-for normal distances d at arc lengths s with relative weights w. Whether the correlated part is
-rough (exponential), once differentiable (Matern 3/2) or smooth (squared exponential) is chosen by
-likelihood.
+for one component d of the errors at arc lengths s with relative weights w. Whether the correlated
+part is rough (exponential), once differentiable (Matern 3/2) or smooth (squared exponential) is
+chosen by likelihood.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 
 FloatArray = NDArray[np.floating]
 Kernel = Literal["exponential", "matern", "gaussian"]
+Source = Literal["declared", "repeats", "estimated"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 # Slow sines per pose in which a missing effect would show.
 SLOW_MODES = 6
@@ -39,7 +40,7 @@ def correlation(kernel: Kernel, ratio: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Covariance of the normal distances of one pose.
+    """Covariance of one component of the errors of one pose's points.
 
     Parameters
     ----------
@@ -50,8 +51,9 @@ class NoiseModel:
     length : float [m]
         Correlation length.
     kernel : "exponential", "matern" or "gaussian"
-    declared : bool
-        Whether the standard deviation was declared instead of estimated.
+    source : "declared", "repeats" or "estimated"
+        Whether it was declared, is how poses repeat that were taken more than once, or was
+        estimated from the residual.
     slow_dof : float
         Degrees of freedom of chi-square with which the variance of slow modes is known.
     """
@@ -60,8 +62,13 @@ class NoiseModel:
     share: float = 0.0
     length: float = 0.0
     kernel: Kernel = "matern"
-    declared: bool = False
+    source: Source = "estimated"
     slow_dof: float = np.inf
+
+    @property
+    def known(self) -> bool:
+        """Whether it does not depend on the model that is fitted."""
+        return self.source != "estimated"
 
     def covariance(self, s: FloatArray, weight: FloatArray) -> FloatArray:
         """Covariance matrix (K, K) [m^2] at arc lengths s."""
@@ -87,24 +94,24 @@ def smooth_modes(s: FloatArray, length: float, count: int, free_end: bool) -> Fl
 
 @dataclass(frozen=True)
 class NoiseSample:
-    """What one pose tells about the noise.
+    """What one pose tells about the noise: residuals of points, and what they hold beside it.
 
     Parameters
     ----------
-    distances : (K,) [m]
-        Normal distances to a curve close to the measured one.
+    residuals : (R,) [m]
+        Distances to a curve close to the measured one, `per_point` of each point, point by point.
     places : (K,) [m]
         Arc lengths of the points.
     weight : (K,)
         Relative standard deviations.
-    own : (K, a)
+    own : (R, a)
         Directions that the curve of this pose alone may take; projected out.
-    shared : (K, b)
+    shared : (R, b)
         Directions along which all poses move together; projected out. Stacked over the poses
         they are independent of one another and of the poses' own directions.
     """
 
-    distances: FloatArray
+    residuals: FloatArray
     places: FloatArray
     weight: FloatArray
     own: FloatArray
@@ -112,14 +119,21 @@ class NoiseSample:
 
     def thinned(self, most: int) -> NoiseSample:
         """Keep at most so many points, evenly picked."""
-        step = max(1, -(-len(self.distances) // most))
+        step = max(1, -(-len(self.places) // most))
+        kept = np.arange(0, len(self.places), step)
+        rows = (kept[:, None] * self.per_point + np.arange(self.per_point)).ravel()
         return NoiseSample(
-            self.distances[::step],
-            self.places[::step],
-            self.weight[::step],
-            self.own[::step],
-            self.shared[::step],
+            self.residuals[rows],
+            self.places[kept],
+            self.weight[kept],
+            self.own[rows],
+            self.shared[rows],
         )
+
+    @property
+    def per_point(self) -> int:
+        """Residuals of a point."""
+        return len(self.residuals) // len(self.places)
 
 
 def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[float, float]:
@@ -136,7 +150,8 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
     gram = np.zeros((samples[0].shared.shape[1] + 1,) * 2)
     for sample in samples:
         factor = np.linalg.cholesky(unit.covariance(sample.places, sample.weight))
-        stacked = np.column_stack([sample.distances, sample.shared, sample.own])
+        factor = np.kron(factor, np.eye(sample.per_point))
+        stacked = np.column_stack([sample.residuals, sample.shared, sample.own])
         y = solve_triangular(factor, stacked, lower=True)
         head, own = y[:, : len(gram)], y[:, len(gram) :]
         logdet += 2 * float(np.log(np.diag(factor)).sum())
@@ -145,7 +160,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
             head = head - basis @ (basis.T @ head)
             logdet += 2 * float(np.log(np.abs(np.diag(triangle))).sum())
         gram += head.T @ head
-        count += len(sample.distances) - own.shape[1]
+        count += len(sample.residuals) - own.shape[1]
     quadratic = gram[0, 0]
     if len(gram) > 1:
         shared, cross = gram[1:, 1:], gram[1:, 0]
@@ -160,7 +175,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
 def estimate_noise(
     samples: list[NoiseSample], cable_length: float, max_points: int = 80, max_poses: int = 60
 ) -> NoiseModel:
-    """Estimate size and correlation of the noise from normal distances of all poses.
+    """Estimate size and correlation of the noise from the residuals of all poses.
 
     Parameters
     ----------
@@ -196,7 +211,7 @@ def tell_of_noise(samples: list[NoiseSample]) -> bool:
 
 def _telling(samples: list[NoiseSample]) -> list[NoiseSample]:
     """Poses with points to spare."""
-    return [x for x in samples if len(x.distances) > x.own.shape[1] + _SPARE_POINTS]
+    return [x for x in samples if len(x.residuals) > x.own.shape[1] + _SPARE_POINTS]
 
 
 @dataclass(frozen=True)
@@ -263,7 +278,7 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
 
 def _degrees(samples: list[NoiseSample]) -> float:
     """Points less the directions that are projected out."""
-    own = sum(len(sample.distances) - sample.own.shape[1] for sample in samples)
+    own = sum(len(sample.residuals) - sample.own.shape[1] for sample in samples)
     return float(max(own - samples[0].shared.shape[1], 1))
 
 
@@ -271,7 +286,7 @@ def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float
     """Logarithm of the geometric mean of the variance of slow modes, in the middle pose for all."""
     sample = samples[len(samples) // 2]
     # Sines vanish at the fixtures, where points may lie: they determine no mode.
-    count = min(SLOW_MODES, len(sample.places) - 3)
+    count = min(SLOW_MODES, max(1, len(sample.places) - 3))
     modes = smooth_modes(sample.places, cable_length, count, free_end=False)
     seen = noise.whitening(sample.places, sample.weight) @ modes
     return -float(np.linalg.slogdet(seen.T @ seen)[1]) / count

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from dlo_casadi.assembly import Given
 from dlo_casadi.equilibrium import NEARBY, Branch, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve, chord_places, line_headings
+from dlo_casadi.estimation.chords import line_headings
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -99,7 +101,7 @@ def measured_branches(
     and the measured one where it is nearer to the points.
     """
     starts = [
-        line_headings(item, model.chain, chord_places(item, model.cable.length))
+        line_headings(item.points, item.pose, model.chain, item.places(model.cable.length))
         if item.readable
         else None
         for item in measured
@@ -123,7 +125,7 @@ def measured_branches(
 
 def _square(prediction: Prediction, item: MeasuredPose) -> float:
     """Mean square distance [m^2] of measured points to a prediction."""
-    return float((prediction.curve.distances(item.points) ** 2).mean())
+    return float((item.distances(prediction.curve) ** 2).mean())
 
 
 def _same(one: Equilibrium, other: Equilibrium) -> bool:
@@ -161,7 +163,7 @@ def rms_distance(
             continue
         if prediction is None:
             return None
-        squares.append(prediction.curve.distances(item.points) ** 2)
+        squares.append(item.distances(prediction.curve) ** 2)
     if not squares:
         return None
     return float(np.sqrt(np.concatenate(squares).mean()))

@@ -11,15 +11,10 @@ from numpy.typing import NDArray
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, SYSTEMATIC_SHARE
 
 FloatArray = NDArray[np.floating]
 
-# 95 % of a standard normal lies within this many standard deviations.
-NORMAL_95 = 1.959964
-# Where a declared noise is taken as white, the lines are still not trusted to be free of a
-# smooth error of this share of it, which no number of points averages out. It is counted on top
-# of the statistical error. An estimated correlation contains such errors already.
-SYSTEMATIC_SHARE = 0.05
 # Search for the interval's ends within this factor of the estimate, in steps growing by two.
 LARGEST_LOG_STEP = float(np.log(1e4))
 
@@ -34,7 +29,9 @@ class Interval:
     @property
     def identifiable(self) -> bool:
         """Whether it is bounded and spans no more than a factor of ten."""
-        return self.low is not None and self.high is not None and self.high <= 10 * self.low
+        if self.low is None or self.high is None:
+            return False
+        return self.high <= IDENTIFIABLE * self.low
 
 
 def threshold(fit: Fit) -> float:
@@ -45,10 +42,10 @@ def threshold(fit: Fit) -> float:
     """
     square = 0.0
     for j, feet in zip(fit.problem.used, fit.point.feet, strict=True):
-        if not fit.noise.declared:
+        if fit.noise.source != "declared":
             break
-        weight = fit.problem.measured[j].relative_std
-        constant = SYSTEMATIC_SHARE * fit.noise.std * weight
+        item = fit.problem.measured[j]
+        constant = SYSTEMATIC_SHARE * fit.noise.std * item.relative_std[item.point_of]
         square += float(((fit.problem.whitening(j, feet) @ constant) ** 2).sum())
     return (NORMAL_95 + np.sqrt(square)) ** 2 * fit.inflation**2
 

@@ -74,7 +74,7 @@ class Fit:
 
     @cached_property
     def determined_unknowns(self) -> float:
-        """Effective number of unknowns that the points determine, priors being what they are."""
+        """Effective number of unknowns that the residuals determine, priors being what they are."""
         problem = self.problem
         effective = problem.unknowns.size - float(np.trace(self.covariance @ problem.precision))
         precision = np.diag(1 / problem.deviation_std**2)
@@ -87,8 +87,8 @@ class Fit:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Number of points minus the effective number of unknowns that they determine."""
-        return max(self.problem.n_points - self.determined_unknowns, 1.0)
+        """Number of residuals minus the effective number of unknowns that they determine."""
+        return max(self.problem.n_residuals - self.determined_unknowns, 1.0)
 
     @property
     def chi2_per_dof(self) -> float:
@@ -97,7 +97,7 @@ class Fit:
 
     @cached_property
     def residual_rms(self) -> float:
-        """Root mean square normal distance of the fitted points [m]."""
+        """Root mean square residual of the fitted points [m]."""
         return float(np.sqrt((np.concatenate(self.linearization.raw) ** 2).mean()))
 
     @cached_property

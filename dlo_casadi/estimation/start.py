@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import DEVIATIONS, Directions, Shapes
 from dlo_casadi.equilibrium import guesses
+from dlo_casadi.estimation.chords import line_headings
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
-from dlo_casadi.estimation.observation import (
-    MeasuredPose,
-    NodeCurve,
-    chord_places,
-    line_headings,
-)
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import Vector
@@ -39,17 +37,17 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     model, used = problem.unknowns.model, problem.used
     chain = model.chain
     # Without forces an element does not know its inner unknowns.
-    plain = chain.kind.plain
     sweep = problem.sweep
-    if plain != chain.element:
-        sweep = Sweep(model.with_mesh(chain.n, plain), problem.sweep.poses)
+    if chain.kind.n_inner:
+        sweep = Sweep(model.with_mesh(chain.n, chain.kind.plain), problem.sweep.poses)
     flat = np.zeros(chain.n_cells)
     first = [guesses(model, model.nominal, flat, item.pose)[0] for item in problem.measured]
     x = np.array(first)[..., None]
     feet: list[FloatArray] = []
     for j in used:
-        places = chord_places(problem.measured[j], chain.length)
-        x[j, :, 0] = line_headings(problem.measured[j], chain, places)
+        item = problem.measured[j]
+        places = item.places(chain.length)
+        x[j, :, 0] = line_headings(item.points, item.pose, chain, places)
         feet.append(places)
     shapes = problem.sweep.start_shapes(x)
     each = _each_node(sweep)
@@ -58,7 +56,8 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
         for k, j in enumerate(used):
             curve = problem.curve_of(seen.z[j])
             if iteration > 1:
-                feet[k] = curve.feet(problem.measured[j].points, feet[k])
+                now = Observed(curve, shapes.lam[j])
+                feet[k] = problem.measured[j].located(now, feet[k])
             if iteration < _KINEMATIC_STEPS:
                 x[j, :, 0] += _kinematic_step(
                     problem.measured[j], model, curve, seen.slopes[j], x[j, :, 0], feet[k]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from dlo_casadi.assembly import Shapes
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
@@ -62,7 +63,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
             moved = cold
         z = sweep.seen(moved, at(log_ei), rest)
         total = sum(
-            float((NodeCurve.of(model.cable.length, row).distances(item.points) ** 2).sum())
+            float((item.distances(NodeCurve.of(model.cable.length, row)) ** 2).sum())
             for row, item in zip(z, used, strict=True)
         )
         return moved, total

@@ -18,15 +18,8 @@ def magnified(pose: PoseInput, shape: PoseShape, factor: int) -> FloatArray:
 
 
 def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray:
-    """Points (K, 2) [m] of the prediction beside the measured ones, distances multiplied."""
-    places = np.linspace(0.0, 1.0, len(shape.curve))
-    slope = np.gradient(shape.curve, places, axis=0)
-    length = max(float(np.hypot(*np.diff(shape.curve, axis=0).T).sum()), 1e-12)
-    at = np.clip(shape.s / length, 0.0, 1.0)
-    tangent = np.stack([np.interp(at, places, slope[:, i]) for i in (0, 1)], axis=1)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.hypot(*tangent.T)[:, None]
-    moved = pose.points - factor * shape.residual[:, None] * normal
-    return np.asarray(moved)
+    """Points (K, d) [m] of the prediction beside the measured ones, distances multiplied."""
+    return np.asarray(pose.points - factor * shape.gap)
 
 
 def measured_line(outcome: Outcome, name: str) -> tuple[FloatArray, FloatArray] | None:

@@ -26,6 +26,7 @@ from dlo_casadi.report.page_boards import next_pose_chart, pull_chart
 from dlo_casadi.report.page_canvas import AFTER, BEFORE, FAINT, HELD_OUT, INK, empty_chart, hover
 from dlo_casadi.report.terminal import cross_validated
 from dlo_casadi.session.outcome import Outcome, Stage
+from dlo_casadi.thresholds import NORMAL_95
 
 _BAND = "#E8EEF3"
 # Errors beyond these are drawn at the edge of an axis [mm].
@@ -264,8 +265,8 @@ def rest_chart(outcome: Outcome) -> Model:
             {
                 "s": rest.s,
                 "value": rest.value,
-                "low": rest.value - 1.96 * rest.std,
-                "high": rest.value + 1.96 * rest.std,
+                "low": rest.value - NORMAL_95 * rest.std,
+                "high": rest.value + NORMAL_95 * rest.std,
             }
         )
         chart.varea("s", "low", "high", source=source, fill_color=AFTER, fill_alpha=0.22)

@@ -25,9 +25,8 @@ from dlo_casadi.report.terminal import (
     verdict_lines,
 )
 from dlo_casadi.session.outcome import Outcome, ParameterEstimate
+from dlo_casadi.thresholds import NORMAL_95
 
-# Half the width of a 95 % interval in standard deviations.
-_TWO_SIDED = 1.96
 # Where a number does not exist.
 NOTHING = "–"
 VERDICT_WORDS = {
@@ -222,8 +221,8 @@ def symmetric_interval(estimate: ParameterEstimate) -> str:
     if estimate.identifiable is False or not estimate.std > 0:
         return ""
     unit = f" {estimate.unit}" if estimate.unit else ""
-    low = estimate.value - _TWO_SIDED * estimate.std
-    high = estimate.value + _TWO_SIDED * estimate.std
+    low = estimate.value - NORMAL_95 * estimate.std
+    high = estimate.value + NORMAL_95 * estimate.std
     return f"{low:.4g} to {high:.4g}{unit}"
 
 

@@ -30,7 +30,7 @@ from dlo_casadi.config import (
     read_document,
     show,
 )
-from dlo_casadi.effects import EFFECTS, Cable, EdgeBias, Effect
+from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
@@ -50,8 +50,6 @@ _ROUNDING = 1e-9
 _LISTED = 5
 # What a prediction depends on beside the values of the parameters.
 _MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
-# Effects that a file may name: those of a configuration, and what every photograph has.
-_KNOWN: dict[str, type[Effect]] = {**EFFECTS, EdgeBias.name: EdgeBias}
 
 
 @dataclass(frozen=True)
@@ -251,7 +249,7 @@ def final_rest(fit: Fit) -> FloatArray:
 
 def _effect_row(effect: Effect) -> dict[str, Any]:
     """Name and label of an effect, and what else it was made with."""
-    if _KNOWN.get(effect.name) is not type(effect):
+    if known_effect(effect.name) is not type(effect):
         raise DloError(f"the effect {effect.name!r} cannot be written to parameters.yaml")
     options = {
         item.name: getattr(effect, item.name) for item in fields(effect) if item.name != "label"
@@ -427,11 +425,11 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
 
 def _effect(row: Mapping[str, Any], k: int) -> Effect:
     name = row["name"]
-    if name not in _KNOWN:
-        raise _DamagedError(
-            ("effects", k), f": no effect is called {name!r}; known: {', '.join(_KNOWN)}"
-        )
-    kinds = {item.name: item.default for item in fields(_KNOWN[name])}
+    kind = known_effect(name)
+    if kind is None:
+        known = ", ".join((*EFFECTS, *NUISANCES))
+        raise _DamagedError(("effects", k), f": no effect is called {name!r}; known: {known}")
+    kinds = {item.name: item.default for item in fields(kind)}
     options: dict[str, Any] = {}
     for key, value in row.items():
         if key == "name":
@@ -444,7 +442,7 @@ def _effect(row: Mapping[str, Any], k: int) -> Effect:
                 ("effects", k, key),
                 f": something like {kinds[key]!r} belongs here, found {show(value)}",
             )
-    return _KNOWN[name](**options)
+    return kind(**options)
 
 
 def _is_like(value: Any, example: Any) -> bool:

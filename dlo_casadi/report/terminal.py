@@ -21,6 +21,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     StageName,
 )
+from dlo_casadi.thresholds import APART, NOTABLE
 
 # Parts of the run in the order in which they are done.
 TIMED = {
@@ -126,10 +127,11 @@ def nuisance_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     """What is known within a tolerance and was adjusted there."""
     fit = outcome.fit
     reported = set(outcome.stages[-1].parameters)
+    hidden = tuple(f"{effect.label}." for effect in fit.model.effects if not effect.shown)
     rows = []
     for q in fit.model.parameters:
         tolerance = fit.model.priors.get(q.name)
-        if tolerance is None or q.name in reported or q.name.startswith("edge_bias."):
+        if tolerance is None or q.name in reported or q.name.startswith(hidden):
             continue
         shift, unit = fit.value(q.name) - q.nominal, f" {q.unit}" if q.unit else ""
         rows.append(
@@ -279,8 +281,6 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     return lines
 
 
-# Rivals so many standard deviations apart are told from one another.
-APART = 3.0
 # Distances [m] that the table of a prediction shows.
 _SHOWN = 5e-6
 # Nobody measures a pose more often.
@@ -309,8 +309,6 @@ DEPENDENCES = {
     "span_z": "the distance of the ends",
     "position_z": "the place in the {plane}",
 }
-# Normal scores beyond it are worth a word.
-NOTABLE = 3.0
 
 
 def structure_lines(outcome: Outcome) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Self
 from dlo_casadi.config import Config
 from dlo_casadi.durable import FolderDraft, is_marked, make_folder, refuse_foreign, write_file
 from dlo_casadi.errors import DloError, OutputError
-from dlo_casadi.measurements import write_centerline
+from dlo_casadi.measurements import write_points
 from dlo_casadi.report.figures import write_figures
 from dlo_casadi.report.json_report import report_text
 from dlo_casadi.report.page import GENERATOR, report_page
@@ -107,7 +107,7 @@ def write_numbers(folder: Path, outcome: Outcome) -> None:
     make_folder(lines)
     for pose in outcome.poses:
         if len(pose.points):
-            write_centerline(lines / f"{pose.name}.csv", pose.points)
+            write_points(lines / f"{pose.name}.csv", pose.points, pose.s)
 
 
 def draw(folder: Path, outcome: Outcome) -> None:

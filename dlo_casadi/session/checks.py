@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
+from dlo_casadi.config import Pose as DeclaredPose
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
@@ -18,14 +19,12 @@ from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import conditions, line_without_end
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.plausibility import (
-    CONTRADICTS,
-    MUCH_BETTER,
-    OUT_OF_STEP,
     Lines,
     Suspicion,
     repeated,
     suspicions,
 )
+from dlo_casadi.thresholds import CONTRADICTS, MUCH_BETTER, OUT_OF_STEP
 
 FloatArray = NDArray[np.floating]
 
@@ -157,7 +156,7 @@ def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicio
     shown = read[:: max(1, -(-len(read) // _POSES))]
     if not shown:
         return ()
-    measured = [MeasuredPose(conditions(declared[item.name]), item.points) for item in shown]
+    measured = [_posed(declared[item.name], item, item.points) for item in shown]
     model = straight(declared_model(config).model).with_mesh(_MESH)
     length = config.cable.length
     own = np.inf
@@ -168,8 +167,8 @@ def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicio
     if not np.isfinite(own):
         return ()  # nothing can be predicted of these poses
     mirrored = [
-        replace(item, points=item.points * [1.0, -1.0] + [0.0, 2 * item.pose.start[1]])
-        for item in measured
+        _posed(pose, item, item.points * [1.0, -1.0] + [0.0, 2 * pose.start[1]])
+        for pose, item in ((declared[item.name], item) for item in shown)
     ]
     x, y = model.gravity
     others = {"y pointing up in the points, which now points down": (model, mirrored)}
@@ -197,6 +196,11 @@ def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicio
     )
 
 
+def _posed(pose: DeclaredPose, item: PoseInput, points: FloatArray) -> MeasuredPose:
+    """A pose with these points in place of those measured."""
+    return MeasuredPose.of_points(conditions(pose), points, s=item.s)
+
+
 def _distance(model: CableModel, factor: float, measured: Sequence[MeasuredPose]) -> float:
     """RMS distance [m] of the points from the shapes of a stiffness; infinite without a shape."""
     p = model.nominal.copy()
@@ -204,7 +208,7 @@ def _distance(model: CableModel, factor: float, measured: Sequence[MeasuredPose]
     rest = np.zeros(model.chain.n_cells)
     predictions = predict_poses(model, p, rest, [item.pose for item in measured])
     gaps = [
-        np.inf if prediction is None else prediction.curve.distances(item.points)
+        np.inf if prediction is None else item.distances(prediction.curve)
         for prediction, item in zip(predictions, measured, strict=True)
     ]
     return float(np.sqrt(np.mean(np.concatenate([np.atleast_1d(gap) for gap in gaps]) ** 2)))

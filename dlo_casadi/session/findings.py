@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.diagnosis.diagnose import AddedEffect, Diagnosis
+from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.result import Fit
 
 
@@ -19,7 +20,7 @@ def effect_rows(diagnosis: Diagnosis) -> tuple[dict[str, Any], ...]:
 def _effect_row(item: AddedEffect, fit: Fit) -> dict[str, Any]:
     return {
         "name": item.candidate.name,
-        "parameters": effect_parameters(fit, item.candidate.effect.label),
+        "parameters": effect_parameters(fit, item.candidate.effect),
         "p_value": item.p_value,
         "rmse_cross_validated_before": item.before.rmse,
         "rmse_cross_validated_after": item.after.rmse,
@@ -27,21 +28,18 @@ def _effect_row(item: AddedEffect, fit: Fit) -> dict[str, Any]:
     }
 
 
-def effect_parameters(fit: Fit, label: str) -> dict[str, dict[str, Any]]:
+def effect_parameters(fit: Fit, effect: Effect) -> dict[str, dict[str, Any]]:
     """Value, standard deviation and unit of an effect's parameters.
 
     Parameters that vanish at infinity are estimated as their inverse; both are given.
     """
     rows: dict[str, dict[str, Any]] = {}
-    for parameter in fit.model.parameters:
-        if not parameter.name.startswith(f"{label}."):
-            continue
-        short = parameter.name.split(".", 1)[1]
-        value, std = fit.value(parameter.name), fit.std(parameter.name)
-        rows[short] = {"value": value, "std": std, "unit": parameter.unit}
-        inverse = INVERSES.get((label, short))
-        if inverse is not None:
-            name, unit = inverse
+    for q in effect.parameters(fit.model.cable):
+        full = f"{effect.label}.{q.name}"
+        value, std = fit.value(full), fit.std(full)
+        rows[q.name] = {"value": value, "std": std, "unit": q.unit}
+        if q.name in effect.inverses:
+            name, unit = effect.inverses[q.name]
             known = value > 0
             rows[name] = {
                 "value": 1 / value if known else None,
@@ -49,13 +47,6 @@ def effect_parameters(fit: Fit, label: str) -> dict[str, dict[str, Any]]:
                 "unit": unit,
             }
     return rows
-
-
-# Estimated parameter -> the name and unit under which its inverse is known.
-INVERSES = {
-    ("bending_softening", "softness"): ("curvature_scale", "1/m"),
-    ("axial_stretch", "compliance"): ("axial_stiffness", "N"),
-}
 
 
 def candidate_rows(diagnosis: Diagnosis) -> tuple[dict[str, Any], ...]:

@@ -9,18 +9,17 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import FITS, Suspicion
+from dlo_casadi.session.plausibility import Suspicion
+from dlo_casadi.thresholds import FITS, HEADING_NEAR, HEADING_OFF
 
 FloatArray = NDArray[np.floating]
 
-# What a clamp and a line may differ by [rad]; a clamp that is askew is up to 0.9 off.
-_OFF = 1.0
-# An explanation is that near [rad].
-_NEAR = 0.5
 # A full turn [rad], as somebody may round it; beyond it the line itself must turn so far.
 _TURN = 6.3
 # Of the length: pieces of which the direction is taken, and the part at an end that is used.
 _STEP, _PART = 0.02, 0.1
+# Between two pieces a line must turn by less, or nobody knows which way round [rad].
+_TELLING = np.pi / 2
 
 
 def wrong_headings(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
@@ -28,8 +27,8 @@ def wrong_headings(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion
     cable, experiment = config.cable, config.experiment
     weight = cable.mass * float(np.hypot(*experiment.gravity))
     layer = np.sqrt(cable.prior_bending_stiffness / max(weight, 1e-12))
-    if layer < 2 * _STEP * cable.length:
-        return ()  # so limp that it may turn within its first points
+    # The weight bends it by 1 / layer beside a clamp: within half of that by a quarter of a radian.
+    reach = min(layer / 2, _PART * cable.length)
     poses = {pose.name: pose for pose in experiment.poses}
     found: list[Suspicion] = []
     for side in ("start", "end"):
@@ -37,12 +36,12 @@ def wrong_headings(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion
             continue
         judged, wrong = 0, {}
         for item in read:
-            shown = _shown(side, poses[item.name], item.points, cable.length)
+            shown = _shown(side, poses[item.name], item.points, cable.length, reach)
             if shown is None:
                 continue
             judged += 1
             declared = getattr(poses[item.name], f"{side}_heading")
-            if abs(shown - declared) > _OFF:
+            if abs(shown - declared) > HEADING_OFF:
                 wrong[item.name] = (declared, shown)
         texts = {
             name: f"its {side}_heading is {declared:g} rad, the line {side}s at {shown:.3g} rad"
@@ -58,10 +57,11 @@ def wrong_headings(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion
     return tuple(found)
 
 
-def _shown(side: str, pose: Pose, points: FloatArray, length: float) -> float | None:
+def _shown(side: str, pose: Pose, points: FloatArray, length: float, reach: float) -> float | None:
     """Heading [rad] of a line at its clamp, as near to the declared one as it may be taken.
 
-    None where the line begins too far from the fixture to tell.
+    None where the line begins too far from the fixture to tell, or its first piece, between points
+    far apart, ends farther than `reach` [m] from it.
     """
     declared = getattr(pose, f"{side}_heading")
     place = pose.start if side == "start" else pose.end
@@ -69,6 +69,10 @@ def _shown(side: str, pose: Pose, points: FloatArray, length: float) -> float | 
     before = float(np.hypot(*(inward[0] - place)))
     s, heading = _headings(inward, _STEP * length)
     if before > FITS * length or len(heading) == 0:
+        return None
+    # Of a loop the chord is short: pieces share the cable's length.
+    whole = s[0] + s[-1]
+    if before + 2 * s[0] * max(1.0, length / whole) > reach:
         return None
     if side == "end":
         heading = heading + np.pi
@@ -86,8 +90,10 @@ def _shown(side: str, pose: Pose, points: FloatArray, length: float) -> float | 
 
 
 def _continued(pose: Pose, points: FloatArray, length: float, best: float) -> float:
-    """The end's heading `best`, with as many turns as the line makes."""
+    """The end's heading `best`, with as many turns as the line makes, if its points tell them."""
     _, heading = _headings(points, _STEP * length)
+    if np.abs(np.diff(heading)).max(initial=0.0) > _TELLING:
+        return best
     begin = heading[0] if pose.start_heading is None else pose.start_heading
     turned = begin + _wrapped(heading[0] - begin) + heading[-1] - heading[0]
     return float(turned + _wrapped(best - turned))
@@ -120,6 +126,6 @@ def _guess(declared: float, shown: float) -> str:
         "counter-clockwise is positive:": -declared,
     }
     for question, value in guesses.items():
-        if abs(_wrapped(value - shown)) < _NEAR:
+        if abs(_wrapped(value - shown)) < HEADING_NEAR:
             return f". Try: {question} then {value:.4g}."
     return ". Try: headings in radians, counter-clockwise from x, along the cable."

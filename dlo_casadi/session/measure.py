@@ -13,7 +13,7 @@ from dlo_casadi.config import Pose as DeclaredPose
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.measurements import read_centerline
+from dlo_casadi.measurements import read_points
 from dlo_casadi.session.outcome import PoseInput
 
 # Points kept of one centre-line; more only repeat their neighbours' noise.
@@ -55,7 +55,7 @@ def read_inputs(config: Config, step: Callable[[str, int, int], None]) -> tuple[
         try:
             if pose.name in skipped:
                 raise MeasurementError(skipped[pose.name])
-            item = _read_image(config, pose) if _is_photograph(config) else _read_csv(pose)
+            item = _read_image(config, pose) if _is_photograph(config) else _read_csv(config, pose)
         except MeasurementError as error:
             item = PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=error.message)
         inputs.append(item)
@@ -77,11 +77,12 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
         reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
         raise MeasurementError(f"no fit pose could be read:\n{reasons}")
     return tuple(
-        MeasuredPose(
+        MeasuredPose.of_points(
             replace(conditions(pose), camera_center=item.camera_center),
             item.points,
             item.weight,
             pose.role == "held_out",
+            item.s,
         )
         for pose, item in zip(config.experiment.poses, inputs, strict=True)
     )
@@ -116,10 +117,11 @@ def _is_photograph(config: Config) -> bool:
     return config.experiment.measurement.kind == "images"
 
 
-def _read_csv(pose: DeclaredPose) -> PoseInput:
-    points = read_centerline(pose.file, pose.start, pose.end)
-    step = max(1, -(-len(points) // MOST_POINTS))
-    return PoseInput(pose.name, pose.role, points[::step])
+def _read_csv(config: Config, pose: DeclaredPose) -> PoseInput:
+    read = read_points(pose.file, pose.start, pose.end, config.cable.length)
+    kept = slice(None, None, max(1, -(-len(read.points) // MOST_POINTS)))
+    s = None if read.s is None else read.s[kept]
+    return PoseInput(pose.name, pose.role, read.points[kept], s=s)
 
 
 def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:

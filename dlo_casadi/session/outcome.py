@@ -74,14 +74,16 @@ class PoseShape:
 
     Parameters
     ----------
-    curve : (M, 2) [m]
+    curve : (M, d) [m]
         Predicted from the end conditions alone, as the camera would see it.
     rmse : float or None [m]
         Root mean square distance of the measured points to it; None without points.
     s : (K,) [m]
         Arc lengths of the measured points.
+    gap : (K, d) [m]
+        Measured minus predicted points.
     residual : (K,) [m]
-        Normal distance of the measured points from the prediction.
+        Distance of the measured points across the prediction; in the plane positive to its left.
     energy : float [J]
     stable : bool
     measured_branch : BranchShape or None
@@ -91,6 +93,7 @@ class PoseShape:
     curve: FloatArray
     rmse: float | None
     s: FloatArray
+    gap: FloatArray
     residual: FloatArray
     energy: float
     stable: bool
@@ -149,8 +152,8 @@ class PoseInput:
     name : str
         File stem.
     role : "fit" or "held_out"
-    points : (K, 2) [m]
-        Centre-line from start to end; empty if it could not be read.
+    points : (K, d) [m]
+        Line or markers from start to end; empty if they could not be read.
     image : Path, optional
         The photograph.
     pixels : (K, 2), optional
@@ -175,6 +178,8 @@ class PoseInput:
         Numbers of the board's markers that were used.
     messages : tuple of str
         What the camera step noticed.
+    s : (K,), optional [m]
+        Known arc lengths of markers.
     """
 
     name: str
@@ -192,6 +197,7 @@ class PoseInput:
     confidence: float | None = None
     markers: tuple[int, ...] | None = None
     messages: tuple[str, ...] = ()
+    s: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -16,19 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-FloatArray = NDArray[np.floating]
+from dlo_casadi.thresholds import (
+    CONTRADICTS,
+    FITS,
+    MUCH_BETTER,
+    NEAR_UNIT,
+    NEARLY_ALL,
+    OUT_OF_STEP,
+    TOO_LONG,
+)
 
-# Shares of the cable's length. Lines end up to 0.08 from their fixtures where a holder or a gap
-# hides the cable; ends that fit are well below, ends that do not are well above.
-FITS, CONTRADICTS = 0.04, 0.1
-# A line longer than so many cables does not follow the cable.
-_TOO_LONG = 1.5
-# Ends that fit another pose need not be as far from their own.
-OUT_OF_STEP = 0.05
-# An explanation leaves at most this share of the misfit.
-MUCH_BETTER = 0.35
-# How far a factor may be from that of a unit.
-_NEAR = 1.25
+FloatArray = NDArray[np.floating]
 
 UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
 
@@ -208,7 +206,7 @@ def too_long(lines: Lines) -> tuple[Suspicion, ...]:
             False,
             lines.names[i],
         )
-        for i in np.flatnonzero(lines.lengths > _TOO_LONG * lines.length)
+        for i in np.flatnonzero(lines.lengths > TOO_LONG * lines.length)
     )
 
 
@@ -270,13 +268,13 @@ def repeated(names: Sequence[str], points: Sequence[FloatArray]) -> tuple[Suspic
 
 def _all_near(ratio: FloatArray, factor: float) -> bool:
     """Whether nearly all ratios are the factor, up to a quarter."""
-    near = (ratio > factor / _NEAR) & (ratio < factor * _NEAR)
-    return bool(near.mean() >= 0.8)
+    near = (ratio > factor / NEAR_UNIT) & (ratio < factor * NEAR_UNIT)
+    return bool(near.mean() >= NEARLY_ALL)
 
 
 def _overall(misfit: FloatArray) -> float:
     """Root mean square over the poses, the worst fifth left out: a pose or two may be wrong."""
-    kept = np.sort(misfit)[: max(1, int(np.ceil(0.8 * len(misfit))))]
+    kept = np.sort(misfit)[: max(1, int(np.ceil(NEARLY_ALL * len(misfit))))]
     return float(np.sqrt(np.mean(kept**2)))
 
 

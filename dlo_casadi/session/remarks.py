@@ -10,11 +10,9 @@ from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.session.fitting import MESH_SHARE, allowed_mesh_error
+from dlo_casadi.session.fitting import allowed_mesh_error
 from dlo_casadi.session.outcome import PoseInput, Stage
-
-# Fixtures that move a prediction by more than this share of the noise get a warning.
-FIXTURES = 0.5
+from dlo_casadi.thresholds import FIXTURES, MESH_SHARE
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
@@ -82,8 +80,7 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
     if spread is not None:
         lines.append(
             f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
-            f"others), the noise is {1e3 * fit.noise.std:.2g} mm: repeatability limits any "
-            "prediction, and intervals from this session are too narrow"
+            f"others), {_beside(fit)}: repeatability limits any prediction"
         )
         lines += [
             f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
@@ -116,6 +113,14 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"{MESH_SHARE:.0%} of the noise: model.n larger?"
         )
     return lines
+
+
+def _beside(fit: Fit) -> str:
+    """What the noise is to the repeats of a pose."""
+    std, length = 1e3 * fit.noise.std, 1e3 * fit.noise.length
+    if fit.noise.source == "repeats":
+        return f"which counts as noise of {std:.2g} mm, correlated over {length:.2g} mm of cable"
+    return f"the noise is {std:.2g} mm, and intervals from this session are too narrow"
 
 
 def _scatter(fit: Fit) -> str:

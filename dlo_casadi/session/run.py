@@ -106,7 +106,7 @@ def fit_session(
     clock.lap("batch")
     progress.step("fit the declared model", 1, 1)
 
-    stages = before_stages(config, declared, measured, fit.model.n, clock, progress)
+    stages = before_stages(config, declared, inputs, measured, fit.model.n, clock, progress)
     reported = _declared_names(config, fit.model)
     stages.append(fit_stage("batch", fit, measured, stiffness_interval(fit), reported))
     clock.lap("fit")
@@ -195,6 +195,7 @@ def close_the_loop(
 def before_stages(
     config: Config,
     declared: Declared,
+    inputs: Sequence[PoseInput],
     measured: Sequence[MeasuredPose],
     n: int,
     clock: Clock,
@@ -212,6 +213,9 @@ def before_stages(
         stages.append(algorithm1_stage(None, measured, length, "switched off"))
     elif not applies(declared.model):
         note = "the paper's loop needs two pinned ends"
+        stages.append(algorithm1_stage(None, measured, length, note))
+    elif any(item.s is not None for item in inputs):
+        note = "the paper's loop needs lines along the cable, not single markers"
         stages.append(algorithm1_stage(None, measured, length, note))
     else:
         progress.step("the paper's loop", 0, 1)
@@ -264,7 +268,7 @@ def _summary(
         poses_held_out=sum(item.held_out for item in readable),
         points=sum(len(item.points) for item in readable),
         std=fit.noise.std,
-        std_source="declared" if fit.noise.declared else "estimated",
+        std_source="declared" if fit.noise.source == "declared" else "estimated",
         correlation_length=fit.noise.length if fit.noise.share > 0 else 0.0,
         held_out_missing=held_out_missing(inputs, config.skipped),
     )

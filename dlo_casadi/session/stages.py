@@ -29,6 +29,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     StageName,
 )
+from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95
 
 FloatArray = NDArray[np.floating]
 
@@ -45,16 +46,18 @@ def pose_shape(
     eq: Equilibrium = prediction.equilibrium
     if not item.readable:
         empty = np.zeros(0)
-        return PoseShape(curve.at(places), None, empty, empty, eq.energy, eq.stable)
-    s = curve.nearest(item.points)
+        none = np.zeros((0, curve.d))
+        return PoseShape(curve.at(places), None, empty, none, empty, eq.energy, eq.stable)
+    s = item.nearest(curve)
     gap = item.points - curve.at(s)
-    residual = (gap * curve.normals(s)).sum(axis=1)
+    across = np.einsum("knd,kd->kn", curve.normals(s), gap)
+    residual = across[:, 0] if curve.d == 2 else np.linalg.norm(across, axis=1)
     rmse = float(np.sqrt((gap**2).sum(axis=1).mean()))
     branch = None
     if other is not None:
-        distances = other.prediction.curve.distances(item.points)
+        distances = item.distances(other.prediction.curve)
         branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)
-    return PoseShape(curve.at(places), rmse, s, residual, eq.energy, eq.stable, branch)
+    return PoseShape(curve.at(places), rmse, s, gap, residual, eq.energy, eq.stable, branch)
 
 
 def _stage(
@@ -125,10 +128,9 @@ def stiffness_stage(
     """Stiffness fitted, straight at rest."""
     p = model.nominal.copy()
     p[0] = found.EI
-    known = found.log_std < np.log(10.0) / 3.92
-    interval = tuple(
-        float(found.EI * np.exp(sign * 1.96 * found.log_std)) if known else None for sign in (-1, 1)
-    )
+    half = NORMAL_95 * found.log_std
+    known = 2 * half < np.log(IDENTIFIABLE)
+    interval = tuple(float(found.EI * np.exp(x)) if known else None for x in (-half, half))
     spread = found.EI * min(found.log_std, 1e3)
     stiffness = ParameterEstimate(
         found.EI, spread, "N m^2", (interval[0], interval[1]), bool(known)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi import CableModel, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.assembly import DEVIATIONS, Given
 from dlo_casadi.equilibrium import JOINT_BOUND
-from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.whole_pose import potential
 from paper import published
 from paper.content import Claim, Part, Section, Table, Target, mm, number, rms

@@ -13,7 +13,6 @@ from dlo_casadi.estimation.algorithm1 import gravity_slopes, run_algorithm1
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.profile import (
-    NORMAL_95,
     Interval,
     stiffness_interval,
     stiffness_profile,
@@ -23,6 +22,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.parallel import map_in_order
 from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from dlo_casadi.session.stages import rest_curvature_of
+from dlo_casadi.thresholds import NORMAL_95
 from paper import branches, chords, published
 from paper.content import Claim, Part, Section, Table, drawing, number
 from paper.fits import FIRST, REST_COEFFICIENTS

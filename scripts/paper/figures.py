@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from paper import published
 from paper.content import Section, drawing
@@ -33,7 +33,7 @@ def deviation(truth: FloatArray, shape: FloatArray) -> FloatArray:
     """Normal distance (k,) [m] of true points from a shape, to the left of its direction."""
     curve = NodeCurve(published.LENGTH, shape, None)
     s = curve.nearest(truth)
-    return ((truth - curve.at(s)) * curve.normals(s)).sum(axis=1)
+    return ((truth - curve.at(s)) * curve.normals(s)[:, 0]).sum(axis=1)
 
 
 def shapes(section: Section, replica: Replica, estimates: Sequence[Estimate]) -> None:

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, DloError
 from dlo_casadi.assembly import DEVIATIONS, Shapes
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Tolerances
 from dlo_casadi.estimation.hyperparameters import settle
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.profile import NORMAL_95, stiffness_interval
+from dlo_casadi.estimation.profile import stiffness_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -33,6 +34,7 @@ from dlo_casadi.parallel import generator_of, map_as_completed
 from dlo_casadi.report.canvas import BLACK, BLUE
 from dlo_casadi.session.declared import nuisances
 from dlo_casadi.session.stages import rest_curvature_of
+from dlo_casadi.thresholds import NORMAL_95
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing, number, rms
 from paper.fits import REST_COEFFICIENTS
@@ -121,7 +123,7 @@ def simulate(truth: Truth, rng: np.random.Generator) -> list[MeasuredPose] | Non
         s = np.sort(rng.uniform(0.01, 0.99, POINTS)) * published.LENGTH
         factor = np.linalg.cholesky(truth.noise.covariance(s, np.ones(POINTS)))
         points = NodeCurve.of(published.LENGTH, z).at(s) + factor @ rng.standard_normal((POINTS, 2))
-        measured.append(MeasuredPose(pose, points))
+        measured.append(MeasuredPose.of_points(pose, points))
     return measured
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import Cable, CableModel
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import Prediction, predict_poses
 from paper import published
 from paper.content import rms
@@ -106,7 +107,7 @@ def make(
     factor = np.linalg.cholesky(noise.covariance(s, np.ones(POINTS)))
     rng = np.random.default_rng(0)
     measured = tuple(
-        MeasuredPose(pose, curve.at(s) + factor @ rng.standard_normal((POINTS, 2)))
+        MeasuredPose.of_points(pose, curve.at(s) + factor @ rng.standard_normal((POINTS, 2)))
         for pose, curve in zip(published.poses(), curves, strict=True)
     )
     truth = np.array([curve.at(PLACES) for curve in curves])

@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 from dlo_casadi import CableModel, CompiledSolver, Pose
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.estimation.batch import solve_batch
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing
@@ -63,7 +64,7 @@ def simulated(poses: int) -> list[MeasuredPose]:
         z = model.assembly.curve(shapes, given)[0]
         s = np.linspace(0.01, 0.99, POINTS) * published.LENGTH
         points = NodeCurve.of(published.LENGTH, z).at(s) + STD * rng.standard_normal((POINTS, 2))
-        out.append(MeasuredPose(pose, points))
+        out.append(MeasuredPose.of_points(pose, points))
     return out
 
 

@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.profile import NORMAL_95
+from dlo_casadi.thresholds import NORMAL_95
 from paper import figures, published
 from paper.content import Claim, Part, Section, Table, Target, mm, number, rms
 from paper.fits import ELEMENTS, FIRST, LABELS, METHODS, Estimate, Method, all_estimates, pick

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from dlo_casadi import CableModel, CompiledSolver, Pose, solve_equilibrium
 from dlo_casadi.assembly import Given, Shapes
-from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.initial import arc_headings
 from dlo_casadi.report.canvas import BLACK, GREY, VERMILLION
 from paper import published

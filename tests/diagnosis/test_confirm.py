@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis.candidates import candidates
+from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.confirm import refit_with
 from dlo_casadi.diagnosis.diagnose import _drop
 from dlo_casadi.diagnosis.pull import _Search
@@ -24,17 +24,23 @@ DECLARED = PLAIN.with_effect(LumpedMass())
 FIXED = {"lumped_mass.mass": 5e-3, "lumped_mass.position": 0.2}  # kg, m; nominal: 0 and L / 4
 
 
+def taper_of(model):
+    """The candidate whose section changes along the cable."""
+    return next(c for c in candidates(model, setup_of(model)) if c.name == "stiffness_gradient")
+
+
 @pytest.fixture(scope="module")
 def base():
     """A cable that tapers and carries a known weight, fitted without the taper."""
-    taper = next(c for c in candidates(PLAIN, None, 1) if c.name == "stiffness_gradient")
-    truth = taper.add_to(DECLARED)
+    truth = taper_of(PLAIN).add_to(DECLARED)
     p = np.array([0.01, *FIXED.values(), 0.4])
     poses = [Pose((0.0, 0.0), (x, y)) for x, y in ((0.3, 0.0), (0.2, -0.2), (0.35, 0.1))]
     rng = np.random.default_rng(0)
     s = np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
     measured = [
-        MeasuredPose(shape_pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2)))
+        MeasuredPose.of_points(
+            shape_pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2))
+        )
         for shape_pose, shape in zip(
             poses, predict_poses(truth, p, np.zeros(truth.chain.n_cells), poses), strict=True
         )
@@ -51,8 +57,8 @@ def kept(fit):
 
 
 def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
-    listed = [c for c in candidates(base.model, None, 3) if c.name == "stiffness_gradient"]
-    (screened,) = Screen(base, listed).run(np.inf)
+    taper = taper_of(base.model)
+    (screened,) = Screen(base, [taper]).run(np.inf)
 
     larger = refit_with(base, screened)
 
@@ -63,7 +69,7 @@ def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
     }
     slope, std = (f("stiffness_gradient.slope") for f in (larger.value, larger.std))
     assert abs(slope - 0.4) < 3 * std
-    smaller = _drop(larger, listed[0])
+    smaller = _drop(larger, taper)
     assert kept(smaller) == FIXED
     assert "lumped_mass.mass" not in smaller.problem.unknowns.names
 

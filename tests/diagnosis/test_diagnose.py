@@ -10,13 +10,13 @@ import pytest
 
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis import diagnose as module
-from dlo_casadi.diagnosis.candidates import candidates
+from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.equivalents import untried_equivalents
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
-from dlo_casadi.effects import LumpedMass
+from dlo_casadi.effects import BendingSoftening, LumpedMass
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -81,7 +81,7 @@ def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
     declared = declared_model(config)
     model = declared.model.with_mesh(20)
     start = fit_of((declared, measured), std=config.experiment.measurement.std)
-    force = next(c for c in candidates(model, None, len(measured)) if c.name == "point_force")
+    force = next(c for c in candidates(model, setup_of(model)) if c.name == "point_force")
     larger = force.add_to(start.model)
     values = larger.nominal.copy()
     for key, value in effect.items():
@@ -111,7 +111,7 @@ def test_the_score_predicts_the_gain_of_a_refit(session):
     """For a small effect the score is the decrease of twice the objective, up to third order."""
     declared, measured = session
     fit = fit_model(declared.model.with_mesh(20), measured, declared.tolerances, std=0.05)
-    listed = candidates(fit.model, None, len(measured))
+    listed = candidates(fit.model, setup_of(fit.model, n_poses=len(measured)))
     screened = {item.candidate.name: item for item in Screen(fit, listed).run(np.inf)}
     item = screened["gravity_tilt"]
     larger = fit_model(item.candidate.add_to(fit.model), measured, declared.tolerances, start=fit)
@@ -123,8 +123,7 @@ def test_the_score_predicts_the_gain_of_a_refit(session):
 def test_leaving_a_pose_out_in_one_step_is_close_to_fitting_again(session):
     declared, measured = session
     added = declared.model.with_mesh(20)
-    effect = next(c for c in candidates(added, None, 6) if c.name == "bending_softening")
-    model = effect.add_to(added)
+    model = added.with_effect(BendingSoftening())
     fit = fit_model(model, measured, declared.tolerances, std=2e-4)
     quick = cross_validate(fit)
     left = fit.problem.indices[0]
@@ -147,7 +146,7 @@ def test_the_place_of_a_mass_of_zero_stops_nothing(session, fit):
     same = fit_model(model, measured, declared.tolerances, start=fit, values=values, free=held)
     here, there = cross_validate(fit), cross_validate(same)
     assert here.squares == pytest.approx(there.squares, rel=1e-3)  # two stops of the same descent
-    assert Screen(same, candidates(model, None, 6)).run(screening_degrees(same))
+    assert Screen(same, candidates(model, setup_of(model, n_poses=6))).run(screening_degrees(same))
 
 
 def test_structure_is_seen_before_and_not_after(fit):

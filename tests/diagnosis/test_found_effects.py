@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis import diagnose as module
-from dlo_casadi.diagnosis.candidates import candidates
+from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.causes import start_from
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.pull import Pull
@@ -38,7 +38,7 @@ def session(name: str, *values: float):
     rng = np.random.default_rng(0)
     s = np.linspace(0.02, 0.98, 30) * CABLE.length
     measured = [
-        MeasuredPose(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(30, 2)))
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(30, 2)))
         for pose, shape in zip(poses, shapes, strict=True)
     ]
     plain = nuisances(CableModel(CABLE, 10, n_rest=5), Tolerances())
@@ -101,7 +101,7 @@ def test_wrong_causes_beside_an_unexplained_residual_are_withdrawn(monkeypatch):
 
 def test_in_one_pose_a_tether_is_a_point_force():
     model = CableModel(CABLE, 10)
-    one, two = ({c.name for c in candidates(model, None, n)} for n in (1, 2))
+    one, two = ({c.name for c in candidates(model, setup_of(model, n_poses=n))} for n in (1, 2))
     assert two - one == {"tether", "plastic_set", "rest_curvature_drift"}
 
 
@@ -109,10 +109,10 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     """Forces k (a - r_j) at the places r_j of the poses' own shapes, by least squares."""
     fit = session("tether", *TETHER)
     stiffness, position, *anchor = TETHER
-    curves = fit.problem.curves(fit.point.theta, fit.point.shapes)
-    places = [curves[j].at(np.array([position]))[0] for j in fit.problem.used]
+    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    places = [seen[j].curve.at(np.array([position]))[0] for j in fit.problem.used]
     pull = Pull(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), 0.0, fit)
-    listed = {c.name: c for c in candidates(fit.model, None, len(ENDS))}
+    listed = {c.name: c for c in candidates(fit.model, setup_of(fit.model, n_poses=len(ENDS)))}
     start = start_from(pull, listed["tether"])
     names = ("stiffness", "position", "anchor_x", "anchor_y")
     assert [start[f"tether.{name}"] for name in names] == pytest.approx(TETHER, rel=1e-9)

@@ -7,8 +7,9 @@ import pytest
 
 from dlo_casadi.diagnosis.next_pose import _separation
 from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
 
 LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4
 
@@ -18,7 +19,7 @@ def separation(noise):
     x = np.linspace(0.0, LENGTH, 11)
     lines = [NodeCurve(LENGTH, np.column_stack([x, 0 * x + y]), None) for y in (0.0, GAP)]
     pose = Pose((0.0, 0.0), (LENGTH, 0.0))
-    measured = SimpleNamespace(pose=pose, relative_std=np.ones(POINTS))
+    measured = MeasuredPose.of_points(pose, np.zeros((POINTS, 2)))
     fit = SimpleNamespace(
         problem=SimpleNamespace(measured=(measured,), used=(0,)),
         point=SimpleNamespace(feet=(np.linspace(0.0, LENGTH, POINTS),)),

@@ -29,7 +29,7 @@ def hung_again(seed: int, scatter: float, count: int = 5) -> list[MeasuredPose]:
         rest = MODEL.rest_basis @ (0.5 + rng.normal(scale=scatter, size=5))
         (shape,) = predict_poses(MODEL, np.array([0.02]), rest, [pose])
         points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2))
-        out.append(MeasuredPose(pose, points))
+        out.append(MeasuredPose.of_points(pose, points))
     return out
 
 

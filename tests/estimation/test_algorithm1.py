@@ -22,8 +22,9 @@ from dlo_casadi.estimation.algorithm1 import (
     gravity_slopes,
     run_algorithm1,
 )
-from dlo_casadi.estimation.observation import MeasuredPose, NodeCurve
-from dlo_casadi.measurements import read_centerline
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.measurements import read_points
 from dlo_casadi.model import CableModel
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
@@ -38,9 +39,9 @@ def session(name: str) -> tuple[Cable, list[MeasuredPose]]:
     data = config.cable
     cable = Cable(data.length, data.mass, data.diameter, data.prior_bending_stiffness, name)
     poses = [
-        MeasuredPose(
+        MeasuredPose.of_points(
             Pose(item.start, item.end, branch=item.branch, name=item.name),
-            read_centerline(item.file, item.start, item.end),
+            read_points(item.file, item.start, item.end).points,
             held_out=item.role == "held_out",
         )
         for item in config.experiment.poses
@@ -68,7 +69,9 @@ def measured(
     for k, end in enumerate(ends):
         pose = Pose((0.0, 0.0), end, branch="ccw", name=f"pose {k}")
         points = solve_equilibrium(model, np.array([stiffness]), rest, pose).points[2:-1]
-        poses.append(MeasuredPose(pose, points + rng.normal(scale=noise, size=points.shape)))
+        poses.append(
+            MeasuredPose.of_points(pose, points + rng.normal(scale=noise, size=points.shape))
+        )
     return poses
 
 
@@ -132,7 +135,7 @@ def test_least_squares_equals_linear_regression_in_the_compliance():
 def test_distance_of_nodes_to_their_nearest_points():
     """r_p by hand: 0.01 m off two points of a line, and a node in a gap that does not count."""
     x = np.concatenate([np.linspace(0.01, 0.3, 30), np.linspace(0.6, 0.99, 40)])
-    line = MeasuredPose(Pose((0.0, 0.0), (1.0, 0.0)), np.stack([x, 0 * x], axis=1))
+    line = MeasuredPose.of_points(Pose((0.0, 0.0), (1.0, 0.0)), np.stack([x, 0 * x], axis=1))
     target = _Target.of(line, gap=0.1)
     nodes = np.array([[0.2, 0.01], [0.42, 0.0], [0.8, -0.01]])
     np.testing.assert_array_equal(target.nearest(nodes)[1], [True, False, True])
@@ -266,7 +269,7 @@ def test_parameters_are_those_of_the_model():
     result = run_algorithm1(CABLE, measured(0.3, ENDS), GRAVITY, n=6, max_iterations=1)
     problem = InnerProblem(CABLE, GRAVITY, 6, c=0.0)
     shape = solve_equilibrium(result.model, result.p, result.rest, Pose((0.0, 0.0), ENDS[0]))
-    line = MeasuredPose(Pose((0.0, 0.0), ENDS[0]), shape.points[1:-1])
+    line = MeasuredPose.of_points(Pose((0.0, 0.0), ENDS[0]), shape.points[1:-1])
     by_paper = problem.objective(
         shape.phi, result.k_theta, result.theta_0, _Target.of(line, gap=1.0)
     )
@@ -276,9 +279,9 @@ def test_parameters_are_those_of_the_model():
 def test_held_out_and_unread_poses_are_not_used():
     poses = measured(0.3, ENDS)
     extra = [
-        replace(poses[0], held_out=True, points=poses[0].points + 0.1),
-        MeasuredPose(poses[1].pose, np.empty((0, 2))),
-        MeasuredPose(Pose((0.0, 0.0), (2.0, 0.0)), poses[2].points),  # out of reach
+        MeasuredPose.of_points(poses[0].pose, poses[0].points + 0.1, held_out=True),
+        MeasuredPose.of_points(poses[1].pose, np.empty((0, 2))),
+        MeasuredPose.of_points(Pose((0.0, 0.0), (2.0, 0.0)), poses[2].points),  # out of reach
     ]
     plain = run_algorithm1(CABLE, poses, GRAVITY, n=5, max_iterations=1)
     more = run_algorithm1(CABLE, [*poses, *extra], GRAVITY, n=5, max_iterations=1)
@@ -291,9 +294,11 @@ def test_only_pins_are_known():
     assert applies(CableModel(CABLE))
     assert not applies(CableModel(CABLE, start="clamped"))
     assert not applies(CableModel(CABLE, end="free"))
-    clamped = MeasuredPose(Pose((0.0, 0.0), (0.5, 0.0), start_heading=0.0, name="p3"), np.eye(2))
+    clamped = MeasuredPose.of_points(
+        Pose((0.0, 0.0), (0.5, 0.0), start_heading=0.0, name="p3"), np.eye(2)
+    )
     with pytest.raises(EstimationError, match="p3: the paper's method knows pinned ends only"):
         run_algorithm1(CABLE, [clamped], GRAVITY)
-    free = MeasuredPose(Pose((0.0, 0.0), name="p4"), np.eye(2))
+    free = MeasuredPose.of_points(Pose((0.0, 0.0), name="p4"), np.eye(2))
     with pytest.raises(EstimationError, match="p4"):
         run_algorithm1(CABLE, [free], GRAVITY)

@@ -30,7 +30,7 @@ def test_noise_of_few_points(points):
     """Five points leave some twenty degrees of freedom in all, good to a factor of two."""
     fit = fitted(points)
     assert STD / 2 < fit.noise.std < 2 * STD
-    assert not fit.noise.declared
+    assert fit.noise.source == "estimated"
     assert 3 <= fit.noise.slow_dof < 8 * points
     assert abs(fit.value("bending_stiffness") - EI) < 3 * fit.std("bending_stiffness")
     # Nothing is missing, so that it is uniform: one seed in two hundred falls below.
@@ -53,7 +53,7 @@ def test_the_residual_of_a_declared_noise_is_tested_against_chi_square(factor, l
 def test_fewer_points_than_unknowns():
     with pytest.raises(
         EstimationError,
-        match=r"the 4 points of 4 fit poses determine \d+\.\d unknowns .* "
+        match=r"the 4 distances of 4 fit poses determine \d+\.\d unknowns .* "
         r"3 are needed.\n  Try: more points on each line, more poses, the noise as "
         r"measurement.std, or rest_shape: straight.",
     ):

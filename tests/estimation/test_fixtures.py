@@ -30,7 +30,7 @@ def moved_session(scatter: float, count: int = 24) -> tuple[Fit, float]:
     true = [replace(p, end=(float(x), float(y))) for p, (x, y) in zip(declared, moved, strict=True)]
     s = np.linspace(0.02, 0.98, 60) * MODEL.cable.length
     measured = [
-        MeasuredPose(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(60, 2)))
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(60, 2)))
         for pose, shape in zip(declared, predict_poses(MODEL, TRUTH, REST, true), strict=True)
     ]
     fit = fit_model(MODEL, measured[::2], Tolerances(end=5e-4), NOISE)

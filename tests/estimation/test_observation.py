@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import (
     NoiseModel,
     NoiseSample,
@@ -12,12 +13,8 @@ from dlo_casadi.estimation.noise import (
     restricted_deviance,
     smooth_modes,
 )
-from dlo_casadi.estimation.observation import (
-    MeasuredPose,
-    NodeCurve,
-    chord_places,
-    normal_rows,
-)
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.sensors import Centerline, Observed, ObservedChange
 
 CURVATURE, LENGTH = 4.0, 0.9  # 1/m, m: turns by 3.6 rad
 RADIUS = 1 / CURVATURE
@@ -81,9 +78,12 @@ def test_points_are_linear_in_the_nodes(links):
     again = NodeCurve.of(LENGTH, table)
     np.testing.assert_array_equal(again.nodes, curve.nodes)
     s = np.linspace(0.0, LENGTH, 31)
-    normals = curve.normals(s)
+    normals = curve.normals(s)[:, 0]
     exact = (normals * curve.at(s)).sum(axis=1)
-    np.testing.assert_allclose(normal_rows(curve, s, normals) @ table.ravel(), exact, atol=1e-14)
+    line = Centerline(on_circle(s), np.ones(len(s)))
+    each = ObservedChange(np.eye(table.size).reshape((*table.shape, -1)), np.zeros((0, table.size)))
+    rows = -line.residual_along(Observed(curve, np.zeros(0)), s, each)
+    np.testing.assert_allclose(rows @ table.ravel(), exact, atol=1e-14)
 
 
 # ---- feet and normals --------------------------------------------------------------------------
@@ -100,7 +100,7 @@ def test_feet_and_normals_on_a_circle():
     # The interpolant is off by 3e-7 m; a foot moves by that over 1 - offset / radius > 0.9,
     # times the curve's slope error h^3 k^3.
     np.testing.assert_allclose(s, exact, atol=2e-6)
-    normals = curve.normals(s)
+    normals = curve.normals(s)[:, 0]
     center = np.array([0.0, RADIUS])
     np.testing.assert_allclose(normals, (center - on_circle(exact)) / RADIUS, atol=2e-5)
     distance = ((points - curve.at(s)) * normals).sum(axis=1)
@@ -116,7 +116,7 @@ def test_nearest_place_on_a_curve_that_meets_itself():
     spiral = np.stack([growing * np.sin(s / RADIUS), -growing * np.cos(s / RADIUS)], axis=1)
     curve = NodeCurve(length, spiral, None)
     places = np.array([0.1, 0.3, 1.2, length - 0.1])
-    beside = curve.at(places) + 1e-3 * curve.normals(places)
+    beside = curve.at(places) + 1e-3 * curve.normals(places)[:, 0]
     found = curve.nearest(beside)
     # A polyline: the foot of a point beside a chord is exact.
     np.testing.assert_allclose(found, places, atol=1e-8)
@@ -139,8 +139,8 @@ def test_first_places_along_the_chords(gap):
         exact = exact[(exact < 0.4) | (exact > 0.45)]
     points = on_circle(exact) + rng.normal(scale=3e-4, size=(len(exact), 2))
     (end,) = on_circle(np.array([LENGTH]))
-    item = MeasuredPose(Pose((0.0, 0.0), (float(end[0]), float(end[1]))), points)
-    places = chord_places(item, LENGTH)
+    item = MeasuredPose.of_points(Pose((0.0, 0.0), (float(end[0]), float(end[1]))), points)
+    places = item.places(LENGTH)
     assert np.all(np.diff(places) >= 0)
     # Noise of 0.3 mm lengthens chords of 18 mm by 2e-4 of themselves; the chord over a gap of
     # 50 mm is short by its k^2 / 24 = 0.2 %: 0.1 mm. Smoothing over 2 % rounds the ends.
@@ -149,10 +149,10 @@ def test_first_places_along_the_chords(gap):
 
 def test_a_pose_knows_whether_it_can_be_read():
     pose = Pose((0.0, 0.0))
-    assert not MeasuredPose(pose, np.empty((0, 2))).readable
-    item = MeasuredPose(pose, np.zeros((3, 2)))
+    assert not MeasuredPose.of_points(pose, np.empty((0, 2))).readable
+    item = MeasuredPose.of_points(pose, np.zeros((3, 2)))
     np.testing.assert_array_equal(item.relative_std, 1.0)
-    weighted = MeasuredPose(pose, np.zeros((3, 2)), weight=np.array([1.0, 2.0, 3.0]))
+    weighted = MeasuredPose.of_points(pose, np.zeros((3, 2)), weight=np.array([1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(weighted.relative_std, [1.0, 2.0, 3.0])
 
 
@@ -204,7 +204,7 @@ def test_restricted_likelihood_of_white_noise_is_unbiased():
     """Projecting out 4 of 20 directions must not make the noise look 10 % smaller."""
     samples = simulated(NoiseModel(3e-4), poses=200, points=20)
     samples = [
-        NoiseSample(x.distances, x.places, x.weight, x.own, np.zeros((20, 0))) for x in samples
+        NoiseSample(x.residuals, x.places, x.weight, x.own, np.zeros((20, 0))) for x in samples
     ]
     _, std = restricted_deviance(NoiseModel(1.0), samples)
     # 200 * 16 degrees of freedom: one standard deviation is 1.25 %.

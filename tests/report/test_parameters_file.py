@@ -185,7 +185,7 @@ def damaged(file, tmp_path, change):
         ),
         (lambda d: d["boundary"].update(end="glued"), "boundary.end must be pinned or clamped"),
         (lambda d: d["effects"].append({"name": "magic", "label": "x"}), "called 'magic'"),
-        (lambda d: d["effects"].pop(), "do not belong together: end_offset.dx, end_offset.dy"),
+        (lambda d: d["effects"].pop(), "do not belong together: image_scale.factor"),
         (lambda d: d["state"]["rest_curvature"].pop(), "20 numbers belong here, found 19"),
         (lambda d: d["parameters"]["end_offset.dx"].update(value=None), "must be finite"),
         (

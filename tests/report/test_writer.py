@@ -9,7 +9,7 @@ from small_sessions import BENCH
 
 from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError, OutputError
-from dlo_casadi.measurements import read_centerline
+from dlo_casadi.measurements import read_points
 from dlo_casadi.report import writer
 from dlo_casadi.report.page import GENERATOR
 from dlo_casadi.report.writer import OWNED, ResultsFolder
@@ -60,8 +60,8 @@ def test_a_run_writes_its_files_and_nothing_else(outcome, quick, tmp_path):
 def test_centre_lines_are_written_as_measured(outcome, quick, tmp_path):
     with ResultsFolder(tmp_path / "results") as folder:
         folder.write(outcome)
-    written = read_centerline(tmp_path / "results" / "centerlines" / "pose_01.csv", (0.0, 0.0))
-    given = read_centerline(BENCH / "short_clean" / "pose_01.csv", (0.0, 0.0))
+    written = read_points(tmp_path / "results" / "centerlines" / "pose_01.csv", (0.0, 0.0)).points
+    given = read_points(BENCH / "short_clean" / "pose_01.csv", (0.0, 0.0)).points
 
     assert np.array_equal(written, given)
 

@@ -43,14 +43,14 @@ def test_the_points_that_weigh_less_are_the_outlying_ones():
     for k, (pose, shape) in enumerate(zip(poses, shapes, strict=True)):
         s = np.linspace(0.02, 0.98, 40 + k) * model.cable.length
         points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 2))
-        measured.append(MeasuredPose(pose, points, held_out=k == 0))
-    measured[2].points[20, 1] += 30 * NOISE
+        points[20, 1] += 30 * NOISE * (k == 2)
+        measured.append(MeasuredPose.of_points(pose, points, held_out=k == 0))
 
     found = reweighted(fit_model(model, measured, Tolerances(), NOISE))
 
     assert [item.pose for item in found] == poses
     assert found[0] is measured[0]
-    assert [len(item.weight) for item in found[1:]] == [41, 42, 43]
+    assert [len(item.relative_std) for item in found[1:]] == [41, 42, 43]
     # A point of d standard deviations weighs as one of noise sqrt(d / 1.5): 4.5 for 30, and 1.7
     # for the 4.5 that one of a hundred thousand has.
-    assert np.flatnonzero(np.concatenate([item.weight for item in found[1:]]) > 2) == 41 + 20
+    assert np.flatnonzero(np.concatenate([item.relative_std for item in found[1:]]) > 2) == 41 + 20

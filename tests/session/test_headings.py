@@ -5,7 +5,7 @@ import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.measurements import write_centerline
+from dlo_casadi.measurements import write_points
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import read_inputs
@@ -15,8 +15,11 @@ BEGINS = (-1.1, -0.6, 0.2)  # rad, where the arcs begin
 TURN = 1.4  # rad, by which they turn
 
 
-def session(folder, change=lambda pose, k: None, turn=TURN):
-    """Configuration and what was read of circular arcs, both ends clamped, 0.3 mm of noise."""
+def session(folder, change=lambda pose, k: None, turn=TURN, apart=5):
+    """Configuration and what was read of circular arcs, both ends clamped, 0.3 mm of noise.
+
+    Points are so many 400th of the cable apart.
+    """
     rng = np.random.default_rng(0)
     poses = []
     for k, begin in enumerate(BEGINS):
@@ -24,8 +27,8 @@ def session(folder, change=lambda pose, k: None, turn=TURN):
         steps = LENGTH / 400 * np.column_stack([np.cos(heading), np.sin(heading)])
         points = np.cumsum(steps, axis=0)
         end = points[-1].tolist()
-        noisy = points[::5] + 3e-4 * rng.standard_normal((80, 2))
-        write_centerline(folder / f"arc_{k}.csv", noisy)
+        noisy = points[::apart] + 3e-4 * rng.standard_normal((len(points[::apart]), 2))
+        write_points(folder / f"arc_{k}.csv", noisy)
         pose = {"file": f"arc_{k}.csv", "start": [0, 0], "end": end, "role": "fit"}
         pose |= {"start_heading": begin, "end_heading": begin + turn}
         change(pose, k)
@@ -91,3 +94,10 @@ def test_a_full_turn_more_than_the_line_has_is_a_mistake(tmp_path):
 
     with pytest.raises(MeasurementError, match="end_heading contradicts 3 of 3 lines"):
         without_implausible(*session(tmp_path, change))
+
+
+@pytest.mark.parametrize("apart", [50, 133, 399])
+def test_points_far_apart_do_not_show_the_direction_of_a_clamp(apart, tmp_path):
+    """A third of the cable on, arcs have turned by radians."""
+    assert wrong_headings(*session(tmp_path, turn=13.0, apart=apart)) == ()
+    assert wrong_headings(*session(tmp_path, turn=-6.0, apart=apart)) == ()

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.measurements import read_centerline, write_centerline
+from dlo_casadi.measurements import read_points, write_points
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.session import run_session
@@ -101,8 +101,8 @@ def changed_line(tmp_path, name, change):
     """The file of a pose with other points."""
 
     def apply(poses):
-        points = read_centerline(SOURCE.parent / f"{name}.csv", (0, 0))
-        write_centerline(tmp_path / f"{name}.csv", change(points))
+        points = read_points(SOURCE.parent / f"{name}.csv", (0, 0)).points
+        write_points(tmp_path / f"{name}.csv", change(points))
         next(pose for pose in poses if Path(pose["file"]).stem == name)["file"] = f"{name}.csv"
 
     return apply

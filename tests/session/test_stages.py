@@ -29,7 +29,7 @@ def measured(*branches, held_out=(), told=False):
     ]
     s = np.linspace(0.02, 0.98, 40) * MODEL.cable.length
     return [
-        MeasuredPose(
+        MeasuredPose.of_points(
             pose if told else replace(pose, branch=None),
             shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2)),
             held_out=k in held_out,

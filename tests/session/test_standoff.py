@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from dlo_casadi.config import load_config
-from dlo_casadi.config.sections import DeclaredEffect
-from dlo_casadi.diagnosis.candidates import candidates
+from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.errors import ConfigError
@@ -42,7 +42,7 @@ def photographed(config, cameras) -> tuple[MeasuredPose, ...]:
         seen = camera - rays * (camera[2] / rays[:, 2:])
         points = seen[:, :2] + STD * rng.standard_normal(curve.shape)
         ends = replace(conditions(pose), camera_center=tuple(camera))
-        measured.append(MeasuredPose(ends, points, held_out=pose.role == "held_out"))
+        measured.append(MeasuredPose.of_points(ends, points, held_out=pose.role == "held_out"))
     return tuple(measured)
 
 
@@ -62,16 +62,28 @@ def test_a_wrong_standoff_is_found_and_not_taken_for_a_scale(config, cameras):
 
 def test_without_a_calibrated_camera_it_is_no_candidate(config):
     model = declared_model(config).model
-    named = [{item.name for item in candidates(model, (0, 0), 8, camera=c)} for c in (True, False)]
+    setups = [setup_of(model, center=(0, 0), n_poses=8, camera=known) for known in (True, False)]
+    named = [{item.name for item in candidates(model, setup)} for setup in setups]
     assert named[0] - named[1] == {"standoff_error"}
 
 
-def test_it_cannot_be_declared_without_a_calibrated_camera(config):
-    effects = (DeclaredEffect(name="standoff_error"),)
-    named = replace(config, model=config.model.model_copy(update={"effects": effects}))
-    assert "standoff_error.distance" in declared_model(named).model.names
-    experiment = config.experiment
-    blind = experiment.measurement.model_copy(update={"camera": None})
-    named = replace(named, experiment=experiment.model_copy(update={"measurement": blind}))
-    with pytest.raises(ConfigError, match=r"standoff_error .* Try: measurement\.camera"):
-        declared_model(named)
+def test_a_configuration_that_was_changed_by_hand_is_checked_again(config):
+    options = config.diagnosis.model_copy(update={"exclude": ("stand_off",)})
+    with pytest.raises(ConfigError, match=r"diagnosis\.exclude: no effect is called 'stand_off'"):
+        declared_model(replace(config, diagnosis=options))
+
+
+def test_it_cannot_be_declared_without_a_calibrated_camera(tmp_path):
+    document = yaml.safe_load(CLEAN.read_text())
+    document["model"] = {"effects": ["standoff_error"]}
+    for pose in document["experiment"]["poses"]:
+        pose["file"] = str(CLEAN.parent / pose["file"])
+    path = tmp_path / "session.yaml"
+    path.write_text(yaml.safe_dump(document))
+    assert "standoff_error.distance" in declared_model(load_config(path)).model.names
+    measurement = document["experiment"]["measurement"]
+    measurement["board"]["standoff"] = 0.0
+    del measurement["camera"]
+    path.write_text(yaml.safe_dump(document))
+    with pytest.raises(ConfigError, match=r"standoff_error: .* Try: measurement\.camera"):
+        load_config(path)

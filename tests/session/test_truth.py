@@ -10,9 +10,10 @@ import pytest
 import yaml
 
 from dlo_casadi.config import DeclaredEffect, load_config
+from dlo_casadi.effects import EFFECTS
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.findings import INVERSES, effect_parameters
+from dlo_casadi.session.findings import effect_parameters
 from dlo_casadi.session.measure import read_poses
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,10 +33,10 @@ GUESS = 0.9
 
 def declared_effect(name: str, true: dict[str, float]) -> DeclaredEffect:
     """An effect as a user declares it who knows about it, in the estimated parameters."""
-    inverse = {(label, known): own for (label, own), (known, _) in INVERSES.items()}
+    inverse = {known: own for own, (known, _) in EFFECTS[name].inverses.items()}
     values = {}
     for key, value in true.items():
-        own = inverse.get((name, key))
+        own = inverse.get(key)
         values[own or key] = GUESS * (1 / value if own else value)
     return DeclaredEffect.model_validate({"name": name, "parameters": values})
 
@@ -61,7 +62,7 @@ def test_stiffness_and_effects_are_those_of_the_truth(name):
     found = {"EI": (fit.value("bending_stiffness"), fit.std("bending_stiffness"))}
     exact = {"EI": truth["bending_stiffness"]}
     for effect, parameters in true.items():
-        rows = effect_parameters(fit, effect)
+        rows = effect_parameters(fit, EFFECTS[effect]())
         for key, value in parameters.items():
             found[f"{effect}.{key}"] = (rows[key]["value"], rows[key]["std"])
             exact[f"{effect}.{key}"] = value

@@ -1,0 +1,206 @@
+"""Sensors: what is measured of a pose, and how it is compared with what a model says.
+
+A sensor's residual is what was measured minus what the model says of it. Its own unknowns, such
+as the places of points along the cable, follow the curve (`located`); derivatives are those at
+fixed own unknowns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.chords import chord_places
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.noise import NoiseModel
+
+FloatArray = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a model says of one pose: its curve, and its multipliers (n_border,) [N, N m]."""
+
+    curve: NodeCurve
+    lam: FloatArray
+
+
+@dataclass(frozen=True)
+class ObservedChange:
+    """How that changes along q directions: `curve` (n + 1, d or 2 d, q), `lam` (n_border, q)."""
+
+    curve: FloatArray
+    lam: FloatArray
+
+
+class Sensor(Protocol):
+    """One measurement of one pose, of R residuals, at K points of the cable (K = 0: of no point).
+
+    The residuals of points come first, `per_point` of each, point by point.
+    """
+
+    @property
+    def points(self) -> FloatArray:
+        """As measured (K, d) [m]."""
+        ...
+
+    @property
+    def weight(self) -> FloatArray:
+        """Relative standard deviations (K,) of the points."""
+        ...
+
+    @property
+    def per_point(self) -> int:
+        """Residuals of a point."""
+        ...
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """First guess of the points' arc lengths (K,) [m], without a curve."""
+        ...
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] at which the points are compared with this curve."""
+        ...
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
+        ...
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,)."""
+        ...
+
+    def residual_along(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> FloatArray:
+        """Change (R, q) of the residual along directions."""
+        ...
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) with W cov W^T = 1."""
+        ...
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """Arc lengths (K,) [m] at which the points belong on a curve that may be far off."""
+        ...
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same with other relative standard deviations."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Points in the board's or the world's frame, compared where they are on the curve."""
+
+    points: FloatArray
+    weight: FloatArray
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,) [m]."""
+        gap = self.points - seen.curve.at(places)
+        return self.components(seen.curve, places, gap[..., None])[:, 0]
+
+    def residual_along(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> FloatArray:
+        """Change (R, q) of the residual along directions."""
+        return -self.components(seen.curve, places, seen.curve.moved(places, along.curve))
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
+        raise NotImplementedError
+
+    @property
+    def per_point(self) -> int:
+        """Residuals of a point."""
+        raise NotImplementedError
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) [1/m] with W cov W^T = 1; the errors of a point are independent."""
+        return np.kron(noise.whitening(places, self.weight), np.eye(self.per_point))
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same points with other relative standard deviations."""
+        return replace(self, weight=weight)
+
+
+@dataclass(frozen=True)
+class Centerline(_Points):
+    """Points somewhere along the cable, compared across its tangent: d - 1 residuals each.
+
+    The arc lengths of their closest points on the curve are the sensor's own unknowns. There the
+    normal distance does not change to first order with s, so that derivatives at fixed s are exact.
+
+    Parameters
+    ----------
+    points : (K, d) [m]
+        In order from start to end.
+    weight : (K,)
+        Relative standard deviations.
+    """
+
+    @property
+    def per_point(self) -> int:
+        """Residuals of a point."""
+        return self.points.shape[1] - 1
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L."""
+        return chord_places(self.points, pose, length)
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] of the closest points, near those given."""
+        return seen.curve.feet(self.points, places)
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """Components along the normals, (K (d - 1), q)."""
+        along = np.einsum("knd,kdq->knq", curve.normals(places), moved)
+        return along.reshape((-1, moved.shape[2]))
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """Arc lengths (K,) [m] of the nearest places on the whole curve."""
+        return curve.nearest(self.points)
+
+
+@dataclass(frozen=True)
+class Markers(_Points):
+    """Points at known arc lengths, compared in all directions: d residuals each.
+
+    Where the cable's length is an unknown, the known arc lengths are shares of the declared one.
+
+    Parameters
+    ----------
+    points : (K, d) [m]
+    weight : (K,)
+        Relative standard deviations.
+    s : (K,) [m]
+        Arc lengths from the start, of the declared length.
+    """
+
+    s: FloatArray
+
+    @property
+    def per_point(self) -> int:
+        """Residuals of a point."""
+        return self.points.shape[1]
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """All components, (K d, q)."""
+        return moved.reshape((-1, moved.shape[2]))
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s

@@ -1,0 +1,175 @@
+"""A new effect is one class and one line in EFFECTS: nothing else has to know of it."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import casadi as ca
+import numpy as np
+import pytest
+import yaml
+
+import dlo_casadi as dlo
+from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.config import load_config
+from dlo_casadi.effects import EFFECTS, Cable, Effect, Fitted, PointForce, PointLoad, Setup
+from dlo_casadi.effects.effect import Params, PointForceAt
+from dlo_casadi.equilibrium import Pose, solve_equilibrium
+from dlo_casadi.errors import ConfigError
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model import CableModel
+from dlo_casadi.parameters import Parameter
+from dlo_casadi.report.parameters_file import load_parameters, parameters_of
+
+NOISE = 3e-4
+LIFT, PLACE = 0.4, 0.35  # N, m
+ENDS = ((0.6, 0.0), (0.3, 0.1), (0.5, -0.3), (0.2, -0.2), (0.65, 0.2), (0.35, -0.45))
+
+
+@dataclass(frozen=True)
+class Balloon(PointLoad):
+    """A balloon tied to the cable: a force against gravity."""
+
+    name = "balloon"
+    inverses: ClassVar = {"lift": ("compliance", "1/N")}
+
+    up: tuple[float, float] = (0.0, 1.0)
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the lift, at most the cable's weight, and its place."""
+        weight = 9.81 * cable.mass
+        lift = Parameter("lift", "N", scale=0.1 * weight, lower=0.0, upper=weight)
+        return (lift, self.position(cable))
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Nothing floats without weight."""
+        return any(setup.gravity)
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """Upwards."""
+        x, y = -np.array(setup.gravity) / max(np.linalg.norm(setup.gravity), 1e-12)
+        return cls(up=(float(x), float(y)))
+
+    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
+        """A balloon at the start lifts nothing."""
+        return "" if values["position"] > 0 else "it is tied to a fixture. Try: position"
+
+    def may_be(self, found: Fitted) -> bool:
+        """Any dead force may be one."""
+        return isinstance(found.effect, PointForce)
+
+    def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
+        """The lift."""
+        return (PointForceAt(params["lift"] * ca.DM(self.up), params["position"]),)
+
+
+@pytest.fixture(scope="module")
+def known():
+    """The line in EFFECTS."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(EFFECTS, Balloon.name, Balloon)
+        yield
+
+
+def write(folder, *, effects=(), tried=(Balloon.name,)):
+    """Write a session of a straight cable with a balloon."""
+    cable = {"name": "light", "length": 0.8, "mass": 0.2, "diameter": 0.01}
+    model = CableModel(Cable(0.8, 0.2, 0.01, 0.1), 40, effects=(Balloon(),), n_rest=0)
+    poses = [Pose((0.0, 0.0), end) for end in ENDS]
+    rest = np.zeros(model.chain.n_cells)
+    shapes = predict_poses(model, np.array([0.1, LIFT, PLACE]), rest, poses)
+    rng, s = np.random.default_rng(0), np.linspace(0.02, 0.98, 30) * 0.8
+    listed = []
+    for k, (end, shape) in enumerate(zip(ENDS, shapes, strict=True)):
+        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(30, 2))
+        file = f"pose_{k}.csv"
+        np.savetxt(folder / file, points, "%.6f", ",", header="x_m,y_m", comments="")
+        role = "held_out" if k == 0 else "fit"
+        listed.append({"file": file, "start": [0.0, 0.0], "end": list(end), "role": role})
+    document = {
+        "cable": {**cable, "bending_stiffness": 0.3, "rest_shape": "straight"},
+        "experiment": {
+            "gravity": [0.0, -9.81],
+            "boundary": {"start": "pinned", "end": "pinned"},
+            "measurement": {"kind": "centerlines", "std": NOISE},
+            "poses": listed,
+        },
+        "model": {"n": 12, "effects": list(effects)},
+        "estimation": {"algorithm1": False},
+        "diagnosis": {"exclude": [name for name in EFFECTS if name not in tried]},
+    }
+    path = folder / "session.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(known, tmp_path_factory):
+    return dlo.fit(write(tmp_path_factory.mktemp("found")))
+
+
+def test_the_diagnosis_finds_it(result):
+    assert result.verdict == "effect_found"
+    (row,) = result.effects
+    assert row["name"] == "balloon"
+    for name, true in (("lift", LIFT), ("position", PLACE)):
+        assert abs(row["parameters"][name]["value"] - true) < 3 * row["parameters"][name]["std"]
+    assert row["parameters"]["compliance"]["value"] == 1 / row["parameters"]["lift"]["value"]
+
+
+def test_the_results_tell_of_it(result, tmp_path):
+    result.write(tmp_path / "results")
+    report = json.loads((tmp_path / "results" / "report.json").read_text())
+    assert [effect["name"] for effect in report["effects"]] == ["balloon"]
+    assert report["stages"][-1]["parameters"]["balloon.lift"]["value"] > 0
+    assert "A balloon tied to the cable" in (tmp_path / "results" / "report.html").read_text()
+    assert "the declared model lacked balloon" in str(result)
+    model, p, *_ = load_parameters(tmp_path / "results")
+    assert model.effects == result.fit.model.effects
+    assert p[model.names.index("balloon.lift")] == result.fit.value("balloon.lift")
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_the_generated_solver_knows_it(result):
+    model, p, rest, _ = parameters_of(result)
+    solver = CompiledSolver(model, p, rest, flags=("-O0",))  # compiles quickly
+    for end in ENDS:
+        expected = solve_equilibrium(model, p, rest, Pose((0.0, 0.0), end))
+        assert solver.solve(end).points == pytest.approx(expected.points, abs=1e-8)
+
+
+def test_it_stands_behind_what_acts_like_it(known, tmp_path):
+    result = dlo.fit(write(tmp_path, tried=(PointForce.name,)))
+    assert "balloon" in result.effects[0]["indistinguishable_from"]
+
+
+def test_it_can_be_declared(known, tmp_path):
+    guess = {"name": "balloon", "parameters": {"lift": 0.3, "position": 0.3}}
+    result = dlo.fit(write(tmp_path, effects=[guess]), diagnosis=False)
+    lift = result.stages[-1].parameters["balloon.lift"]
+    assert abs(lift.value - LIFT) < 3 * lift.std
+    guess["parameters"]["position"] = 0.0
+    with pytest.raises(ConfigError, match=r"balloon: it is tied to a fixture\. Try: position"):
+        load_config(write(tmp_path, effects=[guess]))
+
+
+def test_what_an_effect_does_not_declare_has_a_default():
+    setup = Setup(Cable(0.8, 0.2, 0.01, 0.1), tolerances={"length": 1e-3})
+
+    class Plain(Effect):
+        name = "plain"
+
+        def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+            return (Parameter("size"),)
+
+    effect = Plain.made_for(setup)
+    assert Plain.applies(setup)
+    assert effect.refusal(setup, {"size": 1.0}) == ""
+    assert effect.prior(setup) == {}
+    assert effect.scans(setup) == ({},)
+    assert effect.place({"size": 1.0}) is None
+    assert not effect.may_be(Fitted(effect, setup, {"size": 1.0}, {"size": 0.1}))
