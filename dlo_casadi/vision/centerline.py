@@ -162,13 +162,21 @@ def measure_line(
         end=end,
         diameter=diameter,
         length=course.longest,
-        margin=0.0 if course.folds else _AROUND * course.longest,
+        margin=0.0 if course.in_space else _AROUND * course.longest,
     )
     workings.plane = plane
     chain = find_cable(
         plane, start=start, end=end, diameter=diameter, course=course, workings=workings
     )
-    trace = trace_cable(image, view, chain.strands, start=start, end=end, diameter=diameter)
+    trace = trace_cable(
+        image,
+        view,
+        chain.strands,
+        start=start,
+        end=end,
+        diameter=diameter,
+        in_space=course.in_space,
+    )
     workings.trace = trace
 
     step = max(_SPACING, float(trace.t[-1] - trace.t[0]) / _MOST_POINTS)

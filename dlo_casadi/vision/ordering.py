@@ -26,13 +26,14 @@ class Course:
     shortest, longest : scalar [m]
         Its length lies between them: both are the cable's where that lies in the plane; in front
         of it the picture may show less (a part that points to the camera) or more (a near one).
-    folds : bool
-        Whether it may turn back sharply, as a bend seen from its side does.
+    in_space : bool
+        Whether it may turn back sharply, as a bend seen from its side does, and pass in front of
+        other things than the board.
     """
 
     shortest: float
     longest: float
-    folds: bool = False
+    in_space: bool = False
 
     @property
     def typical(self) -> float:
@@ -109,7 +110,7 @@ def order_strands(
     outwards = np.array([-_tangent(way[::-1], diameter) for way in ways])
     excess = np.abs(np.log(np.repeat(widths, 2))) - 0.25
     worth = seen * (1 - np.clip(0.8 * excess, 0.0, 0.5))
-    gap, link = _links(last, outwards, first, inwards, diameter, course.folds)
+    gap, link = _links(last, outwards, first, inwards, diameter, course.in_space)
     length = course.longest
 
     to_first = np.linalg.norm(first - start, axis=1)

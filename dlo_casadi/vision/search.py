@@ -19,6 +19,7 @@ from dlo_casadi.vision.workings import Workings
 from dlo_casadi.vision.workplane import WorkPlane
 
 _GOOD = -0.7  # cost per length of a cable that is seen nearly from fixture to fixture
+_GOOD_FOLDED = -0.9  # the same where a cable's length in the picture is not known beforehand
 _LEAST = 0.25  # share of the length that must be seen
 _TWIN = 0.5  # other strands this long, relative to the cable, are a second cable
 _ROOT = 3.0  # diameters: so near to the chain begins a strand that it covers twice
@@ -77,6 +78,7 @@ def find_cable(
     contrast = local_contrast(plane.image, plane.reachable, width_px)
     best: _Finding | None = None
     longest = 0.0
+    good = _GOOD_FOLDED if course.in_space else _GOOD
     for candidate in candidate_maps(contrast, area_px):
         for cut in thresholds(candidate[plane.reachable], area_px):
             mask = (candidate > cut) & plane.reachable
@@ -101,7 +103,7 @@ def find_cable(
                     workings.candidate, workings.cut = candidate, cut
                     workings.lines = [line.points for line in lines]
                     workings.chosen = chain.strands
-        if best is not None and best.chain.cost < _GOOD * min(best.chain.total, length):
+        if best is not None and best.chain.cost < good * min(best.chain.total, length):
             break
     if best is None or best.chain.supported < _LEAST * length:
         seen = 0.0 if best is None else best.chain.supported
@@ -112,7 +114,7 @@ def find_cable(
             "picture and in focus? start, end, length and diameter right? a background of another "
             "brightness or colour?"
         )
-    if course.folds:
+    if course.in_space:
         best = replace(best, chain=_with_folds(best, diameter))
         if workings is not None:
             workings.chosen = best.chain.strands

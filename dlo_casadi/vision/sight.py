@@ -186,7 +186,7 @@ def _course(
         nearest = fixtures[:, 2].min() - 0.5 * ahead
         shortest = float(np.linalg.norm(flat[1] - flat[0]))
     longest = length * distance / max(nearest, 0.5 * distance)
-    return Course(max(shortest, 10 * diameter), max(longest, length), folds=True)
+    return Course(max(shortest, 10 * diameter), max(longest, length), in_space=True)
 
 
 def other_stretches(points: Array, t: Array, width: float) -> Array:

@@ -17,7 +17,6 @@ from dlo_casadi.vision.view import Array
 from dlo_casadi.vision.viewpoint import Viewpoint
 
 _DEGREE = 3
-_SPANS = 40  # of the spline: with 80 the lines in space move by less than a tenth of their std
 _GRID = 401  # places along the curve among which the nearest to a pixel is looked for
 _NEAR_PX = 2.0  # px: how far off the first curve may be seen; pixels four times as far do not count
 _TANGENTIAL = 1e-5  # m: a curve does not change by moving along itself
@@ -99,7 +98,7 @@ class CurveFit:
         return at, np.sqrt(np.maximum(np.linalg.eigvalsh(at)[:, -1], 0.0))
 
 
-def first_curve(points: Array, along: Array) -> SpaceCurve:
+def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
     """Smooth curve through scattered points.
 
     Parameters
@@ -108,9 +107,11 @@ def first_curve(points: Array, along: Array) -> SpaceCurve:
         In order.
     along : (P,)
         Not decreasing: how far along the curve each lies.
+    spans : int
+        Polynomials of the spline.
     """
     t = (along - along[0]) / (along[-1] - along[0])
-    n = _SPANS + _DEGREE
+    n = spans + _DEGREE
     basis, rough = _design(t, n), np.diff(np.eye(n), 3, axis=0)
     # a point weighs as much as a wave of three spans that is as high as it is off
     normal = basis.T @ basis + len(points) / n * rough.T @ rough
@@ -242,7 +243,7 @@ def _linearise(curve: SpaceCurve, sight: Sight, motion: Array, t: Array) -> tupl
     turned = points @ camera.rotation.T + camera.translation - motion[3:]
     J[used] = np.hstack(
         [
-            (basis[:, :, None] * by_point[:, None, :]).reshape(len(points), -1),
+            (basis[:, :, None] * by_point[:, None, :]).reshape(len(points), 3 * n),
             np.cross(turned, by_shift),
             by_shift,
         ]
@@ -310,6 +311,8 @@ def _knots(n: int) -> Array:
 
 
 def _design(t: Array, n: int) -> Array:
+    if not len(t):
+        return np.zeros((0, n))
     inside = np.clip(t, 0.0, 1.0 - 1e-12)
     return np.asarray(BSpline.design_matrix(inside, _knots(n), _DEGREE).toarray())
 

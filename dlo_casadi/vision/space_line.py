@@ -17,6 +17,11 @@ from dlo_casadi.vision.space_curve import CurveFit, first_curve, fit_curve_to_si
 from dlo_casadi.vision.view import Array, Camera
 
 _SPACING = 0.0025  # m, as of centre-lines in the plane
+_SPAN = (
+    2.0  # diameters, of the spline: no cable bends sharper; with half of it the lines in space of
+)
+# rendered photographs move by less than a tenth of their std
+_SPANS = (20, 100)
 _AGREE = 0.8  # share of its pixels that a photograph must share with the others
 _AGREE_PX = 1.0  # px, beside four standard deviations: errors of cameras' places
 _FAR = 0.1  # of the length: a line that ends so far from a fixture is not this pose's
@@ -107,7 +112,8 @@ def measure_views(
         except VisionError as error:
             problems[name] = f"{name}: {error.message}"
     fixtures = [np.asarray(at, float) for at in (start, end) if at is not None]
-    fit, order = _agreeing_fit(sights, problems, fixtures, length)
+    spans = int(np.clip(length / (_SPAN * diameter), *_SPANS))
+    fit, order = _agreeing_fit(sights, problems, fixtures, length, spans)
     line = None
     if fit is not None:
         seen = [sights[name] for name in order]
@@ -141,7 +147,11 @@ class _Pair:
 
 
 def _agreeing_fit(
-    sights: dict[str, Sight], problems: dict[str, str], fixtures: list[Array], length: float
+    sights: dict[str, Sight],
+    problems: dict[str, str],
+    fixtures: list[Array],
+    length: float,
+    spans: int,
 ) -> tuple[CurveFit | None, list[str]]:
     """The curve that most photographs agree on, and their names.
 
@@ -160,7 +170,7 @@ def _agreeing_fit(
                 del sights[name]
             return None, []
         names = list(sights)
-        fit = _fit(sights, pair) if pair.match.share > _AGREE else None
+        fit = _fit(sights, pair, spans) if pair.match.share > _AGREE else None
         if fit is None or not _possible(fit, fixtures, length):
             _blame(sights, problems, pair, fixtures)
             continue
@@ -190,13 +200,13 @@ def _best_pair(sights: dict[str, Sight]) -> _Pair:
     return max(pairs, key=lambda pair: (pair.match.share > _AGREE, np.sin(pair.angle)))
 
 
-def _fit(sights: dict[str, Sight], pair: _Pair) -> CurveFit:
+def _fit(sights: dict[str, Sight], pair: _Pair, spans: int) -> CurveFit:
     """First curve of a pair, moved onto what all photographs show."""
     one, other = (sights[name] for name in pair.names)
     match = pair.match
     points = triangulate(one, other, match)
     along = chord_length(one.pixels)[match.first] + chord_length(other.pixels)[match.second]
-    return fit_curve_to_sights(list(sights.values()), first_curve(points, along))
+    return fit_curve_to_sights(list(sights.values()), first_curve(points, along, spans))
 
 
 def _possible(fit: CurveFit, fixtures: list[Array], length: float) -> bool:

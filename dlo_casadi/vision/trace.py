@@ -17,6 +17,7 @@ from dlo_casadi.vision.refine import (
     cable_direction,
     edge_shape,
     find_edges,
+    local_directions,
     sample_profiles,
 )
 from dlo_casadi.vision.view import Array, View
@@ -46,7 +47,7 @@ class Trace:
     glare : (K,) bool
         Whether the place of the cable is overexposed.
     direction : (3,)
-        Weights of blue, green and red by which the cable stands out.
+        Weights of blue, green and red by which most of the cable stands out.
     shape : EdgeShape
         Typical width and blur; a width of 0 where no edges were found.
     width_std : scalar [m]
@@ -72,11 +73,13 @@ def trace_cable(
     start: Array,
     end: Array | None,
     diameter: float,
+    in_space: bool = False,
 ) -> Trace:
     """Lay a smooth curve through the strands and move it onto the middle between the edges.
 
     Two rounds on nearly raw profiles tell which of them show the cable; a last one measures on
-    profiles that are averaged along the cable, over sound ones only.
+    profiles that are averaged along the cable, over sound ones only. In space the cable may pass in
+    front of things of several colours.
     """
     curve, t = _first_curve(strands, diameter, start, end)
     bright = image.astype(np.float32)
@@ -86,7 +89,8 @@ def trace_cable(
         usual = profiles.inside
     if usual.sum() < 8:
         return _nothing(curve, t, profiles.inside)
-    direction = cable_direction(profiles, usual, diameter)
+    common = cable_direction(profiles, usual, diameter)
+    direction = local_directions(profiles, common, usual, diameter) if in_space else common
     guess = EdgeShape(diameter, 0.8 / view.scale)
     for _ in range(2):
         raw = sample_profiles(bright, view, curve, t, diameter)
@@ -110,7 +114,7 @@ def trace_cable(
     scatter = np.abs(fine.width[sound] - shape.width)
     width_std = 1.4826 * float(np.median(scatter)) if len(scatter) else 0.0
     glare = _glare(raw, diameter)
-    return Trace(t, points, std, sound, raw.inside, glare, direction, shape, width_std)
+    return Trace(t, points, std, sound, raw.inside, glare, common, shape, width_std)
 
 
 def _glare(profiles: Profiles, diameter: float) -> NDArray[np.bool_]:

@@ -70,6 +70,8 @@ class Viewpoint:
     def project(self, points: ArrayLike) -> tuple[Array, Array]:
         """Pixels (K, 2) [px] of points (K, 3) [m], and d(pixel)/d(point) (K, 2, 3) [px/m]."""
         at = self.in_camera(points)
+        if not len(at):
+            return np.zeros((0, 2)), np.zeros((0, 2, 3))
         still = np.zeros(3)
         pixels, slopes = cv2.projectPoints(
             at, still, still, self.camera.matrix, self.camera.distortion
