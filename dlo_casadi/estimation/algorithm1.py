@@ -250,9 +250,7 @@ class InnerProblem:
         beta = c n.
     """
 
-    def __init__(
-        self, cable: Cable, gravity: tuple[float, float], n: int, c: float = WEIGHT
-    ) -> None:
+    def __init__(self, cable: Cable, gravity: tuple[float, ...], n: int, c: float = WEIGHT) -> None:
         self.chain = Chain(cable.length, n, "link")
         self.weight = cable.mass / n * np.array(gravity)
         self.beta = c * n
@@ -305,7 +303,7 @@ class InnerProblem:
 
     def first_guess(self, pose: Pose, target: _Target) -> FloatArray:
         """Arc through both ends on the pose's branch, or nearer to the measured points."""
-        sides = {"ccw": (1,), "cw": (-1,), None: (1, -1)}[pose.branch]
+        sides = {"ccw": (1,), "cw": (-1,)}.get(pose.branch or "", (1, -1))
         arcs = [
             arc_headings(self.chain.places, self.chain.length, np.zeros(2), target.end, side)
             for side in sides
@@ -375,7 +373,7 @@ class InnerProblem:
 def run_algorithm1(
     cable: Cable,
     poses: Sequence[MeasuredPose],
-    gravity: tuple[float, float],
+    gravity: tuple[float, ...],
     n: int = 10,
     inner: Inner = "ipopt",
     c: float = WEIGHT,
@@ -460,7 +458,7 @@ def run_algorithm1(
 
 
 def _usable(
-    cable: Cable, poses: Sequence[MeasuredPose], gravity: tuple[float, float], n: int
+    cable: Cable, poses: Sequence[MeasuredPose], gravity: tuple[float, ...], n: int
 ) -> list[MeasuredPose]:
     """Fit poses that have points and are within reach."""
     model = CableModel(cable, n=n, element="link", gravity=gravity)
