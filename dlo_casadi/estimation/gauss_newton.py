@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -218,7 +217,8 @@ class BatchProblem:
     def evaluate(self, theta: FloatArray, shapes: Shapes, feet: list[FloatArray]) -> Point:
         """Objective at given unknowns and equilibria."""
         seen = self.observed(theta, shapes)
-        moved, residuals = [], []
+        moved: list[FloatArray] = []
+        residuals: list[FloatArray] = []
         for j, guess in zip(self.used, feet, strict=True):
             item = self.measured[j]
             s = item.located(seen[j], guess)
@@ -336,15 +336,14 @@ class BatchProblem:
         lin = self.linearize(point)
         for _ in range(max_iterations):
             limit = point.objective + 1e-9 * abs(point.objective)
-            for attempt in count():
-                trial = self._ahead(point, lin, damping, limit, WATCHED)
-                if trial is not None:
-                    break
+            before, trial = damping, self._ahead(point, lin, damping, limit, WATCHED)
+            while trial is None:
                 damping = max(10 * damping, 1e-4)
                 if damping > 1e8:
                     return point, False
+                trial = self._ahead(point, lin, damping, limit, WATCHED)
             gains = [*gains[1:], point.objective - trial.objective]
-            if attempt == 0:
+            if damping == before:
                 damping = damping / 10 if damping > 1e-6 else 0.0
             point = trial
             lin = self.linearize(point)
