@@ -1,6 +1,7 @@
 """Photographs to centre-lines: arrays in, arrays out."""
 
 from dlo_casadi.vision.board import Board, locate_board, locate_camera
+from dlo_casadi.vision.calibration import Calibration, calibrate_camera
 from dlo_casadi.vision.centerline import Centerline, extract_centerline
 from dlo_casadi.vision.correspondence import places_along
 from dlo_casadi.vision.image import read_image
@@ -14,6 +15,7 @@ from dlo_casadi.vision.workings import Workings
 
 __all__ = [
     "Board",
+    "Calibration",
     "Camera",
     "Centerline",
     "Outline",
@@ -24,6 +26,7 @@ __all__ = [
     "Viewpoint",
     "Views",
     "Workings",
+    "calibrate_camera",
     "compare_pixels",
     "draw_steps",
     "extract_centerline",
