@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
-from dlo_casadi.descent import descend
+from dlo_casadi.descent import Minima, descend
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, arc_into_clamps, limited, wrapped
 from dlo_casadi.initial_frames import guessed_frames_of
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import COARSE_MESH, CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Frame
@@ -231,6 +231,9 @@ IPOPT_ITERATIONS = 300
 FAR, CURVED = 1.5, 1.0
 # Farther no end is moved at once [lengths, rad]: shapes near a fold are followed, not jumped over.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
+# In space first guesses are followed on a coarse mesh, and so many of the lowest minima that they
+# lead to on the model's own.
+FEW = 2
 # A joint so near to its bound is at it [rad].
 AT_BOUND = 1e-6
 
@@ -644,9 +647,14 @@ def _in_space(
     """
     starts = np.array([x_init] if x_init is not None else first_nodes(model, p, rest, pose))
     count = len(starts)
-    given = Given.of(p, rest, np.repeat(pose.vector[None], count, axis=0))
     first = Shapes.declared(starts, np.zeros((count, model.n_border)))
-    found = descend(model.assembly, first, given)
+    found: Minima | None = None
+    if count > 1 and model.n > COARSE_MESH:
+        likely = _coarse_minima(model, p, rest, pose)
+        if likely is not None:
+            found = descend(model.assembly, likely, _repeated(p, rest, pose, likely))
+    if found is None or not found.converged.any():
+        found = descend(model.assembly, first, _repeated(p, rest, pose, first))
     if not found.converged.any():
         raise EquilibriumError(
             f"no stable equilibrium found from {count} first guesses with its end at {pose.end} m "
@@ -658,13 +666,45 @@ def _in_space(
         )
     best = int(np.where(found.converged, found.energy, np.inf).argmin())
     one = np.array([best])
-    shapes, given = found.shapes.subset(one), given.subset(one)
+    shapes = found.shapes.subset(one)
+    given = _repeated(p, rest, pose, shapes)
     _, force, _ = model.assembly.balance(shapes, given)
     residual = float(np.abs(force.y).max(initial=0.0))
     none = np.zeros(model.chain.n_nodes - 1)
     return _equilibrium(
         model, shapes, given, none, residual, Status.STABLE, int(found.iterations[best])
     )
+
+
+def _repeated(p: FloatArray, rest: FloatArray, pose: Pose, shapes: Shapes) -> Given:
+    """One pose, for each of some shapes."""
+    return Given.of(p, rest, np.repeat(pose.vector[None], len(shapes.x), axis=0))
+
+
+def _coarse_minima(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> Shapes | None:
+    """The lowest minima of a coarse mesh that differ, on the model's mesh; None without any."""
+    coarse, fine = model.coarse, model.chain
+    edges = np.concatenate([fine.cells[:1, 0], fine.cells[:, 1]])
+    widths = np.diff(edges)
+    means = []
+    for part in fine.by_axis(rest[:, None]):
+        turn = np.concatenate([[0.0], np.cumsum(part[:, 0] * widths)])
+        low, high = (np.interp(side, edges, turn) for side in coarse.chain.cells.T)
+        means.append((high - low) / np.diff(coarse.chain.cells, axis=1).ravel())
+    own = np.concatenate(means)
+    first = np.array(first_nodes(coarse, p, own, pose))
+    shapes = Shapes.declared(first, np.zeros((len(first), coarse.n_border)))
+    found = descend(coarse.assembly, shapes, _repeated(p, own, pose, shapes))
+    kept: list[int] = []
+    for k in np.argsort(np.where(found.converged, found.energy, np.inf)):
+        x = found.shapes.x
+        differs = all(not model.node.same(x[k], x[other], NEARBY) for other in kept)
+        if found.converged[k] and differs and len(kept) < FEW:
+            kept.append(int(k))
+    if not kept:
+        return None
+    nodes = model.node.interpolated(fine.places, coarse.chain.places, found.shapes.x[kept])
+    return Shapes.declared(nodes, found.shapes.lam[kept])
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,8 @@ STIFFNESS_PRIOR_STD = float(np.log(1e3))
 ROLL_STD = 1.0
 TORSIONAL_STIFFNESS = "torsional_stiffness"
 STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
+# Elements of `CableModel.coarse`.
+COARSE_MESH = 10
 # Roll of the end clamp about the cable against what is declared [rad]: rest twist, see design.
 END_ROLL = "end_roll"
 # Numbers that tell where the camera of a pose stood, see `Pose.vector`.
@@ -249,6 +251,11 @@ class CableModel:
     def with_mesh(self, n: int, element: str | None = None) -> CableModel:
         """Return the same model on another mesh."""
         return replace(self, n=n, element=element or self.element)
+
+    @cached_property
+    def coarse(self) -> CableModel:
+        """The same model on a coarse mesh, kept with its functions."""
+        return self.with_mesh(COARSE_MESH)
 
     def _filling(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
         """Effects of one slot of the model with their own parameters."""

@@ -24,7 +24,7 @@ FloatArray = NDArray[np.floating]
 # Places kept from the scan for a full fit.
 TRIED = 3
 PULL_PLACES = tuple(float(share) for share in np.linspace(0.1, 0.9, 9))
-COARSE = 20
+COARSE, COARSE_IN_SPACE = 20, 10
 # Standard deviation of a pull about the mean of the poses, in weights of the cable.
 PULL_WEIGHTS = 1.0
 # Gauss-Newton steps along the flat valley of stiffness against force.
@@ -70,7 +70,8 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
     """
     effect = UnknownPull()
     model = base.model.with_effect(effect)
-    search = _Search(base, model.with_mesh(min(COARSE, model.n)), f"{effect.label}.position")
+    coarse = min(COARSE_IN_SPACE if model.in_space else COARSE, model.n)
+    search = _Search(base, model.with_mesh(coarse), f"{effect.label}.position")
     length, name = model.cable.length, search.position
     best: Fit | None = None
     for fit in search.run(executor or InProcess()):
@@ -137,6 +138,10 @@ class _Search:
         problem = self.held_at(share)
         unknowns = problem.unknowns
         theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.n_coefficients))
+        if self.model.in_space:
+            # Frames tell the stiffness over the weight better than headings do; a start costs more.
+            theta = unknowns.pack(self.base.values_in(self.model), self.base.coefficients)
+            return next(iter(starting_points(problem, theta, (0,))), None)
         points = starting_points(problem, theta)
         return points[0] if points else None
 

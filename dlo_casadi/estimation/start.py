@@ -147,8 +147,9 @@ def all_at_once(
         slopes = unknowns.slopes(theta)
         try:
             along = sweep.directions(shapes, p, rest, slopes, unknowns.rest_slopes)
-            force, matrix = sweep.balance(shapes, p, rest)
-            correction = matrix.factor().solve(Vector(-force.x, -force.y))
+            force = sweep.imbalance(shapes, p, rest)
+            assert along.tangent is not None
+            correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
         except np.linalg.LinAlgError:
             return None
         point = problem.evaluate(theta, shapes, feet)

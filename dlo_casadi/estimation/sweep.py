@@ -100,6 +100,10 @@ class Sweep:
         """Imbalance and tangent matrices; `rest` is that before the first pose, or of each."""
         return self.assembly.balance(shapes, self._given(shapes, p, rest))[1:]
 
+    def imbalance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Vector:
+        """Imbalance alone, for a small part of the cost."""
+        return self.assembly.imbalance(shapes, self._given(shapes, p, rest))
+
     def moved(self, shapes: Shapes, step: Vector, share: FloatArray | float = 1.0) -> Shapes:
         """Shapes after a share (m,) of a step of one column."""
         s = np.broadcast_to(share, (len(shapes.x),))
@@ -275,7 +279,9 @@ class Sweep:
         if self.model.has_state:
             slopes_after = self.assembly.state_after(shapes, given)
             if slopes_after[1].any() or not self.assembly.rest_stays(slopes_after):
-                return self._carried(shapes, given, matrix, still, slopes_after)
+                return replace(
+                    self._carried(shapes, given, matrix, still, slopes_after), tangent=matrix
+                )
             # A state that is not there yet hands on what it finds, and its own parameters' part.
             left = slopes_after[3] @ p_along
             still.rest[1:] += left[:-1].cumsum(axis=0)

@@ -31,6 +31,7 @@ from dlo_casadi.session.findings import (
     unexplained_row,
 )
 from dlo_casadi.session.fitting import (
+    FIRST_MESH_IN_SPACE,
     SEARCH_MESH,
     fine_enough,
     fit_declared,
@@ -205,7 +206,9 @@ def before_stages(
     plain = straight(declared.model).with_mesh(n)
     progress.step("stiffness alone", 0, 1)
     stages = [initial_stage(plain, measured)]
-    stages.append(stiffness_stage(plain, measured, fit_stiffness(plain, measured)))
+    # One number of a model that is far off by itself: a coarse mesh finds it.
+    coarse = plain.with_mesh(min(n, FIRST_MESH_IN_SPACE)) if plain.in_space else plain
+    stages.append(stiffness_stage(plain, measured, fit_stiffness(coarse, measured)))
     progress.step("stiffness alone", 1, 1)
     clock.lap("fit")
     if not config.estimation.algorithm1:
