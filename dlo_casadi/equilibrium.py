@@ -689,7 +689,7 @@ def _coarse_minima(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pos
     edges = np.concatenate([fine.cells[:1, 0], fine.cells[:, 1]])
     widths = np.diff(edges)
     means = []
-    for part in fine.by_axis(rest[:, None]):
+    for part in fine.by_strain(rest[:, None]):
         turn = np.concatenate([[0.0], np.cumsum(part[:, 0] * widths)])
         low, high = (np.interp(side, edges, turn) for side in coarse.chain.cells.T)
         means.append((high - low) / np.diff(coarse.chain.cells, axis=1).ravel())
