@@ -18,8 +18,9 @@ from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
-# Steps per decade of the first search, over three decades to both sides of the prior.
-_PER_DECADE = 3
+# Steps per decade of the first search, over so many decades to both sides of the prior; in space,
+# where a shape costs thirty times as much, over fewer.
+_PER_DECADE, _DECADES, _DECADES_IN_SPACE = 3, 3, 1
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,10 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         straight = np.tile(model.node.identity, (len(used), model.chain.n_nodes, 1))
         first = sweep.start_shapes(straight)
     step = np.log(10) / _PER_DECADE
+    decades = _DECADES_IN_SPACE if model.in_space else _DECADES
     for direction in (1, -1):
         shapes = first
-        for k in range(3 * _PER_DECADE + 1):
+        for k in range(decades * _PER_DECADE + 1):
             log_ei = prior + direction * k * step
             shapes, total = follow(shapes, log_ei - direction * min(k, 1) * step, log_ei)
             grid[log_ei] = (shapes, total)

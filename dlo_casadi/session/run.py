@@ -109,7 +109,9 @@ def fit_session(
 
     stages = before_stages(config, declared, inputs, measured, fit.model.n, clock, progress)
     reported = _declared_names(config, fit.model)
-    stages.append(fit_stage("batch", fit, measured, stiffness_intervals(fit), reported))
+    # A diagnosis that finds nothing replaces this stage, intervals and all.
+    intervals = {} if config.diagnosis.enabled else stiffness_intervals(fit)
+    stages.append(fit_stage("batch", fit, measured, intervals, reported))
     clock.lap("fit")
     outcome = Outcome(
         config=config,
@@ -166,14 +168,18 @@ def close_the_loop(
         fit = solved_by_ipopt(fit)
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
-    intervals = stiffness_intervals(fit)
+    complete = not diagnosis.added and not diagnosis.unexplained
+    intervals = stiffness_intervals(fit if complete or diagnosis.added else outcome.fit)
     if diagnosis.added:
+        first = stiffness_intervals(outcome.fit)
+        stages[-1] = fit_stage("batch", outcome.fit, measured, first, reported)
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [name for name in fit.model.names if name.split(".")[0] in labels]
         stages.append(fit_stage("closed", fit, measured, intervals, [*reported, *names]))
-    elif not diagnosis.unexplained:
+    else:
         # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
-        stages[-1] = fit_stage("batch", fit, measured, intervals, reported)
+        shown = fit if complete else outcome.fit
+        stages[-1] = fit_stage("batch", shown, measured, intervals, reported)
     clock.lap("diagnosis")
     return replace(
         outcome,
