@@ -61,6 +61,8 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         )
         moved, converged = sweep.solve(start, at(log_ei), rest)
         if not converged.all() or not sweep.stable(moved, at(log_ei), rest).all():
+            if model.in_space:
+                return shapes, np.inf
             cold = _cold(model, at(log_ei), rest, used)
             if cold is None:
                 return shapes, np.inf
