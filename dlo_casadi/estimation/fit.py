@@ -19,10 +19,10 @@ from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.repeats import with_repeats
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import all_at_once, measured_shapes
+from dlo_casadi.estimation.start import LOOKS, LOOKS_IN_SPACE, all_at_once, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
-from dlo_casadi.model import STIFFNESSES, CableModel
+from dlo_casadi.model import END_ROLL, STIFFNESSES, CableModel
 from dlo_casadi.parallel import map_in_order
 
 FloatArray = NDArray[np.floating]
@@ -58,9 +58,12 @@ def starting_points(
         start[stiffnesses] += decade * np.log(10)
     shapes, feet = measured_shapes(problem)
     problem.refresh(feet)
-    held = np.zeros(problem.unknowns.size, dtype=bool)
-    held[: problem.unknowns.n_parameters] = True
-    begin = partial(all_at_once, problem, shapes, feet, held=held)
+    # The roll of a cable in its end clamp is as unknown as its rest shape.
+    names = problem.unknowns.names
+    held = np.array([k < problem.unknowns.n_parameters for k in range(len(names))])
+    held &= np.array([name != END_ROLL for name in names])
+    looks = LOOKS_IN_SPACE if problem.unknowns.model.in_space else LOOKS
+    begin = partial(all_at_once, problem, shapes, feet, held=held, looks=looks)
     found = map_in_order(executor or InProcess(), begin, starts)
     points = [point for point in found if point is not None and np.isfinite(point.objective)]
     return sorted(points, key=lambda point: point.objective)

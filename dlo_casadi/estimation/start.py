@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,10 @@ from dlo_casadi.rod.band import Vector
 FloatArray = NDArray[np.floating]
 
 _KINEMATIC_STEPS = 8
+# A step of all nodes below this [rad] has settled what is solved for all at once.
+SETTLED = 1e-3
+# In space frames take longer: of three sessions, one settled after 6 iterations, two after 12.
+LOOKS, LOOKS_IN_SPACE = (6,), (6, 12, 20)
 
 
 def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
@@ -120,7 +125,7 @@ def all_at_once(
     feet: list[FloatArray],
     theta: FloatArray,
     held: NDArray[np.bool_],
-    iterations: int = 6,
+    looks: Sequence[int] = LOOKS,
 ) -> Point | None:
     """Gauss-Newton on shapes, multipliers and unknowns together, from inconsistent values.
 
@@ -131,18 +136,21 @@ def all_at_once(
     ----------
     held : (size,) bool
         Entries of theta that stay where they are.
+    looks : sequence of int
+        Iterations after which equilibria are looked for.
 
     Returns
     -------
     Point or None
-        An equilibrium near the measured shapes, or None if there is none.
+        Of the equilibria found, the best. An equilibrium near the measured shapes, or None if there is none.
     """
     unknowns, sweep = problem.unknowns, problem.sweep
     lower, upper = unknowns.bounds
     moving = ~held
     columns = sweep.used_deviations
     own = np.diag(1 / problem.deviation_std**2 + 1e-12)
-    for _ in range(iterations):
+    best: Point | None = None
+    for iteration in range(max(looks)):
         p, rest = unknowns.p(theta), unknowns.rest(theta)
         slopes = unknowns.slopes(theta)
         try:
@@ -151,7 +159,7 @@ def all_at_once(
             assert along.tangent is not None
             correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
         except np.linalg.LinAlgError:
-            return None
+            return best
         point = problem.evaluate(theta, shapes, feet)
         ahead = problem.linearize_along(point, along, _only(along, correction))
         gap = theta - problem.mean
@@ -182,11 +190,16 @@ def all_at_once(
         theta = theta + step
         feet = point.feet
         if not np.all(np.isfinite(shapes.x)):
-            return None
-    final, converged = sweep.solve(shapes, unknowns.p(theta), unknowns.rest(theta), 40)
-    if not converged.all():
-        return None
-    return problem.evaluate(theta, final, feet)
+            return best
+        settled = size < SETTLED
+        if settled or iteration + 1 in looks:
+            final, converged = sweep.solve(shapes, unknowns.p(theta), unknowns.rest(theta), 40)
+            if converged.all():
+                found = problem.evaluate(theta, final, feet)
+                best = found if best is None or found.objective < best.objective else best
+        if settled:
+            break
+    return best
 
 
 def _only(along: Directions, step: Vector) -> Directions:
