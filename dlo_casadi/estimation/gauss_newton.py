@@ -386,7 +386,7 @@ class BatchProblem:
         if float(np.abs(change.x).max()) > LONGEST_MOVE:
             return None
         guess = replace(self.sweep.moved(point.shapes, change), deviation=deviation)
-        shapes, converged = self.sweep.solve(
+        shapes, converged = self.sweep.settled(
             guess, self.unknowns.p(theta), self.unknowns.rest(theta), reach=1.0
         )
         if not converged.all():

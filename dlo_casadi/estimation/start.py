@@ -193,7 +193,8 @@ def all_at_once(
             return best
         settled = size < SETTLED
         if settled or iteration + 1 in looks:
-            final, converged = sweep.solve(shapes, unknowns.p(theta), unknowns.rest(theta), 40)
+            p, rest = unknowns.p(theta), unknowns.rest(theta)
+            final, converged = sweep.settled(shapes, p, rest, max_iterations=40)
             if converged.all():
                 found = problem.evaluate(theta, final, feet)
                 best = found if best is None or found.objective < best.objective else best

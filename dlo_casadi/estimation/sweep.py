@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Assembly, CurveSlopes, Directions, Given, Shapes
+from dlo_casadi.descent import descend
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -28,6 +30,8 @@ REACH = 1.5
 # gradients cost less than one matrix. Steps longer than NEAR [rad] change the matrix too much.
 CONTRACTION = 0.2
 NEAR = 0.1
+# Iterations of a descent to a minimum: of random poses in space it takes 7 to 23.
+DOWNHILL = 40
 
 
 @dataclass(frozen=True)
@@ -179,6 +183,25 @@ class Sweep:
             if not len(active):
                 break
         now.x[~converged], now.lam[~converged] = shapes.x[~converged], shapes.lam[~converged]
+        return now, converged
+
+    def settled(
+        self, shapes: Shapes, p: FloatArray, rest: FloatArray, **options: Any
+    ) -> tuple[Shapes, NDArray[np.bool_]]:
+        """As `solve`; in space, poses that are lost go downhill to a minimum from where they were.
+
+        Newton's method alone loses a pose of ten wherever frames have far to turn.
+        """
+        now, converged = self.solve(shapes, p, rest, **options)
+        lost = np.flatnonzero(~converged)
+        if not len(lost) or not self.model.in_space or self.model.has_state:
+            return now, converged
+        given = self._given(shapes, p, rest).subset(lost)
+        found = descend(self.assembly, shapes.subset(lost), given, DOWNHILL)
+        kept = lost[found.converged]
+        now.x[kept] = found.shapes.x[found.converged]
+        now.lam[kept] = found.shapes.lam[found.converged]
+        converged[kept] = True
         return now, converged
 
     def _linearized(
