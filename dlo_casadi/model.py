@@ -186,10 +186,10 @@ class CableModel:
     def rest_basis(self) -> FloatArray:
         """Rest curvature per coefficient (n_rests, n_coefficients): kappa_0 = rest_basis @ c.
 
-        In space the coefficients about the axis z follow those about y.
+        In space the coefficients about the axis z follow those about y; the rest twist is none.
         """
-        means = self.rest.cell_means(self.chain.cells)
-        return np.kron(np.eye(len(self.node.curvatures)), means)
+        means, strains = self.rest.cell_means(self.chain.cells), len(self.node.strains)
+        return np.kron(np.eye(strains)[:, -len(self.node.curvatures) :], means)
 
     @property
     def roughness(self) -> FloatArray:
@@ -223,6 +223,11 @@ class CableModel:
     def names(self) -> tuple[str, ...]:
         """Qualified names of the parameters, in the order of the vector `p`."""
         return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def stiffness_indices(self) -> list[int]:
+        """Where the stiffnesses stand in the vector `p`, bending first."""
+        return [k for k, name in enumerate(self.names) if name in STIFFNESSES]
 
     @cached_property
     def nominal(self) -> FloatArray:
@@ -326,8 +331,8 @@ class CableModel:
 
     @cached_property
     def _rest(self) -> ca.SX:
-        """Rest curvature inside a slot, see `Chain.rest_stencils`."""
-        return ca.SX.sym("rest", 3 * len(self.node.curvatures))
+        """Rest strains inside a slot, see `Chain.rest_stencils`."""
+        return ca.SX.sym("rest", 3 * len(self.node.strains))
 
     @cached_property
     def _place(self) -> ca.SX:
@@ -403,13 +408,12 @@ class CableModel:
         d, b = self.node.dimension, self.node.increment
         place, first, last, _ = ca.vertsplit(self._deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
         declared = EndConditions.of(self._ends, self.node)
-        if END_ROLL in self.names:
-            # The material axes of an untwisted cable at the end, against the clamp's.
-            roll = self._p[self.names.index(END_ROLL)]
-            declared = declared.rolled(roll)
         ends = declared.changed(end=declared.end + place).turned(first, last)
         for effect, local in self._filling(BoundaryEffect):
             ends = effect.conditions(ends, local)
+        if END_ROLL in self.names:
+            # The material axes of an untwisted cable at the end, against the clamp's.
+            ends = ends.rolled(self._p[self.names.index(END_ROLL)])
         return ends
 
     @cached_property
@@ -754,6 +758,12 @@ class CableModel:
         return self._here("slot", self._slot_arguments, outputs)
 
     @cached_property
+    def slot_slope(self) -> ca.Function:
+        """As `slot` -> its gradient alone, for a small part of the operations."""
+        gradient = ca.gradient(self._terms.lagrangian, self._by_slot)
+        return self._here("slot_slope", self._slot_arguments, [self._to_local.T @ gradient])
+
+    @cached_property
     def at_ends(self) -> ca.Function:
         """(x, lam, p, pose, deviation) of the first and last node -> as `slot`."""
         hessian, gradient = ca.hessian(self._at_ends, self._by_ends)
@@ -832,13 +842,8 @@ class CableModel:
 
     @cached_property
     def slot_strain(self) -> ca.Function:
-        """As `slot` -> mean curvatures (axes,) of the cell [1/m]."""
+        """As `slot` -> mean strains of the cell [1/m]."""
         return self._here("strain", self._slot_arguments, [self.chain.kind.strain(self._plain)])
-
-    @cached_property
-    def slot_twist(self) -> ca.Function:
-        """As `slot` -> mean twist of the cell [1/m]."""
-        return self._here("twist", self._slot_arguments, [self.chain.kind.twist(self._plain)])
 
     @property
     def _plain(self) -> Slot:
@@ -852,11 +857,11 @@ class CableModel:
 
     @cached_property
     def slot_state(self) -> ca.Function:
-        """As `slot` -> rest curvatures (axes,) of the cell after it; by increments, rest and p."""
+        """As `slot` -> rest strains of the cell after it; by increments, rest and p."""
         own = self._rest[::3]
-        curvature, mean = self.chain.kind.strain(self._plain), own
+        strain, mean = self.chain.kind.strain(self._plain), own
         for effect, local in self._filling(StateEffect):
-            mean = effect.next_rest(mean, curvature, self.cable, local)
+            mean = effect.next_rest(mean, strain, self.cable, local)
         rest = ca.SX.sym("mean", own.numel())
         mean = ca.substitute(mean, own, rest)
         slopes = [ca.jacobian(mean, symbols) for symbols in (self._local[1], rest, self._p)]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Shapes
-from dlo_casadi.equilibrium import solve_equilibrium
+from dlo_casadi.equilibrium import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
 from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
@@ -32,6 +32,9 @@ DECADES = (0, -1, 1, -2, 2, -3, 3)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
 # Of many poses only so many, evenly picked, are searched for where to start with all.
 POSES_OF_A_SEARCH = 40
+# Iterations in which a start that is not the first has to come below the best minimum: those that
+# have nearly always had converged by then, others creep along valleys in which weight hardly tells.
+STEPS_OF_A_RIVAL = 10
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
 ROUGHNESS_START = 0.3
@@ -152,7 +155,8 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
     )
     best: Point | None = None
     for point in points[:3]:
-        candidate, _ = problem.descend(point, tolerance=1e-2)
+        steps = STEPS_OF_A_RIVAL if best else 40
+        candidate, _ = problem.descend(point, steps, tolerance=1e-2)
         if best is None or candidate.objective < best.objective - 0.5:
             best = candidate
         elif abs(candidate.objective - best.objective) < 1.0:
@@ -209,8 +213,13 @@ def carried_shapes(problem: BatchProblem, start: Fit) -> Shapes:
             k = known[index]
             rows.append((own.x[k], own.lam[k], own.deviation[k]))
             continue
+        pose = problem.history[index].pose
         try:
-            found = solve_equilibrium(start.model, start.p, start.rest, problem.history[index].pose)
+            if pose.branch == "previous" and rows:
+                before = problem.history[index - 1].pose
+                found = continued(start.model, start.p, start.rest, pose, before, rows[-1][0])
+            else:
+                found = solve_equilibrium(start.model, start.p, start.rest, pose)
         except EquilibriumError as error:
             raise EstimationError(error.message) from error
         rows.append((found.x, found.multipliers, np.zeros(len(start.model.deviation_names))))

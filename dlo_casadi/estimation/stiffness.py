@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
 
@@ -34,17 +34,20 @@ class StiffnessFit:
 def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> StiffnessFit:
     """Least squares of the distances of all fit points over EI, the cable straight at rest.
 
-    The equilibria are followed from the prior stiffness along the decades, so that each is on
-    the branch that prediction would choose there.
+    The equilibria are followed from the prior stiffness along the decades, each on the branch that
+    prediction would choose there, or on that on which the pose was measured.
     """
     used = [item for item in measured if item.readable and not item.held_out]
     sweep = Sweep(model, [item.pose for item in used])
     rest = np.zeros(model.chain.n_rests)
     n_points = sum(len(item.points) for item in used)
 
+    stiff = model.stiffness_indices
+
     def at(log_ei: float) -> FloatArray:
+        # Torsion follows bending.
         p = model.nominal.copy()
-        p[0] = np.exp(log_ei)
+        p[stiff] *= np.exp(log_ei) / p[0]
         return p
 
     def follow(shapes: Shapes, from_log_ei: float, log_ei: float) -> tuple[Shapes, float]:
@@ -72,7 +75,8 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     grid: dict[float, tuple[Shapes, float]] = {}
     first = _cold(model, at(prior), rest, used)
     if first is None:
-        first = sweep.start_shapes(np.zeros((len(used), model.chain.n_nodes, 1)))
+        straight = np.tile(model.node.identity, (len(used), model.chain.n_nodes, 1))
+        first = sweep.start_shapes(straight)
     step = np.log(10) / _PER_DECADE
     for direction in (1, -1):
         shapes = first
@@ -81,9 +85,11 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
             shapes, total = follow(shapes, log_ei - direction * min(k, 1) * step, log_ei)
             grid[log_ei] = (shapes, total)
     best = min(grid, key=lambda q: grid[q][1])
+    # On the way there some may have lost the branch on which they were measured.
+    near = _cold(model, at(best), rest, used) or grid[best][0]
 
     def cost(log_ei: float) -> float:
-        return follow(grid[best][0], best, log_ei)[1]
+        return follow(near, best, log_ei)[1]
 
     found = minimize_scalar(
         cost, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-3}
@@ -99,10 +105,12 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
 def _cold(
     model: CableModel, p: FloatArray, rest: FloatArray, used: Sequence[MeasuredPose]
 ) -> Shapes | None:
-    """Stable equilibria of lowest energy, or None if one is missing."""
+    """Stable equilibria as predicted or measured, or None if one is missing."""
     predictions = predict_poses(model, p, rest, [item.pose for item in used])
+    others = measured_elsewhere(model, p, rest, used, predictions)
     x, lam = [], []
-    for prediction in predictions:
+    for known, other in zip(predictions, others, strict=True):
+        prediction = other or known
         if prediction is None:
             return None
         x.append(prediction.equilibrium.x)

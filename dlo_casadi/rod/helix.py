@@ -23,23 +23,15 @@ import numpy as np
 
 from dlo_casadi.rod.arc import Arc
 from dlo_casadi.rod.element import Condensed, Element, Law, Layout, Slot, Stiffness
-from dlo_casadi.rod.node import Frame, conjugate, quaternion_product, rotated
+from dlo_casadi.rod.node import SINE, Frame, conjugate, quaternion_product, rotated, series
 
 # Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
 _GAUSS = 0.5 / np.sqrt(3)
 # asin(x) / x in powers of x^2. Of a quarter of the half angle of an element that turns by a
 # quarter turn, x = 0.2, what is left out is 1e-13.
 _ARCSINE = tuple(factorial(2 * k) / (4**k * factorial(k) ** 2 * (2 * k + 1)) for k in range(8))
-# sin(x) / x and (1 - cos x) / x^2 in powers of x^2, to 1e-15 for x = 0.8: half of a quarter turn.
-_SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(7))
+# (1 - cos x) / x^2 in powers of x^2: to 2e-15 for x = 0.785, half of a quarter turn.
 _COSINE = tuple((-1) ** k / factorial(2 * k + 2) for k in range(7))
-
-
-def _series(coefficients: Sequence[float], y: ca.SX) -> ca.SX:
-    total = ca.SX(coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        total = coefficient + y * total
-    return total
 
 
 class Helix(Element):
@@ -66,7 +58,7 @@ class Helix(Element):
             cosine = ca.sqrt((1 + w) / 2)
             vector, w = vector / (2 * cosine), cosine
             halves.append((vector, w))
-        phi = 8 * _series(_ARCSINE, ca.sumsqr(vector)) * vector
+        phi = 8 * series(_ARCSINE, ca.sumsqr(vector)) * vector
         half, w = halves[0]
         middle = quaternion_product(ca.vertsplit(first), (*ca.vertsplit(half), w))
         return ca.vertcat(*middle, phi)
@@ -80,22 +72,17 @@ class Helix(Element):
         return ca.vertcat(Frame.gap(local[:4], other[:4]), other[4:] - local[4:])
 
     def strain(self, slot: Slot) -> ca.SX:
-        """Mean curvatures about the axes y and z."""
-        return slot.local[5:] / (slot.length * slot.stretch)
-
-    def twist(self, slot: Slot) -> ca.SX:
-        """Mean twist."""
-        return slot.local[4] / (slot.length * slot.stretch)
+        """Mean twist, and mean curvatures about the axes y and z."""
+        return slot.local[4:] / (slot.length * slot.stretch)
 
     def bends(self, slot: Slot) -> list[ca.SX]:
-        """Twist and curvatures minus rest curvatures (3,) [1/m] at the Gauss points."""
-        mean = ca.vertcat(self.twist(slot), self.strain(slot)) - _rest(slot, 0.0)
-        return [mean]
+        """Twist and curvatures minus those at rest (3,) [1/m] at the Gauss points."""
+        return [self.strain(slot) - _rest(slot, 0.0)]
 
     def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
         """Energy of bending and twist [J], the mean over the Gauss points.
 
-            W = 1/2 (k - k_0)^T B (k - k_0) + 1/2 GJ tau^2
+            W = 1/2 (k - k_0)^T B (k - k_0) + 1/2 GJ (tau - tau_0)^2
 
         times the factors of the section laws, of each half of the cell at its own point.
         """
@@ -116,9 +103,8 @@ class Helix(Element):
 
 
 def _rest(slot: Slot, x: float) -> ca.SX:
-    """Rest twist 0 and rest curvatures (3,) at x from -1/2 to 1/2 of the element."""
-    values = [slot.rest[3 * i] + x * slot.rest[3 * i + 1] for i in range(2)]
-    return ca.vertcat(0, *values)
+    """Rest twist and rest curvatures (3,) at x from -1/2 to 1/2 of the element."""
+    return ca.vertcat(*(slot.rest[3 * i] + x * slot.rest[3 * i + 1] for i in range(3)))
 
 
 def _size(bend: ca.SX) -> ca.SX:
@@ -130,7 +116,7 @@ def _turned(phi: ca.SX, x: ca.SX | float) -> ca.SX:
     """exp(x phi) e_x."""
     a = x * phi
     y = ca.sumsqr(a)
-    sine, cosine = _series(_SINE, y), _series(_COSINE, y)
+    sine, cosine = series(SINE, y), series(_COSINE, y)
     # a x e_x = (0, a_z, -a_y), a x (a x e_x) = a a_x - |a|^2 e_x.
     return ca.vertcat(
         1 + cosine * (a[0] * a[0] - y),
