@@ -48,13 +48,15 @@ def coarse_elements(n: int) -> int:
 
 
 def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:
-    """Rest curvature (n_rests,) of the coarse cells: means of that of the fine ones."""
+    """Rest strains (n_rests,) of the coarse cells: means of those of the fine ones."""
     low, high = model.chain.cells.T
     shares = [
         np.clip(np.minimum(high, end) - np.maximum(low, start), 0.0, None) / (end - start)
         for start, end in coarse.chain.cells
     ]
-    return np.concatenate([np.array(shares) @ part for part in np.split(rest, 2)])
+    return np.concatenate(
+        [np.array(shares) @ part for part in np.split(rest, len(model.node.strains))]
+    )
 
 
 def _clamps(model: CableModel, p: FloatArray) -> FloatArray:
@@ -84,7 +86,7 @@ def _extra(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
     length = float(model.held(p, 0, 0)[1])
     widths = np.diff(model.chain.cells, axis=1).ravel()
-    bends = rest.reshape(2, -1) * widths
+    bends = model.chain.curvatures(rest) * widths
     return [
         length,
         length / model.n,
