@@ -186,10 +186,10 @@ class CableModel:
     def rest_basis(self) -> FloatArray:
         """Rest curvature per coefficient (n_rests, n_coefficients): kappa_0 = rest_basis @ c.
 
-        In space the coefficients about the axis z follow those about y.
+        In space the coefficients about the axis z follow those about y; the rest twist is none.
         """
-        means = self.rest.cell_means(self.chain.cells)
-        return np.kron(np.eye(len(self.node.curvatures)), means)
+        means, strains = self.rest.cell_means(self.chain.cells), len(self.node.strains)
+        return np.kron(np.eye(strains)[:, -len(self.node.curvatures) :], means)
 
     @property
     def roughness(self) -> FloatArray:
@@ -331,8 +331,8 @@ class CableModel:
 
     @cached_property
     def _rest(self) -> ca.SX:
-        """Rest curvature inside a slot, see `Chain.rest_stencils`."""
-        return ca.SX.sym("rest", 3 * len(self.node.curvatures))
+        """Rest strains inside a slot, see `Chain.rest_stencils`."""
+        return ca.SX.sym("rest", 3 * len(self.node.strains))
 
     @cached_property
     def _place(self) -> ca.SX:
@@ -797,13 +797,8 @@ class CableModel:
 
     @cached_property
     def slot_strain(self) -> ca.Function:
-        """As `slot` -> mean curvatures (axes,) of the cell [1/m]."""
+        """As `slot` -> mean strains of the cell [1/m]."""
         return self._here("strain", self._slot_arguments, [self.chain.kind.strain(self._plain)])
-
-    @cached_property
-    def slot_twist(self) -> ca.Function:
-        """As `slot` -> mean twist of the cell [1/m]."""
-        return self._here("twist", self._slot_arguments, [self.chain.kind.twist(self._plain)])
 
     @property
     def _plain(self) -> Slot:
@@ -817,11 +812,11 @@ class CableModel:
 
     @cached_property
     def slot_state(self) -> ca.Function:
-        """As `slot` -> rest curvatures (axes,) of the cell after it; by increments, rest and p."""
+        """As `slot` -> rest strains of the cell after it; by increments, rest and p."""
         own = self._rest[::3]
-        curvature, mean = self.chain.kind.strain(self._plain), own
+        strain, mean = self.chain.kind.strain(self._plain), own
         for effect, local in self._filling(StateEffect):
-            mean = effect.next_rest(mean, curvature, self.cable, local)
+            mean = effect.next_rest(mean, strain, self.cable, local)
         rest = ca.SX.sym("mean", own.numel())
         mean = ca.substitute(mean, own, rest)
         slopes = [ca.jacobian(mean, symbols) for symbols in (self._local[1], rest, self._p)]

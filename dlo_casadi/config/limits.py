@@ -153,8 +153,8 @@ def impossible_values(experiment: Experiment, length: float) -> Iterator[Problem
         ):
             yield Problem(place, f"std: {message}")
     # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
-    in_space = len(experiment.gravity) == 3
-    cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=1.0 if in_space else None)
+    torsional_stiffness = 1.0 if experiment.in_space else None
+    cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
     declared = experiment.tolerances.model_dump()
     taken_up = {
         kind.tolerances[q.name]: q

@@ -314,6 +314,10 @@ class Tolerances(Section):
     """Of the roll of a cable in its end clamp, about itself [rad]."""
     scale: Positive = 3.0e-4
     """Of the scale of the measurement, relative."""
+    camera_rotation: Positive = 2.0e-3
+    """Of the frame of a measurement in space against the fixtures, about each axis [rad]."""
+    camera_translation: Positive = 1.0e-3
+    """Of the frame of a measurement in space against the fixtures, along each axis [m]."""
 
 
 class Pose(Section):

@@ -118,7 +118,8 @@ class Parameters(NamedTuple):
     p : (n_parameters,)
         In the order of `model.names` (SI).
     rest : (n_rests,) [1/m]
-        Rest curvature that the next pose finds; in space about the axis y, then about z.
+        Rest curvature that the next pose finds; in space the rest strains twist, k_y, k_z of all
+        cells in turn.
     metadata : Metadata
     """
 
@@ -207,12 +208,12 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
             for q, value in zip(model.parameters, fit.p, strict=True)
         },
         "rest_curvature": {
-            "coefficients": _by_axis(fit.coefficients, model.node.curvatures),
+            "coefficients": _by_name(fit.coefficients, model.node.curvatures),
             "unit": "1/m",
             "basis": "cubic B-splines on clamped uniform knots over [0, length]",
         },
         "state": {
-            "rest_curvature": _by_axis(final_rest(fit), model.node.curvatures),
+            "rest_curvature": _by_name(final_rest(fit), model.node.strains),
             "unit": "1/m",
             "of": "cells, last pose done",
         },
@@ -255,11 +256,11 @@ def final_rest(fit: Fit) -> FloatArray:
     return fit.problem.sweep.rest_after_last(fit.point.shapes, fit.p, fit.rest)
 
 
-def _by_axis(values: FloatArray, curvatures: Sequence[str]) -> Any:
-    """Curvatures as they are in a plane; in space by the axis that they are about."""
-    if len(curvatures) == 1:
+def _by_name(values: FloatArray, names: Sequence[str]) -> Any:
+    """Curvatures as they are in a plane; in space components of the strain by their names."""
+    if len(names) == 1:
         return values
-    return dict(zip(curvatures, values.reshape(len(curvatures), -1), strict=True))
+    return dict(zip(names, values.reshape(len(names), -1), strict=True))
 
 
 def _effect_row(effect: Effect) -> dict[str, Any]:
@@ -420,7 +421,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     if len(metadata.coefficients) != model.n_coefficients:
         found = f": {model.n_coefficients} numbers belong here, found {len(metadata.coefficients)}"
         raise _DamagedError(("rest_curvature",), found)
-    rest = _curvatures(document["state"], "rest_curvature", "state")
+    rest = _stacked(document["state"]["rest_curvature"], Frame.strains, "state")
     return Parameters(
         model,
         _numbers(values, len(values), "parameters"),
@@ -440,7 +441,9 @@ def _metadata(document: dict[str, Any], source: Path) -> Metadata:
         names=names,
         covariance=covariance.reshape(len(names), len(names)),
         std={name: float(row.get("std") or 0.0) for name, row in rows.items()},
-        coefficients=_curvatures(document["rest_curvature"], "coefficients", "rest_curvature"),
+        coefficients=_stacked(
+            document["rest_curvature"]["coefficients"], Frame.curvatures, "rest_curvature"
+        ),
         fixtures=dict(document.get("fixtures") or {}),
         identifiable=rows["bending_stiffness"].get("identifiable"),
         interval_95=None if interval is None else (interval[0], interval[1]),
@@ -452,11 +455,10 @@ def _metadata(document: dict[str, Any], source: Path) -> Metadata:
     )
 
 
-def _curvatures(section: Mapping[str, Any], key: str, where: str) -> FloatArray:
-    """Numbers of a section; those about several axes one after the other."""
-    values = section[key]
+def _stacked(values: Any, names: Sequence[str], where: str) -> FloatArray:
+    """Numbers as they are in a plane; in space those of all components one after the other."""
     if isinstance(values, Mapping):
-        values = [value for axis in Frame.curvatures for value in values[axis]]
+        values = [value for name in names for value in values[name]]
     return _numbers(values, len(values), where)
 
 
