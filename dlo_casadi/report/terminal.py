@@ -153,7 +153,7 @@ def fixed_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     rows = [
         ("length", f"{cable.length:g} m", "", "fixed"),
         ("mass", f"{cable.mass:g} kg", "", "fixed"),
-        ("gravity", f"{vector(gravity, 'g')} m/s^2", "", "fixed"),
+        ("gravity", vector(gravity, "g", "m/s^2"), "", "fixed"),
     ]
     unknowns = outcome.fit.problem.unknowns
     for q, free in zip(outcome.fit.model.parameters, unknowns.free, strict=True):
@@ -280,13 +280,13 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     if load is not None:
         force, (low, high) = load["force"], load["interval_95"]
         lines.append(
-            f"  Without naming a cause: pulled by {vector(force, '.3g')} N on average "
+            f"  Without naming a cause: pulled by {vector(force, '.3g', 'N')} on average "
             f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
     if outcome.next_pose is not None:
         lines.append(
             f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "
-            f"{vector(outcome.next_pose['end'], '.3f')} m; {separation_text(outcome.next_pose)}"
+            f"{vector(outcome.next_pose['end'], '.3f', 'm')}; {separation_text(outcome.next_pose)}"
         )
     return lines
 
@@ -469,12 +469,13 @@ def prediction_table(shape: dict[str, Any], notes: Iterable[str] = ()) -> Render
     for row in prediction_rows(shape):
         table.add_row(*row)
     points = _table("Points from start to end")
-    for column in ("s [m]", "x [m]", "y [m]"):
-        points.add_column(column, justify="right")
-    count = len(shape["points"])
-    for k, (x, y) in enumerate(shape["points"]):
+    count, axes = len(shape["points"]), "xyz"[: len(shape["start"])]
+    for column in ("s", *axes):
+        points.add_column(f"{column} [m]", justify="right")
+    for k, place in enumerate(shape["points"]):
         if k % max(1, (count - 1) // 10) == 0:
-            points.add_row(f"{shape['length'] * k / (count - 1):.4f}", f"{x:.5f}", f"{y:.5f}")
+            s = shape["length"] * k / (count - 1)
+            points.add_row(f"{s:.4f}", *(f"{x:.5f}" for x in place))
     return Group(table, points, *(Text(note) for note in notes))
 
 
@@ -486,16 +487,18 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
         if at is None:
             rows.append((side, "free"))
             continue
-        x, y = shape[f"force_on_{side}"]
-        rows.append((side, f"({at[0]:g}, {at[1]:g}) m"))
+        rows.append((side, vector(at, "g", "m")))
         reached = shape["points"][0 if side == "start" else -1]
         if math.dist(at, reached) > _SHOWN:
-            place = f"({reached[0]:.5f}, {reached[1]:.5f}) m"
+            place = vector(reached, ".5f", "m")
             rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
-        rows.append((f"force of the cable on its {side}", f"({x:.4g}, {y:.4g}) N"))
-        if shape[f"{side}_heading"] is not None:
-            moment = shape[f"moment_on_{side}"]
-            rows.append((f"moment of the cable on its {side}", f"{moment:.4g} N m"))
+        force, moment = shape[f"force_on_{side}"], shape[f"moment_on_{side}"]
+        rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
+        if any(shape.get(f"{side}_{key}") is not None for key in ("heading", "orientation")):
+            said = (
+                f"{moment:.4g} N m" if isinstance(moment, float) else vector(moment, ".4g", "N m")
+            )
+            rows.append((f"moment of the cable on its {side}", said))
     rows.append(("energy", f"{shape['energy']:.6g} J"))
     rows.append(("smallest bend radius", _mm(shape["min_bend_radius"])))
     stable = "yes" if shape["stable"] else "NO: the cable would not stay there"
@@ -506,9 +509,9 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def vector(components: Iterable[float], form: str) -> str:
-    """Components of a vector in brackets."""
-    return f"({', '.join(format(x, form) for x in components)})"
+def vector(components: Iterable[float], form: str, unit: str) -> str:
+    """Components of a vector in brackets, and their unit."""
+    return f"({', '.join(format(x, form) for x in components)}) {unit}"
 
 
 def plus_minus(value: float, std: float) -> str:

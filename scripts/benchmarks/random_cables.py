@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.codegen.compiled import shape_record
-from dlo_casadi.codegen.generate import generate, numbers_of
+from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.kernels import kernels_of
 from dlo_casadi.codegen.library import compile_library
+from dlo_casadi.codegen.plane import numbers_of
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
