@@ -56,7 +56,7 @@ def moved(pose: Pose, rng: np.random.Generator) -> Pose:
     )
 
 
-def timed(n: int, element: str, repeats: int = 100) -> dict[str, Any]:
+def timed(n: int, element: str, repeats: int = 20) -> dict[str, Any]:
     """Seconds of cold and warm solves, and the largest node error of each pose [m]."""
     own = problem(n, element)
     source = generate(own.model, own.model.nominal, own.rest)
