@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
@@ -13,6 +14,7 @@ from rich.text import Text
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.canvas import label_of
+from dlo_casadi.report.geometry import directions
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.session.outcome import (
     BranchShape,
@@ -151,7 +153,7 @@ def fixed_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     rows = [
         ("length", f"{cable.length:g} m", "", "fixed"),
         ("mass", f"{cable.mass:g} kg", "", "fixed"),
-        ("gravity", f"({gravity[0]:g}, {gravity[1]:g}) m/s^2", "", "fixed"),
+        ("gravity", vector(gravity, "g", "m/s^2"), "", "fixed"),
     ]
     unknowns = outcome.fit.problem.unknowns
     for q, free in zip(outcome.fit.model.parameters, unknowns.free, strict=True):
@@ -187,9 +189,18 @@ def rest_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     rest = outcome.stages[-1].rest_curvature
     if not rest.value.size:
         return []
-    low, high = rest.value.min(), rest.value.max()
-    text = f"{low:.3g} to {high:.3g} 1/m"
-    return [("rest curvature", text, "", f"std {rest.std.mean():.2g} 1/m on average")]
+    names = [f"rest curvature{name and f' k_{name}'}" for name in directions(outcome)]
+    return [
+        (
+            name,
+            f"{value.min():.3g} to {value.max():.3g} 1/m",
+            "",
+            f"std {std.mean():.2g} 1/m on average",
+        )
+        for name, value, std in zip(
+            names, np.atleast_2d(rest.value), np.atleast_2d(rest.std), strict=True
+        )
+    ]
 
 
 # ---- errors ------------------------------------------------------------------------------------
@@ -269,14 +280,13 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     if load is not None:
         force, (low, high) = load["force"], load["interval_95"]
         lines.append(
-            f"  Without naming a cause: pulled by ({force[0]:.3g}, {force[1]:.3g}) N on average "
+            f"  Without naming a cause: pulled by {vector(force, '.3g', 'N')} on average "
             f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
     if outcome.next_pose is not None:
-        x, y = outcome.next_pose["end"]
         lines.append(
             f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "
-            f"({x:.3f}, {y:.3f}) m; {separation_text(outcome.next_pose)}"
+            f"{vector(outcome.next_pose['end'], '.3f', 'm')}; {separation_text(outcome.next_pose)}"
         )
     return lines
 
@@ -477,16 +487,16 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
         if at is None:
             rows.append((side, "free"))
             continue
-        rows.append((side, _tuple(at, "g", "m")))
+        rows.append((side, vector(at, "g", "m")))
         reached = shape["points"][0 if side == "start" else -1]
         if math.dist(at, reached) > _SHOWN:
-            place = _tuple(reached, ".5f", "m")
+            place = vector(reached, ".5f", "m")
             rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
         force, moment = shape[f"force_on_{side}"], shape[f"moment_on_{side}"]
-        rows.append((f"force of the cable on its {side}", _tuple(force, ".4g", "N")))
+        rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
         if any(shape.get(f"{side}_{key}") is not None for key in ("heading", "orientation")):
             said = (
-                f"{moment:.4g} N m" if isinstance(moment, float) else _tuple(moment, ".4g", "N m")
+                f"{moment:.4g} N m" if isinstance(moment, float) else vector(moment, ".4g", "N m")
             )
             rows.append((f"moment of the cable on its {side}", said))
     rows.append(("energy", f"{shape['energy']:.6g} J"))
@@ -499,8 +509,9 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _tuple(values: Iterable[float], form: str, unit: str) -> str:
-    return f"({', '.join(format(value, form) for value in values)}) {unit}"
+def vector(components: Iterable[float], form: str, unit: str) -> str:
+    """Components of a vector in brackets, and their unit."""
+    return f"({', '.join(format(x, form) for x in components)}) {unit}"
 
 
 def plus_minus(value: float, std: float) -> str:
