@@ -267,7 +267,7 @@ def exchanged(lines: Lines) -> tuple[Suspicion, ...]:
         return ()
     return tuple(
         Suspicion(
-            f"{lines.names[i]}: its end {_at(ends[i])} m is where the other "
+            f"{lines.names[i]}: its end {_at(ends[i], 'g')} m is where the other "
             "poses have their start. Try: are start and end exchanged?",
             False,
             lines.names[i],
@@ -332,5 +332,5 @@ def _moved(lines: Lines, measured: FloatArray) -> tuple[float, FloatArray]:
     return overall(lines.misfit(measured - shift, lines.declared)), shift
 
 
-def _at(point: FloatArray) -> str:
-    return f"({', '.join(f'{value:.3f}' for value in point)})"
+def _at(point: FloatArray, form: str = ".3f") -> str:
+    return f"({', '.join(format(value, form) for value in point)})"

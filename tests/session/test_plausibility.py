@@ -135,7 +135,7 @@ def test_start_and_end_exchanged_in_one_pose():
     declared = lines.declared.copy()
     declared[5] = declared[5, ::-1]
     (found,) = exchanged(replace(lines, declared=declared))
-    assert found.message.startswith("pose_5: its end (0.000, 0.000) m is where the other poses")
+    assert found.message.startswith("pose_5: its end (0, 0) m is where the other poses")
 
 
 def test_free_ends_are_judged_by_their_start():
