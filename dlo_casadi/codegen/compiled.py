@@ -103,6 +103,7 @@ class _Compiled(Generic[S]):
         size, pointer, integer = ctypes.c_size_t, ctypes.c_void_p, ctypes.c_int
         tail: list[Any] = [pointer, size]
         self._c.dlo_solve.argtypes = [pointer, integer, pointer, pointer, *tail]
+        self._c.dlo_step.argtypes = [pointer, pointer, integer, pointer, *tail]
         self._c.dlo_sensitivity.argtypes = [pointer, pointer, pointer, *tail]
         self._c.dlo_batch.argtypes = [pointer, size, integer, pointer, pointer, *tail]
         self._c.dlo_path.argtypes = [
@@ -151,6 +152,16 @@ class _Compiled(Generic[S]):
                 no_equilibrium(STATUSES[status], start, end, self.model.cable.length),
                 p_des=tuple(map(float, end)),
             )
+        return self._read(out[0], status)
+
+    def _stepped(self, pose: FloatArray, start: S, steps: int) -> S:
+        out = np.zeros(1, self.record)
+        kept, address = self._warm(start)
+        work = self._work()
+        status = self._c.dlo_step(
+            pose.ctypes.data, address, steps, out.ctypes.data, work.ctypes.data, work.size
+        )
+        del kept
         return self._read(out[0], status)
 
     def _batch(self, poses: FloatArray, branch: object) -> tuple[Any, NDArray[np.intc]]:
@@ -266,6 +277,18 @@ class CompiledSolver(_Compiled[Shape]):
         pose = one_pose(end, start, headings)
         return self._solved(pose, branch, warm, throw=throw)
 
+    def step(
+        self,
+        shape: Shape,
+        end: ArrayLike = (0.0, 0.0),
+        *,
+        start: ArrayLike = (0.0, 0.0),
+        headings: ArrayLike = (0.0, 0.0),
+        steps: int = 4,
+    ) -> Shape:
+        """Shape in a pose close by, in at most so many Newton steps; see its `status`."""
+        return self._stepped(one_pose(end, start, headings), shape, steps)
+
     def solve_many(
         self,
         ends: ArrayLike,
@@ -367,6 +390,10 @@ class CompiledSpaceSolver(_Compiled[SpaceShape]):
             If the warm start is no shape of this solver.
         """
         return self._solved(frame_poses([pose]), None, warm, throw=throw)
+
+    def step(self, shape: SpaceShape, pose: Pose, *, steps: int = 4) -> SpaceShape:
+        """Shape in a pose close by, in at most so many Newton steps; see its `status`."""
+        return self._stepped(frame_poses([pose]), shape, steps)
 
     def solve_many(self, poses: Sequence[Pose]) -> tuple[Any, NDArray[np.intc]]:
         """Records with the fields of SpaceShape, and statuses (index into STATUSES)."""

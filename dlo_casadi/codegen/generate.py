@@ -104,6 +104,7 @@ def _values(model: CableModel, prefix: str, digest: str) -> dict[str, str]:
     clamped = {side: int(getattr(model, side) == "clamped") for side in ("start", "end")}
     names = [effect.name for effect in model.effects]
     return {
+        "PREFIX": prefix,
         "FILE": f"{prefix}_solver",
         "TITLE": comment(model.cable.name),
         "VERSION": __version__,

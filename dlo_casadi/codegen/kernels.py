@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import pairwise
 from math import isfinite
 from typing import Any
@@ -57,13 +58,18 @@ class Kernel:
         Slots first <= j < last.
     rows : (last - first, k)
         Numbers that differ from slot to slot.
-    function : casadi.Function
-        (x, lam, row (k,), p) -> value and derivatives.
+    derive : callable
+        Makes the function.
     """
 
     members: tuple[int, int]
     rows: FloatArray
-    function: ca.Function
+    derive: Callable[[], ca.Function]
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """(x, lam, row (k,), p) -> value and derivatives."""
+        return self.derive()
 
 
 @dataclass(frozen=True)
@@ -89,6 +95,16 @@ class Kernels:
         """What the kernels read: shared numbers, then the rows of all slots."""
         rows = [kernel.rows.ravel() for kernel in self.slots]
         return [float(number) for number in np.concatenate([self.shared, *rows])]
+
+    @property
+    def operations(self) -> int:
+        """Floating-point operations of all kernels."""
+        counts = (
+            (last - first) * kernel.function.n_nodes()
+            for kernel in self.slots
+            for first, last in [kernel.members]
+        )
+        return sum(counts)
 
     def loops(self, call: str, table_at: int = 0) -> list[str]:
         """Statements that call all kernels, `table_at` after the start of the solver's table.
@@ -180,7 +196,7 @@ def _kernel(
         model.shares(p, ca.DM(first) if inline else place),
     )
     derivatives = _in_space if model.in_space else _in_plane
-    return Kernel(members, own[:, varies], derivatives(model, numbers, row))
+    return Kernel(members, own[:, varies], partial(derivatives, model, numbers, row))
 
 
 def _in_plane(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:

@@ -72,6 +72,8 @@ def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> 
         "WIDTHS": str(rows + count),
         "RESTING": str(rows + 2 * count - 1),
         "EXTRA": str(rows + 3 * count - 1),
+        # Elimination and solution: about 30 operations a node; the trial point is evaluated, too.
+        "OPERATIONS": str(2 * kernels.operations + 30 * count),
         "KERNELS": functions,
         "LOOPS": loops,
     }

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.codegen.kernels import (
+    Kernels,
     c_number,
     kernels_of,
     statements,
@@ -42,9 +43,10 @@ TEXTS = {
 }
 
 
-def coarse_elements(n: int) -> int:
-    """Elements of the mesh on which first guesses are followed."""
-    return min(n, max(LEAST_COARSE, round(n / COARSENING)))
+def coarse_elements(model: CableModel) -> int:
+    """Elements of the mesh on which first guesses are followed: with a free end all."""
+    coarse = model.n if model.end == "free" else max(LEAST_COARSE, round(model.n / COARSENING))
+    return min(model.n, coarse)
 
 
 def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:
@@ -97,37 +99,55 @@ def _extra(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
     ]
 
 
+def meshes_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True
+) -> dict[str, Kernels]:
+    """Kernels of the fine mesh and, where there is one, of the coarse mesh, by their names in C."""
+    found = {"kernel": kernels_of(model, p, rest, inline)}
+    count = coarse_elements(model)
+    if count < model.n:
+        coarse = model.with_mesh(count)
+        means = coarse_rest(model, coarse, rest)
+        found["coarse_kernel"] = kernels_of(coarse, p, means, inline)
+    return found
+
+
+def numbers_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, meshes: dict[str, Kernels]
+) -> list[float]:
+    """The solver's table: numbers of the kernels of both meshes, then the others."""
+    rows = [number for kernels in meshes.values() for number in kernels.table]
+    return [*rows, *_extra(model, p, rest)]
+
+
 def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> dict[str, str]:
     """What the marks of the templates stand for."""
-    count = model.n if model.end == "free" else coarse_elements(model.n)
-    coarse = model.with_mesh(count)
-    fine = kernels_of(model, p, rest, inline)
-    if fine.ends is not None:
+    meshes, count = meshes_of(model, p, rest, inline), coarse_elements(model)
+    if meshes["kernel"].ends is not None:
         raise DloError(
             "no solver can be generated for a cable in space whose ends are held by springs\n"
             "  Try: dlo predict, or dlo_casadi.predict, which know them."
         )
-    meshes = {"kernel": fine}
-    if count < model.n:
-        meshes["coarse_kernel"] = kernels_of(coarse, p, coarse_rest(model, coarse, rest), inline)
     functions: list[str] = []
     loops: dict[str, str] = {}
-    table: list[float] = []
+    at = 0
     for name, kernels in meshes.items():
         functions += [
             _kernel_text(f"{name}_{k}", kernel.members, kernel.function)
             for k, kernel in enumerate(kernels.slots)
         ]
         call = f"{name}_{{k}}(w->x + 4 * j, w->lam, {{row}}, table, w->slot + SLOT * j)"
-        loops[name] = "\n".join(kernels.loops(call, len(table)))
-        table += kernels.table
+        loops[name] = "\n".join(kernels.loops(call, at))
+        at += len(kernels.table)
     return {
         "LENGTH": c_number(float(model.held(p, 0, 0)[1])),
         "WORKSPACE": str(_NUMBERS * (model.n + 1) + 4 * _COARSE_SHAPES * (count + 1)),
         "COARSE": str(count),
         "REACHES": str(int(not model.extensible)),
-        "TABLE": table_to_c([*table, *_extra(model, p, rest)]),
-        "EXTRA": str(len(table)),
+        "TABLE": table_to_c(numbers_of(model, p, rest, meshes)),
+        "EXTRA": str(at),
+        # Elimination and solution: about 500 operations a node.
+        "OPERATIONS": str(meshes["kernel"].operations + 500 * (model.n + 1)),
         "KERNELS": with_helpers(functions),
         "LOOPS": loops["kernel"],
         "COARSE_LOOPS": re.sub("^", "    ", loops.get("coarse_kernel", ""), flags=re.MULTILINE),

@@ -230,6 +230,21 @@ def test_a_warm_start_of_a_neighbour_needs_few_steps_and_leads_to_the_same_shape
     assert solver.solve(pose, warm=solver.solve(pose)).iterations == 1
 
 
+def test_a_step_stays_on_its_branch_within_its_bound_on_the_work(solver):
+    for pose in poses(5, np.random.default_rng(9)):
+        shape = solver.solve(pose)
+        near = replace(pose, end=tuple(np.array(pose.end) + 5e-4))
+        stepped = solver.step(shape, near, steps=5)
+        assert stepped.status == "ok"
+        np.testing.assert_allclose(stepped.points, solver.solve(near).points, atol=1e-9)
+        for steps in (0, 1):
+            short = solver.step(shape, near, steps=steps)
+            assert short.status == ("iteration_limit" if steps else "bad_argument")
+            assert all_zero(short)
+        far = solver.step(shape, replace(pose, end=pose.start), steps=100)
+        assert far.status == "iteration_limit"
+
+
 def moved(pose, column, step):
     """A pose of which one end is shifted or turned about the world's axes."""
     by = step * np.eye(3)[column % 3]
@@ -370,4 +385,30 @@ def test_links_nothing_but_libm(tmp_path):
 
 
 def test_the_coarse_mesh_is_never_finer_than_the_fine_one():
-    assert [coarse_elements(n) for n in (2, 4, 12, 30, 1000)] == [2, 4, 4, 10, 333]
+    found = [coarse_elements(problem(n=n)[0]) for n in (2, 4, 12, 30, 1000)]
+    assert found == [2, 4, 4, 10, 333]
+
+
+def test_an_installed_solver_is_found_by_cmake(tmp_path):
+    if shutil.which("cmake") is None:
+        pytest.skip("cmake is not installed")
+    generate(*problem("arc", 6), "harness").write(tmp_path / "solver")
+    (tmp_path / "user").mkdir()
+    shutil.copy(tmp_path / "solver" / "example.c", tmp_path / "user")
+    (tmp_path / "user" / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.13)\nproject(user C)\n"
+        "find_package(harness_solver 0 REQUIRED CONFIG)\n"
+        "add_executable(user example.c)\n"
+        "target_link_libraries(user PRIVATE harness::harness_solver)\n"
+    )
+    there = f"-DCMAKE_INSTALL_PREFIX={tmp_path / 'there'}"
+    for command in (
+        ["cmake", "-S", "solver", "-B", "solver/build", there, "-DBUILD_EXAMPLE=OFF"],
+        ["cmake", "--build", "solver/build", "--target", "install"],
+        ["cmake", "-S", "user", "-B", "user/build", f"-DCMAKE_PREFIX_PATH={tmp_path / 'there'}"],
+        ["cmake", "--build", "user/build"],
+        ["user/build/user"],
+    ):
+        run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert run.returncode == 0, run.stdout + run.stderr
+    assert "bend radius" in run.stdout
