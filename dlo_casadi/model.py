@@ -544,14 +544,25 @@ class CableModel:
 
     def _slot_energy(self, slot: Slot) -> ca.SX:
         """Energy of bending and loads of one slot [J]: of the loads, minus their work along it."""
+        return self._bending_energy(slot) - self._work(slot, self._slot_forces(slot))
+
+    def _work(self, slot: Slot, forces: list[ca.SX]) -> ca.SX:
+        """Work of `_slot_forces` along a slot [J]."""
         kind = self.chain.kind
-        energy = self._bending_energy(slot)
-        for u, weight in zip(*kind.rule, strict=True):
-            resultant = self._resultant(slot.start + u * slot.length)
-            energy -= weight * slot.length * ca.dot(resultant, kind.tangent(slot, u))
-        for force, share in zip(self._forces, ca.vertsplit(self._shares), strict=False):
-            energy -= ca.dot(force.force, kind.advance(slot, share))
-        return energy
+        nodes, weights = kind.rule
+        shares = ca.vertsplit(self._shares)
+        work = ca.SX(0)
+        for force, u, weight in zip(forces, nodes, weights, strict=False):
+            work += weight * slot.length * ca.dot(force, kind.tangent(slot, u))
+        for force, share in zip(forces[len(nodes) :], shares, strict=False):
+            work += ca.dot(force, kind.advance(slot, share))
+        return work
+
+    def _slot_forces(self, slot: Slot) -> list[ca.SX]:
+        """Dead forces [N] that a slot carries: at the points of its rule, then those on places."""
+        nodes, _ = self.chain.kind.rule
+        spread = [self._resultant(slot.start + u * slot.length) for u in nodes]
+        return [*spread, *(force.force for force in self._forces)]
 
     @cached_property
     def _shares(self) -> ca.SX:
@@ -623,6 +634,40 @@ class CableModel:
         true = self._slot(stretched, condensed.inner, condensed.square)
         # The curve whose end the Lagrangian's derivative by the multipliers holds.
         return _SlotTerms(lagrangian, kind.advance(true), stretched)
+
+    @cached_property
+    def slot_forces(self) -> ca.Function:
+        """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `slot_in_frame`."""
+        forces = self._slot_forces(self._slot(self._stretch, self._inner, ca.SX(0)))
+        arguments = [self._p, self._place, self._deviation]
+        return ca.Function("slot_forces", arguments, [ca.horzcat(*forces)])
+
+    @cached_property
+    def slot_in_frame(self) -> ca.Function:
+        """(local, inner, forces, p, rest, place, deviation, shares) -> energy [J] of a slot.
+
+        Its minimum over the inner unknowns is that of `slot_by_share`. Forces are arguments, so
+        that a slot and the forces on it may be turned together: the energy stays. The multiplier
+        of the end's place is such a force, too, against those that are spread.
+        """
+        kind, h = self.chain.kind, self.chain.h
+        ratio, inner = ca.SX.sym("ratio"), self._inner
+        slot = self._slot(ratio, inner, inner**2)
+        count = len(self._slot_forces(slot))
+        forces = ca.SX.sym("force", self.node.dimension, count)
+        energy = self._bending_energy(slot) - self._work(slot, ca.horzsplit(forces))
+        tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
+        lagrangian = kind.expanded(slot, energy, self._bending_energy)
+        lagrangian -= self._compliance * h * tension**2 / 2
+        local, step = self._local
+        own = [self._p, self._rest, self._place, self._deviation, self._shares]
+        found = ca.substitute([lagrangian], [ratio, step], [self._stretch, ca.SX.zeros(step.shape)])
+        return ca.Function("slot_in_frame", [local, inner, forces, *own], found)
+
+    @cached_property
+    def _inner(self) -> ca.SX:
+        """Unknowns inside an element that are eliminated from it."""
+        return ca.SX.sym("inner", self.chain.kind.n_inner)
 
     @cached_property
     def _at_ends(self) -> ca.SX:

@@ -328,7 +328,7 @@ class Pose(Section):
     start: Place
     """Where the start is held [x, y] [m], in space [x, y, z]."""
     end: Place | None = None
-    """Where the end is held [m]; a free end has none."""
+    """Where the end is held [x, y] [m], in space [x, y, z]; a free end has none."""
     start_heading: Number | None = None
     """Direction of the cable in a clamped start, counter-clockwise from +x [rad]."""
     end_heading: Number | None = None

@@ -85,10 +85,14 @@ class PoseShape:
         Arc lengths of the measured points.
     gap : (K, d) [m]
         Measured minus predicted points.
-    residual : (K,) [m]
-        Distance of the measured points across the prediction; in the plane positive to its left.
+    residual : (K,) or (K, 2) [m]
+        Distance of the measured points across the prediction: in the plane to its left, in space
+        along two normals, which at the start are the axes y and z of the cable's frame there and
+        are carried along without twist.
     energy : float [J]
     stable : bool
+    forces : (2, d) [N]
+        Of the cable on what holds its start and its end.
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
     tipping : float or None [rad]
@@ -102,6 +106,7 @@ class PoseShape:
     residual: FloatArray
     energy: float
     stable: bool
+    forces: FloatArray
     measured_branch: BranchShape | None = None
     tipping: float | None = None
 

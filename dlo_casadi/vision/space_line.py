@@ -12,6 +12,7 @@ from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import Board, locate_camera
 from dlo_casadi.vision.correspondence import Match, match_lines, triangulate
 from dlo_casadi.vision.curve import chord_length
+from dlo_casadi.vision.image import spoilt
 from dlo_casadi.vision.sight import TIP, Sight, other_stretches, see_beside, see_cable
 from dlo_casadi.vision.space_curve import CurveFit, first_curve, fit_curve_to_sights
 from dlo_casadi.vision.view import Array, Camera
@@ -30,7 +31,7 @@ _MISSING = 0.1  # of the length: a line that is so much shorter passes by a stre
 _SURE = 0.9  # share from which no other pair is tried for the first curve
 _AGREE_PX = 1.0  # px, beside four standard deviations: errors of cameras' places
 _FAR = 0.05  # of the length, beside what is not seen: a line that ends farther away is another's
-_LONGER = 1.1  # of the length: a line in space cannot be longer
+_LONGER = 1.1  # of the length: a line in space, up to its fixtures, cannot be longer
 _NARROW = np.radians(5.0)  # between two cameras: below, depths are ten times worse than the rest
 
 
@@ -115,7 +116,8 @@ def measure_views(
                 image, viewpoint, start=start, end=end, diameter=diameter, length=length
             )
         except VisionError as error:
-            problems[name] = f"{name}: {error.message}"
+            why = spoilt(image)
+            problems[name] = f"{name}: {error.message}{'' if why in error.message else why}"
     fixtures = [np.asarray(at, float) for at in (start, end) if at is not None]
     spans = int(np.clip(length / (_SPAN * diameter), *_SPANS))
     fit, order = _agreeing_fit(sights, problems, fixtures, length, spans)
@@ -232,7 +234,7 @@ def _possible(fit: CurveFit, sights: list[Sight], fixtures: list[Array], length:
     ends = fit.curve.position(np.array([0.0, 1.0]))[: len(fixtures)]
     away = np.linalg.norm(ends - np.array(fixtures), axis=1)
     far = _FAR * length + TIP * sights[0].diameter
-    return bool(fit.curve.length < _LONGER * length and np.all(away[shown] < far))
+    return bool(_whole(fit, fixtures) < _LONGER * length and np.all(away[shown] < far))
 
 
 def _agreement(sight: Sight, residuals: Array) -> float:
