@@ -48,6 +48,8 @@ FloatArray = NDArray[np.floating]
 BENDING_STIFFNESS = "bending_stiffness"
 # ln(1000): a prior of the stiffness may be off by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
+# ln(3): GJ over EI is 1 / (1 + nu) in a solid round rod; strands and jackets make it less or more.
+STIFFNESS_RATIO_STD = float(np.log(3.0))
 # Nobody knows how a cable's own twist was gripped: tolerances.roll by default [rad].
 ROLL_STD = 1.0
 TORSIONAL_STIFFNESS = "torsional_stiffness"
@@ -208,7 +210,9 @@ class CableModel:
         """Stiffnesses, in space the roll of the end, then the effects' with qualified names."""
         listed = [_stiffness(BENDING_STIFFNESS, self.cable.bending_stiffness)]
         if self.cable.torsional_stiffness is not None:
-            listed.append(_stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness))
+            torsion = _stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness)
+            # Known by its ratio to the bending stiffness, see `Unknowns.prior_precision`.
+            listed.append(torsion.with_prior(np.inf))
             if self.start == self.end == "clamped":
                 std = self.priors.get(END_ROLL, ROLL_STD)
                 listed.append(

@@ -184,11 +184,17 @@ def _best(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) ->
     for point in points[:3]:
         steps = STEPS_OF_A_RIVAL if best else 40
         candidate, _ = problem.descend(point, steps, tolerance=1e-2)
-        if best is None or candidate.objective < best.objective - 0.5:
+        if best is None or _better(problem, candidate, best):
             best = candidate
         elif abs(candidate.objective - best.objective) < 1.0:
             break
     return best
+
+
+def _better(problem: BatchProblem, point: Point, other: Point) -> bool:
+    """Whether a minimum is clearly lower than another, or only the other's GJ over EI is odd."""
+    odd, others = (problem.unknowns.odd_ratio(one.theta) for one in (point, other))
+    return others if odd != others else point.objective < other.objective - 0.5
 
 
 def _continue(

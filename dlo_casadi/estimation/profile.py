@@ -137,8 +137,7 @@ def _held(fit: Fit, log_value: float, near: Point, name: str) -> tuple[Point, fl
     """Refit with the stiffness held, from a neighbour; the rise of twice the objective."""
     model, found = fit.model, fit.problem.unknowns
     k = found.names.index(name)
-    gap = fit.point.theta[k] - fit.problem.mean[k]
-    base = 2 * fit.point.objective - fit.problem.precision[k, k] * gap**2
+    base = 2 * fit.point.objective - found.own_prior(fit.point.theta, k)
     others = np.array([other != name for other in model.names]) & found.free
     p = fit.p.copy()
     p[model.names.index(name)] = np.exp(log_value)

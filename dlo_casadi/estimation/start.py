@@ -142,7 +142,7 @@ def all_at_once(
     Returns
     -------
     Point or None
-        Of the equilibria found, the best. An equilibrium near the measured shapes, or None if there is none.
+        The best of the equilibria found near the measured shapes, or None if there is none.
     """
     unknowns, sweep = problem.unknowns, problem.sweep
     lower, upper = unknowns.bounds

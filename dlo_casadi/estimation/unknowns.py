@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import STIFFNESS_RATIO_STD, STIFFNESSES, CableModel
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
@@ -141,7 +141,37 @@ class Unknowns:
     def prior_mean(self) -> FloatArray:
         """Mean of the Gaussian prior of theta."""
         nominal = self.model.nominal
-        return self.pack(nominal, np.zeros(self.model.n_coefficients))
+        mean = self.pack(nominal, np.zeros(self.model.n_coefficients))
+        bending, torsion = self._stiffnesses
+        if torsion is not None and bending is None:
+            mean[torsion] += np.log(self.fixed[0] / nominal[0])
+        return mean
+
+    @property
+    def _stiffnesses(self) -> tuple[int | None, int | None]:
+        """Entries of the logarithms of EI and GJ; None where they are not estimated."""
+        found = [self.names.index(name) if name in self.names else None for name in STIFFNESSES]
+        return found[0], found[1]
+
+    def odd_ratio(self, theta: FloatArray) -> bool:
+        """Whether GJ over EI is more than two standard deviations from what is declared.
+
+        Where an effect is missing, a cable without torsion often fits shapes better than any.
+        """
+        bending, torsion = self._stiffnesses
+        if bending is None or torsion is None:
+            return False
+        return self.own_prior(theta, torsion) > 4.0
+
+    def own_prior(self, theta: FloatArray, k: int) -> float:
+        """What the prior of entry k itself adds to twice the objective."""
+        q = self.model.parameters[self._used[k]]
+        gap = theta - self.pack(self.model.nominal, np.zeros(self.model.n_coefficients))
+        bending, torsion = self._stiffnesses
+        if k == torsion:
+            of_bending = gap[bending] if bending is not None else 0.0
+            return float(((gap[k] - of_bending) / STIFFNESS_RATIO_STD) ** 2)
+        return 0.0 if np.isinf(q.prior_std) else float((gap[k] / q.prior_std) ** 2)
 
     def prior_precision(self, roughness_std: float) -> FloatArray:
         """Precision matrix (size, size) of the prior of theta.
@@ -156,6 +186,14 @@ class Unknowns:
             q = self.model.parameters[i]
             std = q.prior_std if q.log else q.prior_std / q.scale
             precision[k, k] = 0.0 if np.isinf(std) else 1 / std**2
+        bending, torsion = self._stiffnesses
+        if torsion is not None:
+            # (log GJ/EI - its nominal value)^2 / std^2.
+            row = np.zeros(self.size)
+            row[torsion] = 1 / STIFFNESS_RATIO_STD
+            if bending is not None:
+                row[bending] = -row[torsion]
+            precision += np.outer(row, row)
         if self.n_rest:
             rest = slice(self.n_parameters, self.size)
             rough = self.model.roughness

@@ -1,0 +1,213 @@
+"""A rod in space against closed forms, the plane, turned worlds, and itself on finer meshes."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.assembly import Given, Shapes
+from dlo_casadi.descent import descend
+from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium import EquilibriumError, Pose, solve_equilibrium
+from dlo_casadi.errors import DloError
+from dlo_casadi.initial_frames import same_sign
+from dlo_casadi.model import CableModel
+
+LENGTH, EI, GJ = 0.8, 0.02, 0.015
+DOWN = (0.0, 0.0, -9.81)
+
+
+def model(n=20, element="quadratic", gravity=DOWN, torsion=GJ, mass=0.12, end="clamped"):
+    cable = Cable(LENGTH, mass, 0.006, EI, torsional_stiffness=torsion)
+    return CableModel(cable, n=n, element=element, start="clamped", end=end, gravity=gravity)
+
+
+def pose(end, start_turn=(0.0, 0.0, 0.0), end_turn=(0.0, 0.0, 0.0), turns=0.0, start=(0, 0, 0)):
+    frames = [tuple(Rotation.from_rotvec(turn).as_quat()) for turn in (start_turn, end_turn)]
+    return Pose(tuple(map(float, start)), tuple(map(float, end)), None, None, *frames, turns=turns)
+
+
+OUT_OF_PLANE = pose((0.5, 0.1, 0.2), (0.3, -0.2, 0.4), (1.0, 0.3, -0.5))
+
+
+def solved(m, place, rest=None):
+    rest = np.zeros(m.chain.n_rests) if rest is None else rest
+    return solve_equilibrium(m, m.nominal, rest, place)
+
+
+def curved(m):
+    """Rest curvatures that change along the cable, about both axes."""
+    s = m.chain.cells.mean(axis=1) / LENGTH
+    strains = np.zeros((len(m.node.strains), len(s)))
+    strains[-2], strains[-1] = 2.0 + np.sin(3 * s), 1.5 * np.cos(2 * s)
+    return strains.ravel()
+
+
+@pytest.mark.parametrize(("element", "order"), [("arc", 1.9), ("quadratic", 3.8)])
+def test_order_of_the_elements(element, order):
+    # Clamps at an angle, gravity, a straight cable at rest: a rest shape has its own mean.
+    fine = solved(model(96), OUT_OF_PLANE).points
+    errors = [
+        np.linalg.norm(solved(model(n, element), OUT_OF_PLANE).points - fine[:: 96 // n], axis=1)
+        for n in (12, 24)
+    ]
+    assert np.log2(errors[0].max() / errors[1].max()) >= order
+
+
+@pytest.mark.parametrize("element", ["arc", "quadratic"])
+def test_a_turned_world_gives_the_same_shape(element):
+    turn = Rotation.from_rotvec([0.7, -1.1, 0.4])
+    here = model(10, element)
+    there = model(10, element, gravity=tuple(turn.apply(DOWN)))
+    frames = [
+        tuple((turn * Rotation.from_quat(q)).as_quat())
+        for q in (OUT_OF_PLANE.start_orientation, OUT_OF_PLANE.end_orientation)
+    ]
+    turned = Pose(
+        OUT_OF_PLANE.start, tuple(turn.apply(OUT_OF_PLANE.end)), None, None, frames[0], frames[1]
+    )
+    mine, other = solved(here, OUT_OF_PLANE, curved(here)), solved(there, turned, curved(there))
+    np.testing.assert_allclose(other.points, turn.apply(mine.points), atol=1e-9)
+    np.testing.assert_allclose(other.lam, turn.apply(mine.lam), atol=1e-9)
+    np.testing.assert_allclose(other.moments, turn.apply(mine.moments), atol=1e-9)
+    assert other.energy == pytest.approx(mine.energy, abs=1e-11)
+
+
+def test_a_planar_load_gives_the_numbers_of_the_plane():
+    plane = CableModel(
+        Cable(LENGTH, 0.12, 0.006, EI), n=16, element="arc", start="clamped", end="clamped"
+    )
+    flat = solve_equilibrium(
+        plane, plane.nominal, np.zeros(plane.chain.n_rests), Pose((0.0, 0.0), (0.5, 0.1), 0.4, -0.3)
+    )
+    m = model(16, "arc", gravity=(0.0, -9.81, 0.0))
+    found = solved(m, pose((0.5, 0.1, 0.0), (0.0, 0.0, 0.4), (0.0, 0.0, -0.3)))
+    np.testing.assert_allclose(found.points[:, :2], flat.points, atol=1e-9)
+    np.testing.assert_allclose(found.points[:, 2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.lam[:2], flat.lam, atol=1e-9)
+    np.testing.assert_allclose(found.moments[:, 2], flat.moments, atol=1e-9)
+    assert found.energy == pytest.approx(flat.energy, abs=1e-11)
+
+
+def test_a_helix_under_moments_alone():
+    """Without forces the moment is constant in space: with EI = GJ the strain in the cable."""
+    twist, bend = 3.0, 4.0
+    steps = [Rotation.from_rotvec(s * np.array([twist, bend, 0.0])) for s in (0.0, LENGTH)]
+    s = np.linspace(0.0, LENGTH, 20001)
+    tangents = Rotation.from_rotvec(np.outer(s, [twist, bend, 0.0])).apply([1.0, 0.0, 0.0])
+    end = np.trapezoid(tangents, s, axis=0)
+    m = model(10, "arc", gravity=(0.0, 0.0, 0.0), torsion=EI)
+    place = Pose((0.0, 0.0, 0.0), tuple(end), None, None, *(tuple(q.as_quat()) for q in steps))
+    found = solved(m, place)
+    np.testing.assert_allclose(found.curvature.reshape((2, -1))[0], bend, rtol=1e-6)
+    np.testing.assert_allclose(found.energy, EI / 2 * (twist**2 + bend**2) * LENGTH, rtol=1e-7)
+    np.testing.assert_allclose(found.lam, 0.0, atol=1e-7)
+    # On the end clamp the cable acts with minus its moment.
+    moment = steps[1].apply([EI * twist, EI * bend, 0.0])
+    np.testing.assert_allclose(np.abs(found.moments[1]), np.abs(moment), atol=1e-6)
+
+
+def test_the_twist_at_which_a_ring_leaves_its_plane():
+    """Michell's ring: 2 pi sqrt(3) EI / GJ."""
+    m = model(40, gravity=(0.0, 0.0, 0.0))
+    s = m.chain.places
+
+    def stable(twist):
+        ring = Rotation.from_rotvec(np.outer(2 * np.pi * s / LENGTH, [0.0, 0.0, 1.0]))
+        roll = Rotation.from_rotvec(np.outer(twist * s / LENGTH, [1.0, 0.0, 0.0]))
+        x = same_sign((ring * roll).as_quat())
+        place = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
+        lam = np.zeros((1, m.n_border))
+        given = Given.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
+        # The exact ring is an equilibrium, stable or not: Newton's method stays there.
+        shapes = Shapes.declared(x[None], lam)
+        for _ in range(6):
+            _, force, matrix = m.assembly.balance(shapes, given)
+            step = matrix.factor().solve(type(force)(-force.x, -force.y))
+            moved = m.node.moved(shapes.x, step.x[..., 0])
+            shapes = Shapes(moved, shapes.lam + step.y[..., 0], shapes.deviation)
+        _, force, matrix = m.assembly.balance(shapes, given)
+        assert np.abs(force.x).max() < 1e-9
+        return int(matrix.negative()[0]) == m.n_multipliers
+
+    exact = 2 * np.pi * np.sqrt(3.0) * EI / GJ
+    assert stable(0.999 * exact)
+    assert not stable(1.001 * exact)
+
+
+def test_a_cantilever_bends_out_of_its_plane_as_within():
+    weightless = model(12, gravity=(0.0, 0.0, 0.0), end="free")
+    within = model(12, gravity=(0.0, -0.5, 0.0), end="free")
+    across = model(12, gravity=(0.0, 0.0, -0.5), end="free")
+    held = Pose((0.0, 0.0, 0.0), None, start_orientation=(0.0, 0.0, 0.0, 1.0))
+    straight, down, aside = (solved(m, held).points[-1] for m in (weightless, within, across))
+    np.testing.assert_allclose(straight, [LENGTH, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(down[1], aside[2], atol=1e-12)
+    # Small deflection: q L^4 / (8 EI); the second order shortens the lever by a few per mille.
+    beam = -0.12 * 0.5 * LENGTH**3 / (8 * EI)
+    assert down[1] == pytest.approx(beam, rel=0.05)
+
+
+def test_turns_twist_the_cable_and_too_many_are_refused():
+    m = model(16)
+    place = pose((0.7, 0.0, 0.0))
+    energies = [solved(m, pose((0.7, 0.0, 0.0), turns=turns)).energy for turns in (-1, 0, 1)]
+    assert energies[0] == pytest.approx(energies[2], rel=1e-6)
+    assert energies[1] < energies[2]
+    assert solved(m, place).twist_angle == pytest.approx(0.0, abs=1e-6)
+
+
+def test_derivatives_by_increments():
+    m = model(4, end="free")
+    rng = np.random.default_rng(3)
+    x = same_sign(Rotation.from_rotvec(0.4 * rng.normal(size=(5, 3)).cumsum(axis=0)).as_quat())
+    given = Given.of(m.nominal, curved(m), OUT_OF_PLANE.vector[None])
+    shapes = Shapes.declared(x[None], rng.normal(size=(1, m.n_border)))
+    _, force, matrix = m.assembly.balance(shapes, given)
+    d = 1e-5
+
+    def moved(node, axis, sign):
+        step = np.zeros((1, 5, 3))
+        step[0, node, axis] = sign * d
+        there = Shapes(m.node.moved(shapes.x, step), shapes.lam, shapes.deviation)
+        return m.assembly.balance(there, given)[0][0]
+
+    for node in range(5):
+        for axis in range(3):
+            slope = (moved(node, axis, 1) - moved(node, axis, -1)) / (2 * d)
+            assert slope == pytest.approx(force.x[0, node, axis, 0], abs=1e-7)
+    np.testing.assert_allclose(m.assembly.imbalance(shapes, given).rows, force.rows, atol=1e-12)
+    dense = matrix.dense()[0]
+    np.testing.assert_allclose(dense, dense.T, atol=1e-10)
+
+
+def test_gravity_and_torsion_belong_together():
+    with pytest.raises(DloError, match="gravity has 3 numbers"):
+        CableModel(Cable(LENGTH, 0.1, 0.005, EI), gravity=DOWN)
+    with pytest.raises(DloError, match="'link' is not known in space"):
+        _ = model(element="link").chain
+
+
+def test_an_end_out_of_reach_is_told_with_numbers():
+    with pytest.raises(
+        EquilibriumError, match=r"is 0\.9000 m from the start, the cable is 0\.8000"
+    ):
+        solved(model(), pose((0.9, 0.0, 0.0)))
+
+
+def test_descents_from_far_away_are_minima():
+    m = model(10, "arc")
+    rng = np.random.default_rng(0)
+    x = np.array(
+        [
+            same_sign(Rotation.from_rotvec(rng.normal(size=(11, 3)).cumsum(axis=0) / 3).as_quat())
+            for _ in range(4)
+        ]
+    )
+    given = Given.of(
+        m.nominal, np.zeros(m.chain.n_rests), np.repeat(OUT_OF_PLANE.vector[None], 4, axis=0)
+    )
+    found = descend(m.assembly, Shapes.declared(x, np.zeros((4, m.n_border))), given)
+    assert found.converged.any()
+    _, force, matrix = m.assembly.balance(found.shapes, given)
+    assert np.abs(force.x[found.converged]).max() < 1e-9
+    assert np.all(matrix.negative()[found.converged] == m.n_multipliers)
