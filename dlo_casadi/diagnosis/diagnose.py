@@ -29,7 +29,7 @@ from dlo_casadi.diagnosis.structure import (
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.hyperparameters import noise_of, settle
+from dlo_casadi.estimation.hyperparameters import errors_of, settle
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
@@ -407,15 +407,16 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
     modes included; where something is, the noise is too large and the significance too low.
     """
     try:
-        noise = noise_of(closed.problem, closed.point, closed.linearization, modes=0)
+        noise, rest_scatter = errors_of(closed.problem, closed.point, closed.linearization, modes=0)
     except EstimationError:  # with the effect hardly a point is left over: nothing is shown
         return 1.0
-    problem = open_.problem.changed(noise, open_.problem.roughness_std, open_.problem.scatter)
-    problem.refresh(open_.point.feet)
+    rough, scatter = open_.problem.roughness_std, open_.problem.scatter
+    larger = closed.problem.changed(noise, rough, scatter, rest_scatter)
+    larger.refresh(closed.point.theta, closed.point.shapes, closed.point.feet)
+    problem = open_.problem.changed(noise, rough, scatter, rest_scatter)
+    problem.share_metric(larger)
     point = problem.evaluate(open_.point.theta, open_.point.shapes, open_.point.feet)
     point, _ = problem.descend(point)
-    larger = closed.problem.changed(noise, open_.problem.roughness_std, open_.problem.scatter)
-    larger.refresh(closed.point.feet)
     other = larger.evaluate(closed.point.theta, closed.point.shapes, closed.point.feet)
     other, _ = larger.descend(other)
     gain = max(2 * (point.objective - other.objective), 0.0)

@@ -88,7 +88,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
         modes = smooth_modes(s, model.cable.length, SLOW_MODES, model.end == "free")
         seen = problem.measured[j].slow_rows(modes)
-        basis, _ = np.linalg.qr(problem.whitening(j, s) @ seen)
+        basis, _ = np.linalg.qr(problem.whitening(j) @ seen)
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
         covariance = np.eye(basis.shape[1])
         block = inner[k]
@@ -147,7 +147,7 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
         x = item.points / fit.model.cable.length
         terms = np.column_stack([x, *(x[:, a] * x[:, b] for a, b in pairs)])
         moved = np.einsum("dc,kt->kdct", np.eye(d), terms).reshape((len(x), d, size))
-        seen = problem.whitening(j, s) @ item.components(observed[j].curve, s, moved)
+        seen = problem.whitening(j) @ item.components(observed[j].curve, s, moved)
         information += seen.T @ seen
         cross += seen.T @ lin.by_theta[k]
         slope += seen.T @ lin.residuals[k]

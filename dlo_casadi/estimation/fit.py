@@ -52,7 +52,8 @@ def starting_points(
     for start, decade in zip(starts, decades, strict=True):
         start[0] += decade * np.log(10)
     shapes, feet = measured_shapes(problem)
-    problem.refresh(feet)
+    if not problem.has_metric:
+        problem.refresh(theta, shapes, feet)
     held = np.zeros(problem.unknowns.size, dtype=bool)
     held[: problem.unknowns.n_parameters] = True
     begin = partial(all_at_once, problem, shapes, feet, held=held)
@@ -116,7 +117,7 @@ def fit_model(
         begin = model.nominal if start is None else start.values_in(model)
     unknowns = Unknowns(model, chosen, begin)
     if start is not None:
-        return _continue(unknowns, measured, tolerances, start, max_iterations)
+        return _continue(unknowns, measured, start, max_iterations)
     noise = NoiseModel(FIRST_STD)
     if std is not None:
         declared = NoiseModel(std, source="declared")
@@ -161,7 +162,6 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
 def _continue(
     unknowns: Unknowns,
     measured: Sequence[MeasuredPose],
-    tolerances: Tolerances,
     start: Fit,
     max_iterations: int = 40,
 ) -> Fit:
@@ -171,19 +171,12 @@ def _continue(
     p = np.where(known & unknowns.free, start.values_in(model), unknowns.fixed)
     unknowns = replace(unknowns, fixed=p)
     theta = unknowns.pack(p, start.coefficients)
-    problem = BatchProblem(
-        unknowns,
-        measured,
-        start.noise,
-        tolerances,
-        start.problem.roughness_std,
-        start.problem.scatter,
-    )
+    problem = start.problem.of(unknowns, measured)
     shapes, solved = problem.sweep.solve(carried_shapes(problem, start), p, unknowns.rest(theta))
     if not solved.all():
         raise EstimationError("the shapes of the first fit are no equilibria of the second model")
     feet = _feet_for(problem, start)
-    problem.refresh(feet)
+    problem.share_metric(start.problem)
     point = problem.evaluate(theta, shapes, feet)
     point, converged = problem.descend(point, max_iterations)
     return Fit(problem, point, converged)
@@ -249,7 +242,7 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     model = fit.model.with_mesh(n)
     unknowns = replace(problem.unknowns, model=model)
     try:
-        moved = _continue(unknowns, problem.history, problem.tolerances, fit)
+        moved = _continue(unknowns, problem.history, fit)
     except EstimationError:
         # The coarse mesh was too far off to be followed: start again from the measured shapes.
         names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]

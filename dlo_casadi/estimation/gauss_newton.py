@@ -18,12 +18,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.rest_scatter import RestScatter, modes_of
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -35,6 +37,8 @@ FloatArray = NDArray[np.floating]
 NO_INFORMATION = 1e-6
 # Farther than so [rad] no node is moved along its derivative: equilibria are not that linear.
 LONGEST_MOVE = 1.5
+# Cables come back to the same shape, unless the data tell otherwise.
+NO_REST_SCATTER = RestScatter()
 # A descent creeps where so many steps together gain no more than the last one may.
 CREEPING = 4
 
@@ -129,6 +133,8 @@ class BatchProblem:
         Prior of the rest curvature, see `Unknowns.prior_precision`.
     scatter : (len(DEVIATIONS),), optional
         Standard deviations of a pose's own deviations; the tolerances by default.
+    rest_scatter : RestScatter
+        Rest curvature of each hanging's own; none by default.
     sweep : Sweep, optional
         Reused when only noise or priors have changed.
     """
@@ -141,6 +147,7 @@ class BatchProblem:
         tolerances: Tolerances,
         roughness_std: float = 1.0,
         scatter: FloatArray | None = None,
+        rest_scatter: RestScatter = NO_REST_SCATTER,
         sweep: Sweep | None = None,
     ) -> None:
         self.unknowns = unknowns
@@ -160,6 +167,7 @@ class BatchProblem:
         self.precision = unknowns.prior_precision(roughness_std)
         self.mean = unknowns.prior_mean()
         self.scatter = tolerances.deviation if scatter is None else scatter
+        self.rest_scatter = rest_scatter
         self.deviation_std = self.scatter[self.sweep.used_deviations]
         self._whitening: dict[int, FloatArray] = {}
 
@@ -185,20 +193,52 @@ class BatchProblem:
         """Curve of what the model says of its nodes."""
         return NodeCurve.of(self.unknowns.model.cable.length, z)
 
-    def whitening(self, j: int, feet: FloatArray) -> FloatArray:
-        """Whitening matrix (R_j, R_j) of pose j, computed for the feet at `refresh`."""
-        if j not in self._whitening:
-            self._whitening[j] = self.measured[j].whitening(self.noise, feet)
+    def whitening(self, j: int) -> FloatArray:
+        """Whitening matrix (R_j, R_j) of pose j, as of the last `refresh`."""
         return self._whitening[j]
 
-    def refresh(self, feet: Sequence[FloatArray]) -> None:
-        """Recompute the noise metric for points whose feet have moved."""
-        self._whitening = {}
-        for j, s in zip(self.used, feet, strict=True):
-            self.whitening(j, s)
+    def refresh(self, theta: FloatArray, shapes: Shapes, feet: Sequence[FloatArray]) -> None:
+        """Take the metric of the residuals at these unknowns, equilibria and feet.
+
+        The covariance of pose j is that of its noise plus E_j E_j^T, where E_j is what a standard
+        deviation of each mode of its own rest curvature does to the residuals.
+        """
+        self._whitening = {
+            j: self.measured[j].whitening(self.noise, s)
+            for j, s in zip(self.used, feet, strict=True)
+        }
+        if self.rest_scatter.std == 0:
+            return
+        moved = self.moved_by_rest(theta, shapes, feet)
+        for j, way in zip(self.used, moved, strict=True):
+            seen = self._whitening[j] @ (way * self.rest_scatter.sizes)
+            factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
+            self._whitening[j] = solve_triangular(factor, self._whitening[j], lower=True)
+
+    def moved_by_rest(
+        self, theta: FloatArray, shapes: Shapes, feet: Sequence[FloatArray]
+    ) -> list[FloatArray]:
+        """Change (R_j, MODES) of the fitted poses' residuals by a rest curvature of their own."""
+        p, rest, model = self.unknowns.p(theta), self.unknowns.rest(theta), self.unknowns.model
+        modes = modes_of(model.chain.cells, model.cable.length)
+        along = self.sweep.by_rest(shapes, p, rest, modes)
+        seen = self.sweep.observe(shapes, p, rest, along)
+        return [
+            self.measured[j].residual_along(
+                Observed(self.curve_of(seen.z[j]), shapes.lam[j]),
+                s,
+                ObservedChange(seen.slopes[j], along.lam[j]),
+            )
+            for j, s in zip(self.used, feet, strict=True)
+        ]
+
+    @property
+    def has_metric(self) -> bool:
+        """Whether the metric of the residuals has been taken."""
+        return bool(self._whitening)
 
     def share_metric(self, other: BatchProblem) -> None:
-        """Take over the noise metric of a problem with the same fitted poses and noise."""
+        """Take over the metric of a problem with the same fitted poses: objectives compare then."""
         self._whitening = {
             mine: other._whitening[theirs]
             for mine, theirs in zip(self.used, other.used, strict=True)
@@ -211,7 +251,7 @@ class BatchProblem:
         for j, guess in zip(self.used, feet, strict=True):
             item = self.measured[j]
             s = item.located(seen[j], guess)
-            white = self.whitening(j, s) @ item.residual(seen[j], s)
+            white = self.whitening(j) @ item.residual(seen[j], s)
             moved.append(s)
             data += float(white @ white)
         gap = theta - self.mean
@@ -250,7 +290,7 @@ class BatchProblem:
         size = self.unknowns.size
         for j, s in zip(self.used, point.feet, strict=True):
             now, item = Observed(self.curve_of(seen.z[j]), point.shapes.lam[j]), self.measured[j]
-            white = self.whitening(j, s)
+            white = self.whitening(j)
             d = item.residual(now, s)
             if ahead is not None and correction is not None:
                 change = ObservedChange(ahead.slopes[j], correction.lam[j])
@@ -375,26 +415,43 @@ class BatchProblem:
         Not for models with a state, whose poses depend on those before them.
         """
         kept = self.fitted[:: -(-len(self.fitted) // most)]
+        return self.of(self.unknowns, [self.history[k] for k in kept])
+
+    def of(
+        self,
+        unknowns: Unknowns,
+        measured: Sequence[MeasuredPose] | None = None,
+        scatter: FloatArray | None = None,
+        sweep: Sweep | None = None,
+    ) -> BatchProblem:
+        """Return a problem with the same noise, roughness and scatter, unless it is given here."""
         return BatchProblem(
-            self.unknowns,
-            [self.history[k] for k in kept],
+            unknowns,
+            self.history if measured is None else measured,
             self.noise,
             self.tolerances,
             self.roughness_std,
-            self.scatter,
+            self.scatter if scatter is None else scatter,
+            self.rest_scatter,
+            sweep,
         )
 
     def changed(
-        self, noise: NoiseModel, roughness_std: float, scatter: FloatArray | None = None
+        self,
+        noise: NoiseModel,
+        roughness_std: float,
+        scatter: FloatArray,
+        rest_scatter: RestScatter,
     ) -> BatchProblem:
-        """Return the same problem with another noise, roughness or scatter of the ends."""
+        """Return the same problem with another noise, roughness or scatter."""
         return BatchProblem(
             self.unknowns,
             self.history,
             noise,
             self.tolerances,
             roughness_std,
-            self.scatter if scatter is None else scatter,
+            scatter,
+            rest_scatter,
             self.sweep,
         )
 

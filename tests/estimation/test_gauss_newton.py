@@ -194,7 +194,7 @@ def rich(element: str, markers: bool = False) -> tuple[BatchProblem, Point]:
     shapes = solved(problem, theta)
     seen = problem.observed(theta, shapes)
     feet = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
-    problem.refresh(feet)
+    problem.refresh(theta, shapes, feet)
     return problem, problem.evaluate(theta, shapes, feet)
 
 
@@ -209,7 +209,7 @@ def residuals(problem: BatchProblem, point: Point, theta, deviation=None) -> lis
     for j, guess in zip(problem.used, point.feet, strict=True):
         item = problem.measured[j]
         s = item.located(seen[j], guess)
-        out.append(problem.whitening(j, s) @ item.residual(seen[j], s))
+        out.append(problem.whitening(j) @ item.residual(seen[j], s))
     return out
 
 
@@ -340,7 +340,7 @@ def test_noise_free_round_trip_is_exact():
     shapes = solved(problem, theta)
     seen = problem.observed(theta, shapes)
     feet = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
-    problem.refresh(feet)
+    problem.refresh(theta, shapes, feet)
     found, converged = problem.descend(problem.evaluate(theta, shapes, feet))
     assert converged
     # A standard deviation of 1e-7 m against positions of 1 m: relative 1e-6 or better, and the
