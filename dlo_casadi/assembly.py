@@ -15,15 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.rod.band import BandMatrix, Vector
+from dlo_casadi.rod.node import Frame, Heading, Node
 
 if TYPE_CHECKING:
     from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
-# What may be different in every pose, in the order of `deviation`: where the ends deviate from
-# what is declared [m, rad], and a force of unknown cause [N].
-DEVIATIONS = ("end_x", "end_y", "start_heading", "end_heading", "pull_x", "pull_y")
+_NODES = {node.coordinates: node for node in (Heading, Frame)}
+
+
+def deviation_names(node: type[Node]) -> tuple[str, ...]:
+    """What may be different in every pose, in the order of `deviation`.
+
+    Where the ends deviate from what is declared [m, rad], and a force of unknown cause [N].
+    """
+    parts = (("end", node.axes), ("start", node.turns), ("end", node.turns), ("pull", node.axes))
+    return tuple(f"{what}_{name}" for what, names in parts for name in names)
+
+
+DEVIATIONS = deviation_names(Heading)
 
 
 @dataclass(frozen=True)
@@ -36,8 +47,8 @@ class Shapes:
         States of the nodes: of a planar cable, headings [rad].
     lam : (m, n_border)
         Multipliers of the end conditions; places and pulls of springs.
-    deviation : (m, len(DEVIATIONS))
-        What is different in every pose, see DEVIATIONS.
+    deviation : (m, n_deviations)
+        What is different in every pose, see `deviation_names`.
     """
 
     x: FloatArray
@@ -47,7 +58,7 @@ class Shapes:
     @classmethod
     def declared(cls, x: FloatArray, lam: FloatArray) -> Shapes:
         """Shapes whose ends are where they are declared to be."""
-        return cls(x, lam, np.zeros((len(x), len(DEVIATIONS))))
+        return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]])))))
 
     def subset(self, index: Any) -> Shapes:
         """Shapes of some of the poses."""
@@ -58,7 +69,7 @@ class Shapes:
 class Given:
     """What the equilibria of m poses depend on.
 
-    `p` (m, n_parameters), `rest` (m, n_cells) [1/m], `poses` (m, POSE_SIZE) as declared.
+    `p` (m, n_parameters), `rest` (m, n_rests) [1/m], `poses` (m, n_pose) as declared.
     """
 
     p: FloatArray
@@ -83,7 +94,7 @@ class Directions:
     """Directions of all that shapes depend on, q of them, of m poses.
 
     `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q),
-    `rest` (m, n_cells, q), `deviation` (m, len(DEVIATIONS), q).
+    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q).
     """
 
     x: FloatArray
@@ -136,6 +147,8 @@ class Assembly:
         self.chain, self.node = model.chain, model.chain.kind.node
         self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
         self._slots = self.chain.n_slots
+        # Numbers that tell the rest curvature inside a slot.
+        self.n_inside = 3 * len(self.node.curvatures)
         self._next = np.minimum(np.arange(self._slots) + 1, self.n - 1)
         self._functions: dict[str, _Mapped] = {}
 
@@ -219,28 +232,29 @@ class Assembly:
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
         n_p = along.p.shape[1]
         moved = slots[..., :n_p] @ along.p[:, None]
-        moved += slots[..., n_p : n_p + 3] @ self.chain.rest_inside(along.rest)
-        moved += slots[..., n_p + 3 :] @ along.deviation[:, None]
+        n_r = n_p + self.n_inside
+        moved += slots[..., n_p:n_r] @ self.chain.rest_inside(along.rest)
+        moved += slots[..., n_r:] @ along.deviation[:, None]
         at_ends = ends[..., :n_p] @ along.p + ends[..., n_p:] @ along.deviation
         return self._added(moved, at_ends)
 
     # ---- the curve ------------------------------------------------------------------------------
 
     def _stations(self, advance: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (m, n + 1, 2, ...) and length ratios (m, n + 1, 1, ...) of element boundaries."""
-        steps = advance[:, self.chain.layout.advancing]
-        places = np.concatenate([start[:, None], steps[:, :, :2]], axis=1).cumsum(axis=1)
-        ratio = steps[:, :, 2:]
+        """Places (m, n + 1, d, ...) and length ratios (m, n + 1, 1, ...) of element boundaries."""
+        steps, d = advance[:, self.chain.layout.advancing], self.node.dimension
+        places = np.concatenate([start[:, None], steps[:, :, :d]], axis=1).cumsum(axis=1)
+        ratio = steps[:, :, d:]
         mean = (ratio[:, 1:] + ratio[:, :-1]) / 2
         return places, np.concatenate([ratio[:, :1], mean, ratio[:, -1:]], axis=1)
 
     def nodes(self, shapes: Shapes, given: Given) -> FloatArray:
-        """True places (m, n + 1, 2) [m] of the element boundaries."""
+        """True places (m, n + 1, dimension) [m] of the element boundaries."""
         (advance,) = self._call_slots("slot_curve", shapes, given)
-        return self._stations(advance[..., 0], given.poses[:, :2])[0]
+        return self._stations(advance[..., 0], given.poses[:, : self.node.dimension])[0]
 
     def curve(self, shapes: Shapes, given: Given) -> FloatArray:
-        """Measured places, and slopes dr/ds of smooth elements, (m, n + 1, 2 or 4)."""
+        """Measured places, and slopes dr/ds of smooth elements, (m, n + 1, d or 2 d)."""
         (advance,) = self._call_slots("slot_curve", shapes, given)
         (rows,) = self._call_stations("station", advance[..., 0], shapes, given)
         return rows[..., 0]
@@ -249,7 +263,7 @@ class Assembly:
         self, name: str, advance: FloatArray, shapes: Shapes, given: Given
     ) -> list[FloatArray]:
         m, count = len(shapes.x), self.chain.n + 1
-        places, ratio = self._stations(advance, given.poses[:, :2])
+        places, ratio = self._stations(advance, given.poses[:, : self.node.dimension])
         x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
         p, ends = (
             np.broadcast_to(a[:, None], (m, count, a.shape[1])) for a in (given.p, given.poses)
@@ -265,42 +279,60 @@ class Assembly:
         return CurveSlopes(self, rows[..., 0], by_moving, by_others, by_station, by_p)
 
     def start_force(self, shapes: Shapes, given: Given) -> FloatArray:
-        """Force (m, 2) [N] of the cable on whatever holds its start."""
+        """Force (m, dimension) [N] of the cable on whatever holds its start."""
         rows = (shapes.lam, given.p, given.poses, shapes.deviation)
         return self._mapped("start_force", 1)(*(row[:, None] for row in rows))[0][:, 0, :, 0]
 
     # ---- state and strain ------------------------------------------------------------------------
 
     def strain(self, shapes: Shapes, given: Given) -> FloatArray:
-        """Mean curvature (m, n_cells) [1/m] of the cells."""
+        """Mean curvatures (m, n_rests) [1/m] of the cells, about the axes in turn."""
         (rows,) = self._call_slots("slot_strain", shapes, given)
+        return self._stacked(rows[..., 0][:, self.chain.layout.bends])
+
+    def twist(self, shapes: Shapes, given: Given) -> FloatArray:
+        """Mean twist (m, n_cells) [1/m] of the cells; zero in a plane."""
+        (rows,) = self._call_slots("slot_twist", shapes, given)
         return rows[:, self.chain.layout.bends, 0, 0]
 
+    @staticmethod
+    def _stacked(cells: FloatArray) -> FloatArray:
+        """Values (m, n_cells, axes, ...) of cells as (m, n_rests, ...), axis after axis."""
+        by_axis = np.moveaxis(cells, 2, 1)
+        return by_axis.reshape((len(cells), -1, *cells.shape[3:]))
+
     def state_after(self, shapes: Shapes, given: Given) -> tuple[FloatArray, ...]:
-        """Rest curvature (m, n_cells) that poses leave; its slopes by both nodes, rest and p."""
+        """Rest curvature (m, n_rests) that poses leave; its slopes by both nodes, rest and p.
+
+        The slopes are (m, n_rests, 2b), (m, n_rests, axes) by the cell's own rest curvatures, and
+        (m, n_rests, n_parameters).
+        """
         bends = self.chain.layout.bends
-        after, by_x, by_rest, by_p = self._call_slots("slot_state", shapes, given)
-        return (
-            after[:, bends, 0, 0],
-            by_x[:, bends, 0],
-            by_rest[:, bends, 0, 0],
-            by_p[:, bends, 0],
-        )
+        after, *slopes = self._call_slots("slot_state", shapes, given)
+        stacked = [self._stacked(part[:, bends]) for part in slopes]
+        return (self._stacked(after[..., 0][:, bends]), *stacked)
+
+    def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
+        """Whether poses hand on the rest curvature that they find, to first order."""
+        axes = len(self.node.curvatures)
+        return bool(np.all(slopes[2] == np.repeat(np.eye(axes), self.chain.n_cells, axis=0)))
 
     def state_along(
         self, slopes: tuple[FloatArray, ...], x: FloatArray, rest: FloatArray, p: FloatArray
     ) -> FloatArray:
-        """Change (m, n_cells, q) of what poses leave behind, along nodes, rest and p."""
-        bends = self.chain.layout.bends
+        """Change (m, n_rests, q) of what poses leave behind, along nodes, rest and p."""
+        bends, axes = self.chain.layout.bends, len(self.node.curvatures)
         _, by_x, by_rest, by_p = slopes
         both = np.concatenate([x[:, bends], x[:, bends + 1]], axis=2)
-        moved = (by_x[:, :, None] @ both)[:, :, 0]
-        return np.asarray(moved + by_rest[..., None] * rest + by_p @ p)
+        own = np.stack(self.chain.by_axis(rest), axis=2)
+        moved = (by_x[:, :, None] @ np.tile(both, (1, axes, 1, 1)))[:, :, 0]
+        moved += (by_rest[:, :, None] @ np.tile(own, (1, axes, 1, 1)))[:, :, 0]
+        return np.asarray(moved + by_p @ p)
 
 
 @dataclass(frozen=True)
 class CurveSlopes:
-    """Measured curves `z` (m, n + 1, 2 or 4) and their derivatives, slot by slot."""
+    """Measured curves `z` (m, n + 1, d or 2 d) and their derivatives, slot by slot."""
 
     assembly: Assembly
     z: FloatArray
@@ -310,16 +342,17 @@ class CurveSlopes:
     by_p: FloatArray
 
     def along(self, directions: Directions) -> FloatArray:
-        """Change (m, n + 1, 2 or 4, q) of the measured curves."""
+        """Change (m, n + 1, d or 2 d, q) of the measured curves."""
         a, d = self.assembly, directions
         n_p, b = d.p.shape[1], a.b
         nodes = np.concatenate([d.x[:, : a._slots], d.x[:, a._next]], axis=2)
         steps = self.by_moving[..., : 2 * b] @ nodes
         steps += self.by_moving[..., 2 * b :] @ d.lam[:, None]
         steps += self.by_others[..., :n_p] @ d.p[:, None]
-        steps += self.by_others[..., n_p : n_p + 3] @ a.chain.rest_inside(d.rest)
-        steps += self.by_others[..., n_p + 3 :] @ d.deviation[:, None]
-        start = np.zeros((len(steps), 2, steps.shape[3]))
+        n_r = n_p + a.n_inside
+        steps += self.by_others[..., n_p:n_r] @ a.chain.rest_inside(d.rest)
+        steps += self.by_others[..., n_r:] @ d.deviation[:, None]
+        start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))
         places, ratio = a._stations(steps, start)
         shape = (len(steps), a.chain.n + 1, 2 * b, steps.shape[3])
         own = d.x[:, a.chain.layout.stations].reshape(shape)

@@ -11,12 +11,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Given, Shapes
+from dlo_casadi.assembly import Given, Shapes
+from dlo_casadi.descent import descend
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, arc_into_clamps, limited, wrapped
+from dlo_casadi.initial_frames import guessed_frames_of
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
+from dlo_casadi.rod.node import Frame
 from dlo_casadi.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
@@ -46,10 +49,14 @@ class Pose:
 
     Parameters
     ----------
-    start, end : (2,) [m]
+    start, end : (dimension,) [m]
         `end` is None for a free end.
     start_heading, end_heading : float [rad] or None
-        Directions of clamped ends, continuous along the cable.
+        Directions of clamped ends in a plane, continuous along the cable.
+    start_orientation, end_orientation : (4,) or None
+        Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable.
+    turns : float
+        In space, full turns of twist at the end about its x axis beside the roll nearest to none.
     branch : "ccw" or "cw", optional
         Which way the cable turns from start to end: the sign of `Equilibrium.turn`.
     name : str
@@ -57,28 +64,44 @@ class Pose:
         Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
     """
 
-    start: tuple[float, float]
-    end: tuple[float, float] | None = None
+    start: tuple[float, ...]
+    end: tuple[float, ...] | None = None
     start_heading: float | None = None
     end_heading: float | None = None
+    start_orientation: tuple[float, ...] | None = None
+    end_orientation: tuple[float, ...] | None = None
+    turns: float = 0.0
     branch: Branch | None = None
     name: str = "pose"
     camera_center: tuple[float, float, float] | None = None
 
     @property
     def ends(self) -> FloatArray:
-        """Start, end [m], start heading, end heading [rad] (6,)."""
-        end = self.end if self.end is not None else (0.0, 0.0)
-        return np.array([*self.start, *end, self.start_heading or 0.0, self.end_heading or 0.0])
+        """Start, end [m], start frame, end frame: see `EndConditions.vector`."""
+        end = self.end if self.end is not None else (0.0,) * len(self.start)
+        return np.concatenate([self.start, end, *self.frames])
+
+    @property
+    def frames(self) -> tuple[FloatArray, FloatArray]:
+        """Frames (coordinates,) of both ends as nodes carry them: in a plane headings [rad]."""
+        if len(self.start) == 2:
+            return np.array([self.start_heading or 0.0]), np.array([self.end_heading or 0.0])
+        first, last = self.start_orientation, self.end_orientation
+        return _unit(first or Frame.identity), _unit(last or Frame.identity)
 
     @property
     def vector(self) -> FloatArray:
-        """The model's argument `pose` (9,): the ends, then what `effects.Sight` says of the camera.
+        """The model's argument `pose`: the ends, then what `effects.Sight` says of the camera.
 
         Its centre (x, y, z) enters as (x, y, 1) / z: zeros for none, which sees from infinity.
         """
         x, y, z = self.camera_center or (0.0, 0.0, np.inf)
         return np.concatenate([self.ends, np.array([x, y, 1.0]) / z])
+
+
+def _unit(quaternion: tuple[float, ...]) -> FloatArray:
+    q = np.array(quaternion, dtype=float)
+    return q / max(float(np.linalg.norm(q)), 1e-300)
 
 
 @dataclass(frozen=True)
@@ -89,21 +112,24 @@ class Equilibrium:
     ----------
     x : (n_nodes, coordinates)
         States of the nodes: of a planar cable, absolute headings [rad].
-    points : (n + 1, 2) [m]
+    points : (n + 1, dimension) [m]
         Nodes from start to end.
     energy : float [J]
-    lam : (2,) [N]
+    lam : (dimension,) [N]
         Force of the cable on whatever holds its end; zero at a free end.
-    lam_start : (2,) [N]
+    lam_start : (dimension,) [N]
         Force of the cable on whatever holds its start.
-    moments : (2,) [N m]
-        Of the cable on its clamps (start, end); zero at pins.
+    moments : (2, increment) [N m]
+        Of the cable on its clamps (start, end), in space about the world's axes; zero at pins.
+        In a plane (2,).
     multipliers : (n_border,)
         Of the end conditions, places and pulls of springs: in the order of `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
         Of the joint bounds; zero where a joint bends freely.
-    curvature : (n_cells,) [1/m]
-        Mean curvature of each bending cell.
+    curvature : (n_rests,) [1/m]
+        Mean curvature of each bending cell, in space about the axis y, then about z.
+    twist : (n_cells,) [1/m]
+        Mean twist of each cell; zero in a plane.
     min_bend_radius : float [m]
         Smallest radius of curvature along the cable: of the cells' mean curvatures, continued
         linearly to both ends; of second order in the cells' length.
@@ -122,6 +148,7 @@ class Equilibrium:
     multipliers: FloatArray
     bound_multipliers: FloatArray
     curvature: FloatArray
+    twist: FloatArray
     min_bend_radius: float
     residual: float
     status: Status
@@ -160,6 +187,8 @@ class Equilibrium:
 def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
     """Smallest radius [m] of curvatures that are means over cells (n, 2), see `Equilibrium`."""
     widths = np.diff(cells, axis=1).ravel()
+    if len(curvature) > len(cells):
+        curvature = np.linalg.norm(curvature.reshape((-1, len(cells))), axis=0)
     largest = float(np.abs(curvature).max())
     for inner in (1, -2) if len(curvature) > 1 else ():
         outer = 0 if inner == 1 else -1
@@ -271,7 +300,7 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
     Parameters
     ----------
     p : (n_parameters,)
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
     """
     chain = model.chain
     ends, length = model.held(p, pose.ends, 0)
@@ -297,6 +326,37 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
     for phi in out:
         phi[[0, -1]] = np.where(held, headings, phi[[0, -1]])
     return out
+
+
+def first_nodes(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> list[FloatArray]:
+    """First guesses of the nodes (n_nodes, coordinates): `guesses`, or `guessed_frames`."""
+    if model.in_space:
+        return guessed_frames(model, p, rest, pose)
+    return [phi[:, None] for phi in guesses(model, p, rest, pose)]
+
+
+def guessed_frames(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose
+) -> list[FloatArray]:
+    """First guesses of the frames (n_nodes, 4) of a cable in space.
+
+    Between two ends, four arcs of the cable's length, the first sagging along gravity, the others
+    turned about the chord by quarter turns; bent into the clamps, the roll of the end clamp that
+    is nearest to none, and `turns`, spread evenly. With a free end: the rest shape, the cable
+    fallen down, and straight on.
+    """
+    ends, length = model.held(p, pose.ends, 0)
+    values = np.array(ends).ravel()
+    start, end, first, last = np.split(values, [3, 6, 10])
+    held = tuple(side == "clamped" for side in (model.start, model.end))
+    clamps = (first if held[0] else None, last if held[1] else None)
+    u = model.chain.places / model.chain.length
+    down = np.array(model.gravity)
+    chord = None if model.end == "free" else (end - start) / float(length)
+    cells = model.chain.cells
+    widths = np.diff(cells, axis=1).ravel()
+    bent = rest.reshape((2, -1)) * widths
+    return guessed_frames_of(u, chord, clamps, down, bent, pose.turns)
 
 
 def _hanging(
@@ -329,11 +389,12 @@ def check_reach(model: CableModel, p: FloatArray, pose: Pose) -> None:
     if pose.end is None or model.extensible:
         return
     ends, true_length = model.held(p, pose.ends, 0)
-    start, end, _ = np.array(ends).reshape(3, 2)
-    distance, length = float(np.hypot(*(end - start))), float(true_length)
+    start, end = np.array(ends).ravel()[: 2 * model.node.dimension].reshape(2, -1)
+    distance, length = float(np.linalg.norm(end - start)), float(true_length)
     if distance >= length:
+        where = ", ".join(f"{x:.4f}" for x in pose.end)
         raise EquilibriumError(
-            f"no equilibrium: the end ({pose.end[0]:.4f}, {pose.end[1]:.4f}) m is {distance:.4f} m "
+            f"no equilibrium: the end ({where}) m is {distance:.4f} m "
             f"from the start, the cable is {length:.4f} m long.\n"
             "  Try: end in metres? cable.length?",
             pose.name,
@@ -347,7 +408,7 @@ def solve_equilibrium(
     rest: FloatArray,
     pose: Pose,
     *,
-    phi_init: FloatArray | None = None,
+    x_init: FloatArray | None = None,
 ) -> Equilibrium:
     """Shape of the cable held at the ends of a pose.
 
@@ -356,17 +417,17 @@ def solve_equilibrium(
     Of the equilibria that the first guesses lead to (see `guesses`), the stable one of lowest
     energy is returned, an unstable one where no other is found. A pose that names its branch
     gets one of that branch or none; between two pins the first stable one, as a rule that of the
-    branch's own arc. With `phi_init`, the equilibrium that it leads to, on whichever branch.
+    branch's own arc. With `x_init`, the equilibrium that it leads to, on whichever branch.
 
     Parameters
     ----------
     model : CableModel
     p : (n_parameters,)
         In the order of `model.names`, SI units.
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
         Rest curvature of the bending cells: `model.rest_basis @ coefficients`.
     pose : Pose
-    phi_init : (n_nodes,) [rad], optional
+    x_init : (n_nodes, coordinates), optional
 
     Raises
     ------
@@ -387,8 +448,10 @@ def solve_equilibrium(
             pose.end,
         )
     check_reach(model, p, pose)
-    starts = [phi_init] if phi_init is not None else guesses(model, p, rest, pose)
-    branch = pose.branch if phi_init is None else None
+    if model.in_space:
+        return _in_space(model, p, rest, pose, x_init)
+    starts = [x_init[:, 0]] if x_init is not None else guesses(model, p, rest, pose)
+    branch = pose.branch if x_init is None else None
     first_suffices = branch is not None and (model.start, model.end) == ("pinned", "pinned")
     found: list[Equilibrium] = []
     for phi in starts:
@@ -429,7 +492,7 @@ def _from_start(
     """One IPOPT solve from one first guess, and Newton's method on the Lagrangian."""
     chain = model.chain
     solver = _solver(id(model), _Held(model))
-    deviation = np.zeros(len(DEVIATIONS))
+    deviation = np.zeros(len(model.deviation_names))
     given = Given.of(p, rest, pose.vector[None])
     x0 = np.concatenate([phi, np.zeros(2 * model.n_springs + model.n_inner * chain.n_slots)])
     bounds = np.zeros(model.n_multipliers + chain.n_nodes - 1)
@@ -451,22 +514,75 @@ def _from_start(
         status = Status.FAILED
     else:
         status = Status.STABLE if found.stable else Status.UNSTABLE
-    curvature = model.assembly.strain(found.shapes, given)[0]
-    end_force, moments = split_multipliers(model, found.shapes.lam[0])
+    iterations = int(stats["iter_count"])
+    return _equilibrium(
+        model, found.shapes, given, found.bound_lam, found.residual, status, iterations
+    )
+
+
+def _equilibrium(
+    model: CableModel,
+    shapes: Shapes,
+    given: Given,
+    bound_lam: FloatArray,
+    residual: float,
+    status: Status,
+    iterations: int,
+) -> Equilibrium:
+    """What there is to say of one shape."""
+    assembly = model.assembly
+    curvature = assembly.strain(shapes, given)[0]
+    end_force, moments = split_multipliers(model, shapes.x[0], shapes.lam[0])
     return Equilibrium(
-        x=found.shapes.x[0],
-        points=model.assembly.nodes(found.shapes, given)[0],
-        energy=energy,
+        x=shapes.x[0],
+        points=assembly.nodes(shapes, given)[0],
+        energy=float(assembly.energy(shapes, given)[0]),
         lam=end_force,
-        lam_start=model.assembly.start_force(found.shapes, given)[0],
+        lam_start=assembly.start_force(shapes, given)[0],
         moments=moments,
-        multipliers=found.shapes.lam[0],
-        bound_multipliers=found.bound_lam,
+        multipliers=shapes.lam[0],
+        bound_multipliers=bound_lam,
         curvature=curvature,
-        min_bend_radius=smallest_radius(curvature, chain.cells),
-        residual=found.residual,
+        twist=assembly.twist(shapes, given)[0],
+        min_bend_radius=smallest_radius(curvature, model.chain.cells),
+        residual=residual,
         status=status,
-        iterations=int(stats["iter_count"]),
+        iterations=iterations,
+    )
+
+
+def _in_space(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, x_init: FloatArray | None
+) -> Equilibrium:
+    """The minimum of lowest energy among those that the first guesses lead to.
+
+    Raises
+    ------
+    EquilibriumError
+        If none leads to one.
+    """
+    starts = np.array([x_init] if x_init is not None else first_nodes(model, p, rest, pose))
+    count = len(starts)
+    given = Given.of(p, rest, np.repeat(pose.vector[None], count, axis=0))
+    first = Shapes.declared(starts, np.zeros((count, model.n_border)))
+    found = descend(model.assembly, first, given)
+    if not found.converged.any():
+        raise EquilibriumError(
+            f"no stable equilibrium found from {count} first guesses with its end at {pose.end} m "
+            f"and {pose.turns:g} turns.\n"
+            "  Try: fewer turns (a twisted cable loops), a finer mesh (model.n), or check the "
+            "stiffnesses and orientations.",
+            pose.name,
+            pose.end,
+        )
+    best = int(np.where(found.converged, found.energy, np.inf).argmin())
+    one = np.array([best])
+    shapes, given = found.shapes.subset(one), given.subset(one)
+    _, force, _ = model.assembly.balance(shapes, given)
+    residual = float(np.abs(force.y).max(initial=0.0))
+    none = np.zeros(model.chain.n_nodes - 1)
+    return _equilibrium(
+        model, shapes, given, none, residual, Status.STABLE, int(found.iterations[best])
     )
 
 
@@ -547,12 +663,20 @@ def _bordered(
     return whole, matrix.with_border(arms)
 
 
-def split_multipliers(model: CableModel, lam: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Force on the end's holder (2,) [N] and moments of clamped headings (start, end) [N m]."""
-    named = dict(zip(model.border_names, lam, strict=True))
-    force = np.array([named.get("end_position_x", 0.0), named.get("end_position_y", 0.0)])
-    moments = np.array([named.get("start_heading", 0.0), named.get("end_heading", 0.0)])
-    return force, moments
+def split_multipliers(
+    model: CableModel, x: FloatArray, lam: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Force on the end's holder (dimension,) [N] and moments on the clamps (start, end) [N m].
+
+    The moments are (2,) in a plane, (2, 3) about the world's axes in space.
+    """
+    node, named = model.node, dict(zip(model.border_names, lam, strict=True))
+    force = np.array([named.get(f"end_position_{axis}", 0.0) for axis in node.axes])
+    moments = [
+        node.to_world(frame, np.array([named.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
+        for side, frame in (("start", x[0]), ("end", x[-1]))
+    ]
+    return force, np.squeeze(np.array(moments))
 
 
 def total_dead_load(model: CableModel, p: FloatArray) -> FloatArray:

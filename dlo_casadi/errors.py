@@ -93,7 +93,7 @@ class EquilibriumError(DloError):
         self,
         message: str,
         pose: str | None = None,
-        p_des: tuple[float, float] | None = None,
+        p_des: tuple[float, ...] | None = None,
     ) -> None:
         super().__init__(message if pose is None else f"{pose}: {message}")
         self.pose = pose

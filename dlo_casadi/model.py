@@ -19,12 +19,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Assembly
+from dlo_casadi.assembly import Assembly, deviation_names
 from dlo_casadi.effects import (
     BoundaryEffect,
     Cable,
     Effect,
-    EndConditions,
     Kinematics,
     Load,
     MeasurementEffect,
@@ -34,11 +33,13 @@ from dlo_casadi.effects import (
     SpringAt,
     StateEffect,
 )
+from dlo_casadi.ends import EndConditions
 from dlo_casadi.errors import DloError
 from dlo_casadi.parameters import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.rest import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
-from dlo_casadi.rod.element import Cell, Slot
+from dlo_casadi.rod.element import Cell, Slot, Stiffness
+from dlo_casadi.rod.node import Node
 
 StartKind = Literal["pinned", "clamped"]
 EndKind = Literal["pinned", "clamped", "free"]
@@ -47,8 +48,20 @@ FloatArray = NDArray[np.floating]
 BENDING_STIFFNESS = "bending_stiffness"
 # ln(1000): a prior of the stiffness may be off by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
-# Numbers that declare one pose: its ends (6) and its camera (3), see `equilibrium.Pose.vector`.
-POSE_SIZE = 9
+# Nobody knows how a cable's own twist was gripped: tolerances.roll by default [rad].
+ROLL_STD = 1.0
+TORSIONAL_STIFFNESS = "torsional_stiffness"
+STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
+# Roll of the end clamp about the cable against what is declared [rad]: rest twist, see design.
+END_ROLL = "end_roll"
+# Numbers that tell where the camera of a pose stood, see `Pose.vector`.
+SIGHT_SIZE = 3
+
+
+def _stiffness(name: str, nominal: float) -> Parameter:
+    lower, upper = STIFFNESS_BOUNDS
+    std = STIFFNESS_PRIOR_STD
+    return Parameter(name, "N m^2", nominal, lower=lower, upper=upper, prior_std=std, log=True)
 
 
 @dataclass(frozen=True)
@@ -81,7 +94,7 @@ class _SlotTerms:
 
 @dataclass(frozen=True)
 class CableModel:
-    """An elastic cable between two fixtures in a plane.
+    """An elastic cable between two fixtures, in a plane or in space.
 
     Parameters
     ----------
@@ -92,8 +105,8 @@ class CableModel:
         A name of `rod.chain.ELEMENTS`.
     start : "pinned" or "clamped"
     end : "pinned", "clamped" or "free"
-    gravity : (float, float) [m/s^2]
-        In the board frame.
+    gravity : (dimension,) [m/s^2]
+        In the board frame; three numbers for a cable in space.
     effects : tuple of Effect
         In the order in which those of one slot are applied.
     n_rest : int
@@ -112,12 +125,18 @@ class CableModel:
     element: str = DEFAULT_ELEMENT
     start: StartKind = "pinned"
     end: EndKind = "pinned"
-    gravity: tuple[float, float] = (0.0, -9.81)
+    gravity: tuple[float, ...] = (0.0, -9.81)
     effects: tuple[Effect, ...] = ()
     n_rest: int = 9
     priors: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if len(self.gravity) != len(self.cable.axes):
+            raise DloError(
+                f"gravity has {len(self.gravity)} numbers, but the cable "
+                f"{'has no' if len(self.gravity) == 3 else 'has a'} torsional stiffness: in space "
+                "give both, in a plane neither"
+            )
         labels = [effect.label for effect in self.effects]
         for effect in self.effects:
             if labels.count(effect.label) > 1:
@@ -136,7 +155,27 @@ class CableModel:
     def chain(self) -> Chain:
         """The chain of n elements."""
         held = (self.start == "clamped", self.end == "clamped")
-        return Chain(self.cable.length, self.n, self.element, *held)
+        return Chain(self.cable.length, self.n, self.element, *held, in_space=self.in_space)
+
+    @property
+    def in_space(self) -> bool:
+        """Whether the cable may leave the plane."""
+        return len(self.gravity) == 3
+
+    @property
+    def node(self) -> type[Node]:
+        """What the nodes carry."""
+        return self.chain.kind.node
+
+    @property
+    def n_pose(self) -> int:
+        """Numbers that declare one pose, see `equilibrium.Pose.vector`."""
+        return EndConditions.size(self.node) + SIGHT_SIZE
+
+    @property
+    def deviation_names(self) -> tuple[str, ...]:
+        """What may be different in every pose."""
+        return deviation_names(self.node)
 
     @cached_property
     def rest(self) -> RestCurvature:
@@ -145,22 +184,34 @@ class CableModel:
 
     @cached_property
     def rest_basis(self) -> FloatArray:
-        """Rest curvature per coefficient (n_cells, n_rest): kappa_0 = rest_basis @ c."""
-        return self.rest.cell_means(self.chain.cells)
+        """Rest curvature per coefficient (n_rests, n_coefficients): kappa_0 = rest_basis @ c.
+
+        In space the coefficients about the axis z follow those about y.
+        """
+        means = self.rest.cell_means(self.chain.cells)
+        return np.kron(np.eye(len(self.node.curvatures)), means)
+
+    @property
+    def roughness(self) -> FloatArray:
+        """Second differences of the rest coefficients, about each axis."""
+        return np.kron(np.eye(len(self.node.curvatures)), self.rest.roughness)
+
+    @property
+    def n_coefficients(self) -> int:
+        """Number of rest coefficients."""
+        return self.rest.n_coefficients * len(self.node.curvatures)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Bending stiffness, then the parameters of the effects with qualified names."""
-        stiffness = Parameter(
-            BENDING_STIFFNESS,
-            "N m^2",
-            nominal=self.cable.bending_stiffness,
-            lower=STIFFNESS_BOUNDS[0],
-            upper=STIFFNESS_BOUNDS[1],
-            prior_std=STIFFNESS_PRIOR_STD,
-            log=True,
-        )
-        listed = [stiffness]
+        """Stiffnesses, in space the roll of the end, then the effects' with qualified names."""
+        listed = [_stiffness(BENDING_STIFFNESS, self.cable.bending_stiffness)]
+        if self.cable.torsional_stiffness is not None:
+            listed.append(_stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness))
+            if self.start == self.end == "clamped":
+                std = self.priors.get(END_ROLL, ROLL_STD)
+                listed.append(
+                    Parameter(END_ROLL, "rad", scale=0.1, lower=-9.0, upper=9.0, prior_std=std)
+                )
         for effect in self.effects:
             for parameter in effect.parameters(self.cable):
                 name = f"{effect.label}.{parameter.name}"
@@ -203,8 +254,8 @@ class CableModel:
                     parameter.name: self._p[self.names.index(f"{effect.label}.{parameter.name}")]
                     for parameter in effect.parameters(self.cable)
                 }
-                for name in effect.per_pose:
-                    local[name] = self._deviation[DEVIATIONS.index(name)]
+                for name in effect.per_pose(self.cable):
+                    local[name] = self._deviation[self.deviation_names.index(name)]
                 picked.append((effect, local))
         return picked
 
@@ -217,21 +268,22 @@ class CableModel:
     @cached_property
     def _pose(self) -> ca.SX:
         """What is declared of one pose, see `equilibrium.Pose.vector`."""
-        return ca.SX.sym("pose", POSE_SIZE)
+        return ca.SX.sym("pose", self.n_pose)
 
     @property
     def _ends(self) -> ca.SX:
-        """Start (2), end (2), start heading, end heading as declared."""
-        return self._pose[:6]
+        """The ends as declared, see `EndConditions.vector`."""
+        return self._pose[:-SIGHT_SIZE]
 
     @property
     def _sight(self) -> Sight:
-        return Sight(self._pose[:2], self._pose[6:8], self._pose[8])
+        start = EndConditions.of(self._ends, self.node).start
+        return Sight(start, self._pose[-3:-1], self._pose[-1])
 
     @cached_property
     def _deviation(self) -> ca.SX:
-        """Deviation of one pose from its declared ends: see DEVIATIONS."""
-        return ca.SX.sym("deviation", len(DEVIATIONS))
+        """Deviation of one pose from its declared ends: `deviation_names`."""
+        return ca.SX.sym("deviation", len(self.deviation_names))
 
     @cached_property
     def _lam(self) -> ca.SX:
@@ -245,9 +297,37 @@ class CableModel:
         return ca.SX.sym("x", 2 * node.coordinates), ca.SX.sym("delta", 2 * node.increment)
 
     @cached_property
+    def _local(self) -> tuple[ca.SX, ca.SX]:
+        """Local coordinates of a slot, and their increments: see `Element.local`."""
+        return ca.SX.sym("local", self._local_of_nodes.numel()), ca.SX.sym(
+            "step", 2 * self.node.increment
+        )
+
+    @property
+    def _local_of_nodes(self) -> ca.SX:
+        return self.chain.kind.local(*ca.vertsplit(self._nodes[0], self.node.coordinates))
+
+    @cached_property
+    def _local_slopes(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Derivative of the local increments by the nodes', weights, and their weighed Hessian."""
+        kind, (x, delta) = self.chain.kind, self._nodes
+        pairs = zip(
+            ca.vertsplit(x, self.node.coordinates),
+            ca.vertsplit(delta, self.node.increment),
+            strict=True,
+        )
+        moved = kind.local(*(self.node.retract(own, step) for own, step in pairs))
+        gap = kind.local_gap(self._local_of_nodes, moved)
+        weights = ca.SX.sym("weight", gap.numel())
+        bend, _ = ca.hessian(ca.dot(weights, gap), delta)
+        still = ca.SX.zeros(delta.shape)
+        slope, bend = ca.substitute([ca.jacobian(gap, delta), bend], [delta], [still])
+        return slope, weights, bend
+
+    @cached_property
     def _rest(self) -> ca.SX:
         """Rest curvature inside a slot, see `Chain.rest_stencils`."""
-        return ca.SX.sym("rest", 3)
+        return ca.SX.sym("rest", 3 * len(self.node.curvatures))
 
     @cached_property
     def _place(self) -> ca.SX:
@@ -276,14 +356,14 @@ class CableModel:
         A spring's place y [m] is an unknown of its own, held on the cable by its pull [N]: so that
         no node knows more than its neighbours, see `SpringAt`.
         """
-        own = ("place_x", "place_y", "pull_x", "pull_y")
+        own = [f"{what}_{axis}" for what in ("place", "pull") for axis in self.node.axes]
         springs = [f"spring_{k}.{name}" for k in range(self.n_springs) for name in own]
         return (*self.condition_names, *springs)
 
     @property
     def n_multipliers(self) -> int:
         """How many of them are multipliers: negative eigenvalues of the tangent at a minimum."""
-        return self.n_conditions + 2 * self.n_springs
+        return self.n_conditions + self.node.dimension * self.n_springs
 
     @cached_property
     def are_multipliers(self) -> NDArray[np.bool_]:
@@ -292,24 +372,27 @@ class CableModel:
 
     def _spring_unknowns(self, k: int) -> tuple[ca.SX, ca.SX]:
         """Place and pull of a spring."""
-        own = self._lam[self.n_conditions + 4 * k : self.n_conditions + 4 * (k + 1)]
-        return own[:2], own[2:]
+        d = self.node.dimension
+        own = self._lam[self.n_conditions + 2 * d * k : self.n_conditions + 2 * d * (k + 1)]
+        return own[:d], own[d:]
 
     @cached_property
     def condition_names(self) -> tuple[str, ...]:
-        """Names of the end conditions: end position, then headings of clamps."""
-        names = [] if self.end == "free" else ["end_position_x", "end_position_y"]
-        names += ["start_heading"] if self.start == "clamped" else []
-        names += ["end_heading"] if self.end == "clamped" else []
+        """Names of the end conditions: end position, then frames of clamps."""
+        axes, turns = self.node.axes, self.node.turns
+        names = [] if self.end == "free" else [f"end_position_{axis}" for axis in axes]
+        names += [f"start_{turn}" for turn in turns] if self.start == "clamped" else []
+        names += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
         return tuple(names)
 
     @cached_property
     def deviations(self) -> tuple[str, ...]:
         """Which deviations of a pose can matter for these boundaries."""
-        used = [] if self.end == "free" else ["end_x", "end_y"]
-        used += ["start_heading"] if self.start == "clamped" else []
-        used += ["end_heading"] if self.end == "clamped" else []
-        used += [name for effect in self.effects for name in effect.per_pose]
+        axes, turns = self.node.axes, self.node.turns
+        used = [] if self.end == "free" else [f"end_{axis}" for axis in axes]
+        used += [f"start_{turn}" for turn in turns] if self.start == "clamped" else []
+        used += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
+        used += [name for effect in self.effects for name in effect.per_pose(self.cable)]
         return tuple(used)
 
     # ---- mechanics ---------------------------------------------------------------------------
@@ -317,23 +400,27 @@ class CableModel:
     @cached_property
     def _held(self) -> EndConditions:
         """Where the ends really are: declared, deviation of the pose, boundary effects."""
-        ends = EndConditions(
-            start=self._ends[:2],
-            end=self._ends[2:4] + self._deviation[:2],
-            start_heading=self._ends[4] + self._deviation[2],
-            end_heading=self._ends[5] + self._deviation[3],
-        )
+        d, b = self.node.dimension, self.node.increment
+        place, first, last, _ = ca.vertsplit(self._deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
+        declared = EndConditions.of(self._ends, self.node)
+        if END_ROLL in self.names:
+            # The material axes of an untwisted cable at the end, against the clamp's.
+            roll = self._p[self.names.index(END_ROLL)]
+            declared = declared.rolled(roll)
+        ends = declared.changed(end=declared.end + place).turned(first, last)
         for effect, local in self._filling(BoundaryEffect):
             ends = effect.conditions(ends, local)
         return ends
 
     @cached_property
     def held(self) -> ca.Function:
-        """(p, ends, deviation) -> where the ends really are (6,), length without load [m]."""
-        ends = self._held
-        where = ca.vertcat(ends.start, ends.end, ends.start_heading, ends.end_heading)
+        """(p, ends, deviation) -> where the ends really are, length without load [m].
+
+        The ends as `EndConditions.vector`, declared and true.
+        """
         length = self.cable.length * self._stretch
-        return ca.Function("held", [self._p, self._ends, self._deviation], [where, length])
+        arguments = [self._p, self._ends, self._deviation]
+        return ca.Function("held", arguments, [self._held.vector, length])
 
     @cached_property
     def _stretch(self) -> ca.SX:
@@ -397,8 +484,6 @@ class CableModel:
     def _slot(self, ratio: ca.SX, inner: ca.SX, square: ca.SX) -> Slot:
         """The slot's symbols; numbers that all slots share are written in."""
         kind, table = self.chain.kind, self.chain.layout.slots
-        x, delta = self._nodes
-        c, b = kind.node.coordinates, kind.node.increment
         place = ca.vertcat(
             *(
                 ca.SX(column[0]) if np.all(column == column[0]) else self._place[i]
@@ -406,8 +491,7 @@ class CableModel:
             )
         )
         return Slot(
-            first=kind.node.retract(x[:c], delta[:b]),
-            last=kind.node.retract(x[c:], delta[b:]),
+            local=kind.local_moved(*self._local),
             rest=self._rest,
             place=place,
             mesh=self.chain.h,
@@ -419,11 +503,20 @@ class CableModel:
 
     def _bending_energy(self, slot: Slot) -> ca.SX:
         laws = [_Law(effect, self.cable, local) for effect, local in self._filling(SectionLaw)]
-        return self.chain.kind.bending(slot, self._bending_stiffness, laws)
+        return self.chain.kind.bending(slot, self._stiffness, laws)
 
     @property
     def _bending_stiffness(self) -> ca.SX:
         return self._p[self.names.index(BENDING_STIFFNESS)]
+
+    @property
+    def _stiffness(self) -> Stiffness:
+        if not self.in_space:
+            return Stiffness(self._bending_stiffness, ca.SX(0))
+        bending = self._bending_stiffness * ca.SX.eye(2)
+        for effect, local in self._filling(SectionLaw):
+            bending = effect.bending(bending, local)
+        return Stiffness(bending, self._p[self.names.index(TORSIONAL_STIFFNESS)])
 
     @cached_property
     def section_moment(self) -> ca.Function:
@@ -469,7 +562,9 @@ class CableModel:
     def _pull(self, slot: Slot) -> ca.SX:
         """Work of the multipliers of places, the end's and the springs', along a slot [J]."""
         kind = self.chain.kind
-        work = ca.SX(0) if self.end == "free" else ca.dot(self._lam[:2], kind.advance(slot))
+        work = ca.SX(0)
+        if self.end != "free":
+            work = ca.dot(self._lam[: self.node.dimension], kind.advance(slot))
         shares = ca.vertsplit(self._shares)[len(self._forces) :] if self.n_springs else []
         for k, share in enumerate(shares):
             work += ca.dot(self._spring_unknowns(k)[1], kind.advance(slot, share))
@@ -527,8 +622,8 @@ class CableModel:
         last = node.retract(x[node.coordinates :], delta[node.increment :])
         held = self._held
         gaps = [] if self.end == "free" else [held.start - held.end]
-        gaps += [first - held.start_heading] if self.start == "clamped" else []
-        gaps += [last - held.end_heading] if self.end == "clamped" else []
+        gaps += [node.gap(held.start_frame, first)] if self.start == "clamped" else []
+        gaps += [node.gap(held.end_frame, last)] if self.end == "clamped" else []
         total = ca.dot(self._lam[: self.n_conditions], ca.vertcat(*gaps)) if gaps else ca.SX(0)
         for effect, local in self._filling(BoundaryEffect):
             total += effect.energy(first, last, local)
@@ -557,7 +652,8 @@ class CableModel:
             ratio = ratio + ca.sqrt(self._compliance) * axial
         inner = ca.SX.sym("inner", kind.n_inner)
         slot = self._slot(ratio, inner, inner**2)
-        energy = kind.expanded(slot, self._slot_energy(slot)) + self.chain.h * axial**2 / 2
+        energy = kind.expanded(slot, self._slot_energy(slot), self._bending_energy)
+        energy += self.chain.h * axial**2 / 2
         own = ca.reshape(unknowns[self.n_inner - kind.n_inner :], inner.shape)
         reached = ca.gradient(self._pull(slot), self._lam)
         outputs = ca.substitute([energy, reached], [inner], [own])
@@ -576,46 +672,61 @@ class CableModel:
         x, _ = self._nodes
         return [x, self._lam, self._p, self._pose, self._deviation]
 
-    @property
-    def _moving(self) -> ca.SX:
-        """What the Lagrangian of a slot is differentiated by: increments, then multipliers."""
-        return ca.vertcat(self._nodes[1], self._lam)
-
     def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
         """A function at increments of zero, its outputs dense."""
+        local, step = self._local
         _, delta = self._nodes
-        found = ca.substitute(outputs, [delta], [ca.SX.zeros(delta.shape)])
+        symbols = [step, delta, local]
+        values = [ca.SX.zeros(step.shape), ca.SX.zeros(delta.shape), self._local_of_nodes]
+        found = ca.substitute(outputs, symbols, values)
         return ca.Function(name, arguments, [ca.densify(one) for one in ca.cse(found)])
 
-    def _derivatives(self, name: str, value: ca.SX, arguments: list[ca.SX]) -> ca.Function:
-        hessian, gradient = ca.hessian(value, self._moving)
-        return self._here(name, arguments, [value, gradient, hessian])
+    @property
+    def _by_slot(self) -> ca.SX:
+        """What the Lagrangian of a slot is differentiated by: local increments, multipliers."""
+        return ca.vertcat(self._local[1], self._lam)
+
+    @property
+    def _by_ends(self) -> ca.SX:
+        """What that of the ends is differentiated by: increments of the nodes, multipliers."""
+        return ca.vertcat(self._nodes[1], self._lam)
+
+    @property
+    def _to_local(self) -> ca.SX:
+        """Derivative of local increments and multipliers by the nodes' and multipliers."""
+        return ca.diagcat(self._local_slopes[0], ca.SX.eye(self.n_border))
 
     @cached_property
     def slot(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
-        return self._derivatives("slot", self._terms.lagrangian, self._slot_arguments)
+        value = self._terms.lagrangian
+        hessian, gradient = ca.hessian(value, self._by_slot)
+        _, weights, bend = self._local_slopes
+        bend = ca.substitute(bend, weights, gradient[: weights.numel()])
+        by_nodes = self._to_local.T @ hessian @ self._to_local
+        by_nodes += ca.diagcat(bend, ca.SX(self.n_border, self.n_border))
+        outputs = [value, self._to_local.T @ gradient, by_nodes]
+        return self._here("slot", self._slot_arguments, outputs)
 
     @cached_property
     def at_ends(self) -> ca.Function:
         """(x, lam, p, pose, deviation) of the first and last node -> as `slot`."""
-        return self._derivatives("at_ends", self._at_ends, self._end_arguments)
-
-    def _mixed(self, name: str, value: ca.SX, arguments: list[ca.SX], by: ca.SX) -> ca.Function:
-        mixed = ca.jacobian(ca.gradient(value, self._moving), by)
-        return self._here(name, arguments, [mixed])
+        hessian, gradient = ca.hessian(self._at_ends, self._by_ends)
+        return self._here("at_ends", self._end_arguments, [self._at_ends, gradient, hessian])
 
     @cached_property
     def slot_sensitivity(self) -> ca.Function:
         """As `slot` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
         by = ca.vertcat(self._p, self._rest, self._deviation)
-        return self._mixed("slot_sensitivity", self._terms.lagrangian, self._slot_arguments, by)
+        mixed = ca.jacobian(ca.gradient(self._terms.lagrangian, self._by_slot), by)
+        return self._here("slot_sensitivity", self._slot_arguments, [self._to_local.T @ mixed])
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
         """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
         by = ca.vertcat(self._p, self._deviation)
-        return self._mixed("end_sensitivity", self._at_ends, self._end_arguments, by)
+        mixed = ca.jacobian(ca.gradient(self._at_ends, self._by_ends), by)
+        return self._here("end_sensitivity", self._end_arguments, [mixed])
 
     @cached_property
     def _advanced(self) -> ca.SX:
@@ -624,14 +735,15 @@ class CableModel:
 
     @cached_property
     def slot_curve(self) -> ca.Function:
-        """As `slot` -> advance [m] and length ratio (3,)."""
+        """As `slot` -> advance [m] and length ratio (dimension + 1,)."""
         return self._here("slot_curve", self._slot_arguments, [self._advanced])
 
     @cached_property
     def slot_curve_slopes(self) -> ca.Function:
         """As `slot` -> the same, derivatives by increments and lam, and by p, rest, deviation."""
         others = ca.vertcat(self._p, self._rest, self._deviation)
-        blocks = [ca.jacobian(self._advanced, symbols) for symbols in (self._moving, others)]
+        by_nodes = ca.jacobian(self._advanced, self._by_slot) @ self._to_local
+        blocks = [by_nodes, ca.jacobian(self._advanced, others)]
         return self._here("slot_curve_slopes", self._slot_arguments, [self._advanced, *blocks])
 
     @cached_property
@@ -639,13 +751,21 @@ class CableModel:
         """Arguments, place (and slope) in the measurement of one station, and what moves it."""
         kind = self.chain.kind
         x, delta = self._nodes
-        point, ratio = ca.SX.sym("point", 2), ca.SX.sym("ratio")
-        heading = (kind.node.retract(x[0], delta[0]) + kind.node.retract(x[1], delta[1])) / 2
-        slope = ratio * kind.node.tangent(heading)
+        point, ratio = ca.SX.sym("point", self.node.dimension), ca.SX.sym("ratio")
+        before, after = (
+            self.node.retract(own, step)
+            for own, step in zip(
+                ca.vertsplit(x, x.numel() // 2),
+                ca.vertsplit(delta, delta.numel() // 2),
+                strict=True,
+            )
+        )
+        frame = self.node.middle(before, after)
+        slope = ratio * self.node.tangent(frame)
         image = point
         maps = self._filling(MeasurementEffect)
         for effect, local in maps:
-            image = effect.observe(image, heading, self._sight, local)
+            image = effect.observe(image, frame, self._sight, local)
         rows = image
         if kind.smooth:
             rows = ca.vertcat(image, ca.jtimes(image, point, slope) if maps else slope)
@@ -667,9 +787,18 @@ class CableModel:
 
     @cached_property
     def slot_strain(self) -> ca.Function:
-        """As `slot` -> mean curvature of the cell [1/m]."""
-        slot = self._slot(self._stretch, ca.SX.zeros(self.chain.kind.n_inner), ca.SX(0))
-        return self._here("strain", self._slot_arguments, [self.chain.kind.strain(slot)])
+        """As `slot` -> mean curvatures (axes,) of the cell [1/m]."""
+        return self._here("strain", self._slot_arguments, [self.chain.kind.strain(self._plain)])
+
+    @cached_property
+    def slot_twist(self) -> ca.Function:
+        """As `slot` -> mean twist of the cell [1/m]."""
+        return self._here("twist", self._slot_arguments, [self.chain.kind.twist(self._plain)])
+
+    @property
+    def _plain(self) -> Slot:
+        """The slot without its inner unknowns."""
+        return self._slot(self._stretch, ca.SX.zeros(self.chain.kind.n_inner), ca.SX(0))
 
     @property
     def has_state(self) -> bool:
@@ -678,23 +807,25 @@ class CableModel:
 
     @cached_property
     def slot_state(self) -> ca.Function:
-        """As `slot` -> rest curvature of the cell after the pose; by increments, rest and p."""
-        kind = self.chain.kind
-        slot = self._slot(self._stretch, ca.SX.zeros(kind.n_inner), ca.SX(0))
-        curvature, mean = kind.strain(slot), self._rest[0]
+        """As `slot` -> rest curvatures (axes,) of the cell after it; by increments, rest and p."""
+        own = self._rest[::3]
+        curvature, mean = self.chain.kind.strain(self._plain), own
         for effect, local in self._filling(StateEffect):
             mean = effect.next_rest(mean, curvature, self.cable, local)
-        by = (self._nodes[1], self._rest[0], self._p)
-        blocks = [ca.jacobian(mean, symbols) for symbols in by]
-        return self._here("slot_state", self._slot_arguments, [mean, *blocks])
+        rest = ca.SX.sym("mean", own.numel())
+        mean = ca.substitute(mean, own, rest)
+        slopes = [ca.jacobian(mean, symbols) for symbols in (self._local[1], rest, self._p)]
+        slopes[0] = slopes[0] @ self._local_slopes[0]
+        mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
+        return self._here("slot_state", self._slot_arguments, [mean, *slopes])
 
     @cached_property
     def start_force(self) -> ca.Function:
-        """(lam, p, pose, deviation) -> force (2,) [N] of the cable on its start.
+        """(lam, p, pose, deviation) -> force (dimension,) [N] of the cable on its start.
 
         Minus the slope of the Lagrangian by the start's place, nodes and multipliers kept.
         """
-        slope = ca.gradient(self._at_ends, self._pose)[:2]
+        slope = ca.gradient(self._at_ends, self._pose)[: self.node.dimension]
         arguments = self._end_arguments[1:]
         return ca.Function("start_force", arguments, [ca.densify(-slope)])
 
@@ -705,8 +836,8 @@ class CableModel:
 
     @cached_property
     def dead_load(self) -> ca.Function:
-        """P -> sum of the dead loads on the cable (2,) [N], without those of single poses."""
-        still = ca.SX.zeros(len(DEVIATIONS))
+        """P -> sum of the dead loads (dimension,) [N], without those of single poses."""
+        still = ca.SX.zeros(len(self.deviation_names))
         load = ca.substitute(self._total_load, self._deviation, still)
         return ca.Function("dead_load", [self._p], [ca.densify(load)])
 

@@ -9,16 +9,15 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.assembly import DEVIATIONS
-from dlo_casadi.model import POSE_SIZE, CableModel
+from dlo_casadi.model import CableModel
 
 
 @dataclass(frozen=True)
 class PoseSymbols:
     """What a pose's expressions depend on.
 
-    `x` (n_nodes coordinates,), `lam` (n_border,), `p` (n_parameters,), `rest` (n_cells,) [1/m],
-    `pose` (POSE_SIZE,), `deviation` (len(DEVIATIONS),).
+    `x` (n_nodes coordinates,), `lam` (n_border,), `p` (n_parameters,), `rest` (n_rests,) [1/m],
+    `pose` (n_pose,), `deviation` (n_deviations,).
     """
 
     x: ca.SX
@@ -36,9 +35,9 @@ class PoseSymbols:
             ca.SX.sym("x", chain.n_nodes * chain.kind.node.coordinates),
             ca.SX.sym("lam", model.n_border),
             ca.SX.sym("p", len(model.parameters)),
-            ca.SX.sym("kappa_0", chain.n_cells),
-            ca.SX.sym("pose", POSE_SIZE),
-            ca.SX.sym("deviation", len(DEVIATIONS)),
+            ca.SX.sym("kappa_0", chain.n_rests),
+            ca.SX.sym("pose", model.n_pose),
+            ca.SX.sym("deviation", len(model.deviation_names)),
         )
 
 
@@ -96,31 +95,31 @@ def balance(model: CableModel, s: PoseSymbols) -> ca.SX:
 
 
 def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
-    """Measured curve ((n + 1) 2 or 4,): place, and slope of smooth elements, node by node."""
+    """Measured curve ((n + 1) d or 2 d,): place, and slope of smooth elements, node by node."""
     chain, layout = model.chain, model.chain.layout
-    c = chain.kind.node.coordinates
+    c, d = chain.kind.node.coordinates, chain.kind.node.dimension
     arguments = _slot_arguments(model, s)
     steps = [model.slot_curve(*arguments[j]) for j in layout.advancing]
-    ratios = [step[2] for step in steps]
+    ratios = [step[d] for step in steps]
     ratios = [
         ratios[0],
         *((a + b) / 2 for a, b in pairwise(ratios)),
         ratios[-1],
     ]
-    point, rows = s.pose[:2], []
+    point, rows = s.pose[:d], []
     for i, (first, last) in enumerate(layout.stations):
         both = ca.vertcat(s.x[first * c : (first + 1) * c], s.x[last * c : (last + 1) * c])
         rows.append(model.station(point, ratios[i], both, s.p, s.pose))
         if i < chain.n:
-            point = point + steps[i][:2]
+            point = point + steps[i][:d]
     return ca.vertcat(*rows)
 
 
 def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
-    """Rest curvature (n_cells,) [1/m] that the pose leaves behind."""
+    """Rest curvature (n_rests,) [1/m] that the pose leaves behind."""
     arguments = _slot_arguments(model, s)
-    rests: list[Any] = [model.slot_state(*arguments[j])[0] for j in model.chain.layout.bends]
-    return ca.vertcat(*rests)
+    rests: list[Any] = [model.slot_state(*arguments[j])[0].T for j in model.chain.layout.bends]
+    return ca.vec(ca.vertcat(*rests))
 
 
 def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
@@ -137,6 +136,7 @@ def _slot_arguments(model: CableModel, s: PoseSymbols) -> list[list[ca.SX]]:
     for j in range(chain.n_slots):
         k = min(j + 1, last)
         both = ca.vertcat(s.x[j * c : (j + 1) * c], s.x[k * c : (k + 1) * c])
-        own = ca.DM(weights[j]) @ s.rest[cells[j].tolist()]
+        axes = ca.vertsplit(s.rest, chain.n_cells)
+        own = ca.vertcat(*(ca.DM(weights[j]) @ axis[cells[j].tolist()] for axis in axes))
         rows.append([both, s.lam, s.p, own, ca.DM(chain.layout.slots[j]), s.deviation])
     return rows

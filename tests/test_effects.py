@@ -295,7 +295,7 @@ def test_a_tether_to_its_clamp_buckles_a_cable_at_eulers_load(element):
     for share, stable in ((0.98, True), (1.02, False)):  # links: (pi / 20)^2 / 12 = 0.2 % off
         p = np.array([0.05, share * critical, CABLE.length, 0.0, 0.0])
         rest = np.zeros(model.chain.n_cells)
-        assert solve_equilibrium(model, p, rest, pose, phi_init=straight).stable is stable
+        assert solve_equilibrium(model, p, rest, pose, x_init=straight[:, None]).stable is stable
 
 
 def test_a_soft_tether_to_a_far_anchor_is_a_point_force():

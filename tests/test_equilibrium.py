@@ -331,7 +331,7 @@ def test_straight_strut_about_the_euler_load(share, status):
     p = np.array([stiffness, 1 / (1000 * euler)])
     end = (length * (1 - share / 1000), 0.0)
     straight = solve_equilibrium(
-        model, p, np.zeros(20), Pose((0.0, 0.0), end), phi_init=np.zeros(21)
+        model, p, np.zeros(20), Pose((0.0, 0.0), end), x_init=np.zeros((21, 1))
     )
     np.testing.assert_allclose(straight.phi, 0.0, atol=1e-8)
     assert straight.lam[0] == pytest.approx(share * euler, rel=1e-6)
@@ -352,7 +352,7 @@ def test_second_mode_is_flagged_and_avoided():
     model = CableModel(Cable(1.0, 0.1, 0.01, 0.3), 16, gravity=WEIGHTLESS)
     pose = Pose((0.0, 0.0), (0.8, 0.0))
     s = model.chain.places
-    double = solve(model, 0.3, pose, phi_init=0.9 * np.cos(2 * np.pi * s))
+    double = solve(model, 0.3, pose, x_init=0.9 * np.cos(2 * np.pi * s)[:, None])
     assert double.status is Status.UNSTABLE
     assert not double.stable
     np.testing.assert_allclose(double.points[8], [0.4, 0.0], atol=1e-6)  # odd about its middle

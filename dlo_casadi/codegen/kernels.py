@@ -13,9 +13,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import POSE_SIZE, CableModel
+from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -161,7 +160,7 @@ def _kernel(
     # The cell's start is counted from the slot's, so that slots of one kind differ in that alone.
     place = ca.vertcat(start, first[1], start + (first[2] - first[0]), *first[3:])
     shares = model.shares(p, ca.DM(first) if inline else place)
-    still = ca.DM.zeros(len(DEVIATIONS))
+    still = ca.DM.zeros(len(model.deviation_names))
     position = ca.SX.zeros(0) if model.end == "free" else lam
     multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
     arguments = [x, multipliers, p, ca.vertcat(*numbers[1:]), place, still, shares]
@@ -177,7 +176,9 @@ def _kernel(
 def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
     """Energy of the holders, without end conditions."""
     x, lam = ca.SX.sym("x", 2), ca.SX.zeros(model.n_conditions)
-    value, _, _ = model.at_ends(x, lam, p, ca.DM.zeros(POSE_SIZE), ca.DM.zeros(len(DEVIATIONS)))
+    value, _, _ = model.at_ends(
+        x, lam, p, ca.DM.zeros(model.n_pose), ca.DM.zeros(len(model.deviation_names))
+    )
     if not ca.depends_on(value, x):
         return None
     return _derivatives(value, [x, _symbols(p)], x)

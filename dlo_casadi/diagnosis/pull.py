@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model, starting_points
@@ -88,8 +87,8 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
             continue
     if best is None:
         return None
-    columns = [DEVIATIONS.index(axis) for axis in effect.per_pose]
-    mean = [best.value(f"{effect.label}.{axis}") for axis in effect.means]
+    columns = [model.deviation_names.index(axis) for axis in effect.per_pose(model.cable)]
+    mean = [best.value(f"{effect.label}.f{axis}") for axis in model.node.axes]
     forces = best.point.shapes.deviation[np.ix_(best.problem.used, columns)] + mean
     position = best.value(name)
     half = NORMAL_95 * max(best.std(name), 1e-4 * length)
@@ -137,7 +136,7 @@ class _Search:
         """Equilibria near the measured shapes for a load at a share of the length."""
         problem = self.held_at(share)
         unknowns = problem.unknowns
-        theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.rest.n_coefficients))
+        theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.n_coefficients))
         points = starting_points(problem, theta)
         return points[0] if points else None
 
@@ -177,7 +176,9 @@ def pull_scatter(base: Fit) -> FloatArray:
     along a taut cable hardly shows: there it should be like that of the other poses.
     """
     cable = base.model.cable
-    weight = cable.mass * float(np.hypot(*base.model.gravity))
+    weight = cable.mass * float(np.linalg.norm(base.model.gravity))
     scatter = base.problem.scatter.copy()
-    scatter[4:] = PULL_WEIGHTS * max(weight, cable.bending_stiffness / cable.length**2)
+    scatter[-base.model.node.dimension :] = PULL_WEIGHTS * max(
+        weight, cable.bending_stiffness / cable.length**2
+    )
     return scatter

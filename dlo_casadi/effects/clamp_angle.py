@@ -62,9 +62,4 @@ class ClampAngle(BoundaryEffect):
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Turn the clamps."""
-        turned = {}
-        if self.start:
-            turned["start_heading"] = ends.start_heading + params["start_heading_error"]
-        if self.end:
-            turned["end_heading"] = ends.end_heading + params["end_heading_error"]
-        return ends.changed(**turned)
+        return ends.turned(params.get("start_heading_error"), params.get("end_heading_error"))

@@ -54,13 +54,13 @@ class EdgeBias(MeasurementEffect):
         std = PIXELS * (setup.pixel or 0.0)
         return {q.name: std for q in self.parameters(setup.cable)} if std else {}
 
-    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Move the point along the cable's normal."""
         offset = sum(
             (
-                params[f"a{k}"] * ca.cos(k * heading) + params[f"b{k}"] * ca.sin(k * heading)
+                params[f"a{k}"] * ca.cos(k * frame) + params[f"b{k}"] * ca.sin(k * frame)
                 for k in HARMONICS
             ),
             start=ca.SX(0),
         )
-        return point + offset * ca.vertcat(-ca.sin(heading), ca.cos(heading))
+        return point + offset * ca.vertcat(-ca.sin(frame), ca.cos(frame))

@@ -9,13 +9,14 @@ All of that has defaults, so that most effects declare `name`, `parameters` and 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import pi
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import casadi as ca
 import numpy as np
 
+from dlo_casadi.ends import EndConditions
 from dlo_casadi.parameters import Parameter
 from dlo_casadi.rod.element import Cell
 
@@ -45,6 +46,8 @@ class Cable:
     name : str
     straight : bool
         True if no rest curvature is fitted.
+    torsional_stiffness : float [N m^2], optional
+        Crude prior of GJ; a cable that has one is in space, others stay in a plane.
     """
 
     length: float
@@ -53,28 +56,17 @@ class Cable:
     bending_stiffness: float
     name: str = "cable"
     straight: bool = False
+    torsional_stiffness: float | None = None
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the components of a position or a force."""
+        return ("x", "y") if self.torsional_stiffness is None else ("x", "y", "z")
 
     @property
     def curvature_scale(self) -> float:
         """One full turn over the length [1/m]."""
         return 2 * pi / self.length
-
-
-@dataclass(frozen=True)
-class EndConditions:
-    """Where and how the ends are held: symbols of one pose.
-
-    `start`, `end` (2,) [m]; `start_heading`, `end_heading` [rad].
-    """
-
-    start: ca.SX
-    end: ca.SX
-    start_heading: ca.SX
-    end_heading: ca.SX
-
-    def changed(self, **values: ca.SX) -> EndConditions:
-        """Return a copy with some conditions replaced."""
-        return replace(self, **values)
 
 
 @dataclass(frozen=True)
@@ -114,7 +106,7 @@ class Sight:
 
     Parameters
     ----------
-    start : (2,) [m]
+    start : (dimension,) [m]
         The start fixture.
     camera : (2,) [1]
         The camera's centre (x, y) over its distance z from the cable's declared plane.
@@ -139,8 +131,6 @@ class Effect:
 
     name: ClassVar[str]
     slot: ClassVar[str]
-    # Unknowns of each pose that the effect uses beside its parameters; see model.DEVIATIONS.
-    per_pose: ClassVar[tuple[str, ...]] = ()
     # Own parameters that lie within a declared tolerance, by its name there: until more is needed
     # the effect is a nuisance of every model that it applies to.
     tolerances: ClassVar[Mapping[str, str]] = {}
@@ -158,6 +148,10 @@ class Effect:
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Parameters with units, bounds and the nominal value at which the effect vanishes."""
         raise TypeError(f"{type(self).__name__} declares no parameters")
+
+    def per_pose(self, cable: Cable) -> tuple[str, ...]:
+        """Unknowns of each pose that it uses beside its parameters, of `deviation_names`."""
+        return ()
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
@@ -219,11 +213,15 @@ class SectionLaw(Effect):
         Parameters
         ----------
         bend : scalar [1/m]
-            Curvature minus rest curvature.
+            Curvature minus rest curvature; in space its size.
         cell : Cell
             From where to where it reaches.
         """
         raise TypeError(f"{self.name} has no section law")
+
+    def bending(self, stiffness: ca.SX, params: Params) -> ca.SX:
+        """Bending stiffness (2, 2) [N m^2] of a cable in space about its material axes y and z."""
+        return stiffness
 
     def tangent(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
         """Factor on the stiffness against a small change of the bend.
@@ -262,7 +260,7 @@ class Load(Effect):
         return self.n_springs == 0
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
-        """Return the direction and size of gravity (2,) [m/s^2] that every weight feels."""
+        """Return the direction and size of gravity (dimension,) [m/s^2] that every weight feels."""
         return gravity
 
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX | float:
@@ -314,8 +312,8 @@ class BoundaryEffect(Effect):
         """Change the end conditions. Changes are applied in the order of the model's effects."""
         return ends
 
-    def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX | float:
-        """Energy stored in the holders [J], by the cable's directions there. Energies add."""
+    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX | float:
+        """Energy stored in the holders [J], by the cable's first and last node. Energies add."""
         return 0.0
 
 
@@ -324,13 +322,13 @@ class MeasurementEffect(Effect):
 
     slot: ClassVar[str] = "measurement"
 
-    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
-        """Where the camera believes the true point (2,) [m] to be. Maps apply in order.
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
+        """Where the camera believes the true point (dimension,) [m] to be. Maps apply in order.
 
         Parameters
         ----------
-        heading : scalar [rad]
-            Direction of the cable at the point.
+        frame : (coordinates,)
+            Of the cable at the point, as a node would carry it: in a plane its heading [rad].
         """
         raise TypeError(f"{self.name} has no measurement map")
 

@@ -14,11 +14,11 @@ from dlo_casadi.parameters import Parameter
 class EndOffset(BoundaryEffect):
     """True minus declared position of the end fixture, the same in all poses.
 
-        end' = end + (dx, dy)
+        end' = end + (dx, dy (, dz))
 
     Parameters
     ----------
-    dx, dy : scalar [m]
+    dx, dy (, dz) : scalar [m]
         Vanish at 0.
     """
 
@@ -30,7 +30,8 @@ class EndOffset(BoundaryEffect):
         bound = 0.3 * cable.length
         scale = 0.002 * cable.length
         return tuple(
-            Parameter(axis, "m", scale=scale, lower=-bound, upper=bound) for axis in ("dx", "dy")
+            Parameter(axis, "m", scale=scale, lower=-bound, upper=bound)
+            for axis in (f"d{name}" for name in cable.axes)
         )
 
     @classmethod
@@ -40,4 +41,4 @@ class EndOffset(BoundaryEffect):
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Move the end fixture."""
-        return ends.changed(end=ends.end + ca.vertcat(params["dx"], params["dy"]))
+        return ends.changed(end=ends.end + ca.vertcat(*params.values()))

@@ -55,9 +55,9 @@ class StartSpring(_PinSpring):
         """A local effect beside the start pin may be the pin's."""
         return found.near_start
 
-    def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX:
+    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
         """Energy of the spring [J]."""
-        return self._spring(start_heading, params)
+        return self._spring(first, params)
 
 
 class EndSpring(_PinSpring):
@@ -78,6 +78,6 @@ class EndSpring(_PinSpring):
         """A local effect beside the end pin may be the pin's."""
         return found.near_end
 
-    def energy(self, start_heading: ca.SX, end_heading: ca.SX, params: Params) -> ca.SX:
+    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
         """Energy of the spring [J]."""
-        return self._spring(end_heading, params)
+        return self._spring(last, params)

@@ -51,7 +51,7 @@ class ImageDistortion(MeasurementEffect):
         """About the middle of the photographs."""
         return cls(center=setup.center or (0.0, 0.0))
 
-    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Move the point along its radius."""
         arm = point - ca.DM(self.center)
         return ca.DM(self.center) + (1 + params["coefficient"] * ca.sumsqr(arm)) * arm

@@ -28,6 +28,6 @@ class ImageScale(MeasurementEffect):
         """Declare the factor."""
         return (Parameter("factor", nominal=1.0, scale=0.002, lower=0.7, upper=1.4),)
 
-    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Scale about the start fixture."""
         return sight.start + params["factor"] * (point - sight.start)

@@ -15,7 +15,7 @@ class PointForce(PointLoad):
 
     Parameters
     ----------
-    fx, fy : scalar [N]
+    fx, fy (, fz) : scalar [N]
         In the board frame; vanishes at 0; at most three times the cable's weight on Earth.
     position : scalar [m], in [0, L]
         Arc length from the start fixture.
@@ -27,11 +27,18 @@ class PointForce(PointLoad):
         """Declare the force and its place."""
         scale = 0.1 * 9.81 * cable.mass
         return (
-            Parameter("fx", "N", scale=scale, lower=-30 * scale, upper=30 * scale),
-            Parameter("fy", "N", scale=scale, lower=-30 * scale, upper=30 * scale),
+            *(
+                Parameter(f"f{axis}", "N", scale=scale, lower=-30 * scale, upper=30 * scale)
+                for axis in cable.axes
+            ),
             self.position(cable),
         )
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force."""
-        return (PointForceAt(ca.vertcat(params["fx"], params["fy"]), params["position"]),)
+        return (
+            PointForceAt(
+                ca.vertcat(*(params[f"f{axis}"] for axis in "xyz" if f"f{axis}" in params)),
+                params["position"],
+            ),
+        )

@@ -56,6 +56,11 @@ class Setup:
     directions: tuple[float, float] = (0.0, 0.0)
     largest_bend: float | None = None
 
+    @property
+    def in_space(self) -> bool:
+        """Whether the cable may leave the plane."""
+        return len(self.gravity) == 3
+
 
 @dataclass(frozen=True)
 class Fitted:

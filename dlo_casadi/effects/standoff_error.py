@@ -54,7 +54,7 @@ class StandoffError(MeasurementEffect):
             "Try: measurement.camera, or image_scale"
         )
 
-    def observe(self, point: ca.SX, heading: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
         """Follow the ray through the point to the declared plane."""
         d = params["distance"]
         return point + d * (sight.nearness * point - sight.camera) / (1 - d * sight.nearness)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import casadi as ca
 
 from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
@@ -21,26 +19,30 @@ class UnknownPull(PointLoad):
 
     Parameters
     ----------
-    fx, fy : scalar [N]
+    fx, fy (, fz) : scalar [N]
         Mean over the poses, at most ten weights; f_j is what each deviates from it.
     position : scalar [m], in [0, L]
     """
 
     name = "unknown_pull"
-    per_pose = ("pull_x", "pull_y")
-    # The parameters that they are deviations from, in the same order.
-    means: ClassVar = ("fx", "fy")
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the mean force and its place."""
         scale = 9.81 * cable.mass
         return (
-            Parameter("fx", "N", scale=scale, lower=-10 * scale, upper=10 * scale),
-            Parameter("fy", "N", scale=scale, lower=-10 * scale, upper=10 * scale),
+            *(
+                Parameter(f"f{axis}", "N", scale=scale, lower=-10 * scale, upper=10 * scale)
+                for axis in cable.axes
+            ),
             self.position(cable),
         )
 
+    def per_pose(self, cable: Cable) -> tuple[str, ...]:
+        """f_j."""
+        return tuple(f"pull_{axis}" for axis in cable.axes)
+
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force of this pose."""
-        force = ca.vertcat(params["fx"] + params["pull_x"], params["fy"] + params["pull_y"])
+        axes = [name[1:] for name in params if name.startswith("f")]
+        force = ca.vertcat(*(params[f"f{axis}"] + params[f"pull_{axis}"] for axis in axes))
         return (PointForceAt(force, params["position"]),)

@@ -250,9 +250,7 @@ class InnerProblem:
         beta = c n.
     """
 
-    def __init__(
-        self, cable: Cable, gravity: tuple[float, float], n: int, c: float = WEIGHT
-    ) -> None:
+    def __init__(self, cable: Cable, gravity: tuple[float, ...], n: int, c: float = WEIGHT) -> None:
         self.chain = Chain(cable.length, n, "link")
         self.weight = cable.mass / n * np.array(gravity)
         self.beta = c * n
@@ -375,7 +373,7 @@ class InnerProblem:
 def run_algorithm1(
     cable: Cable,
     poses: Sequence[MeasuredPose],
-    gravity: tuple[float, float],
+    gravity: tuple[float, ...],
     n: int = 10,
     inner: Inner = "ipopt",
     c: float = WEIGHT,
@@ -460,7 +458,7 @@ def run_algorithm1(
 
 
 def _usable(
-    cable: Cable, poses: Sequence[MeasuredPose], gravity: tuple[float, float], n: int
+    cable: Cable, poses: Sequence[MeasuredPose], gravity: tuple[float, ...], n: int
 ) -> list[MeasuredPose]:
     """Fit poses that have points and are within reach."""
     model = CableModel(cable, n=n, element="link", gravity=gravity)

@@ -26,12 +26,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Shapes
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import stats_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.sensors import ObservedChange
-from dlo_casadi.model import POSE_SIZE
 from dlo_casadi.whole_pose import PoseSymbols, balance, curve, rest_after
 
 FloatArray = NDArray[np.floating]
@@ -138,7 +137,7 @@ class _BatchNlp:
         self.n_x, self.n_lam = problem.sweep.assembly.n, model.n_border
         self.columns = problem.sweep.used_deviations
         self.n_dev = len(self.columns)
-        self.n_rest = model.chain.n_cells if model.has_state else 0
+        self.n_rest = model.chain.n_rests if model.has_state else 0
         self.stride = self.n_x + self.n_lam + self.n_dev + self.n_rest
         # Multipliers and balance in units of a typical force: EI turns^2.
         self.force = model.cable.bending_stiffness * model.cable.curvature_scale**2
@@ -154,9 +153,9 @@ class _BatchNlp:
         unknowns, model = problem.unknowns, problem.unknowns.model
         theta = ca.SX.sym("theta", unknowns.size)
         own = ca.SX.sym("own", self.stride)
-        pose = ca.SX.sym("pose", POSE_SIZE)
+        pose = ca.SX.sym("pose", model.n_pose)
         x, lam, dev, rest = self._split(own)
-        deviation = ca.SX.zeros(len(DEVIATIONS))
+        deviation = ca.SX.zeros(len(model.deviation_names))
         for k, column in enumerate(self.columns):
             deviation[column] = dev[k] * problem.deviation_std[k]
         if not model.has_state:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dlo_casadi.equilibrium import Pose
+from dlo_casadi.initial_frames import into_clamps
 from dlo_casadi.rod.chain import Chain
 
 FloatArray = NDArray[np.floating]
@@ -29,10 +31,11 @@ def chord_places(points: FloatArray, pose: Pose, length: float) -> FloatArray:
     return np.clip(places, 0.0, length)
 
 
-def line_headings(points: FloatArray, pose: Pose, chain: Chain, places: FloatArray) -> FloatArray:
-    """Headings (n_nodes,) [rad] of a measured line, unwrapped along the cable.
+def line_nodes(points: FloatArray, pose: Pose, chain: Chain, places: FloatArray) -> FloatArray:
+    """Nodes (n_nodes, coordinates) along a measured line, from its chords.
 
-    Those of chords of some hundredths of the length; `places` (K,) [m] are the points' arc lengths.
+    Those of some hundredths of the length; `places` (K,) [m] are the points' arc lengths. In a
+    plane headings are continuous along the cable; in space the clamps' roll is spread evenly.
     """
     line = [np.array(pose.start)[None], points]
     s = [np.array([0.0]), places]
@@ -43,11 +46,24 @@ def line_headings(points: FloatArray, pose: Pose, chain: Chain, places: FloatArr
     grid = np.linspace(0.0, at[-1], 31)
     coarse = np.stack([np.interp(grid, at, column) for column in polyline.T], axis=1)
     chords = np.diff(coarse, axis=0)
+    middles = (grid[1:] + grid[:-1]) / 2
+    if chain.in_space:
+        tangents = np.stack([np.interp(chain.places, middles, x) for x in chords.T], axis=1)
+        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)
+        given = (pose.start_orientation, pose.end_orientation)
+        held = (chain.start_clamped, chain.end_clamped)
+        clamps = [
+            Rotation.from_quat(frame) if clamped and frame is not None else None
+            for clamped, frame in zip(held, given, strict=True)
+        ]
+        return into_clamps(
+            chain.places / chain.length, tangents, (clamps[0], clamps[1]), pose.turns
+        )
     headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
     if pose.start_heading is not None:
         turns = np.round((pose.start_heading - headings[0]) / (2 * np.pi))
         headings = headings + 2 * np.pi * turns
-    return np.interp(chain.places, (grid[1:] + grid[:-1]) / 2, headings)
+    return np.interp(chain.places, middles, headings)[:, None]
 
 
 def _denoised_length(polyline: FloatArray, steps: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Shapes
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
@@ -22,7 +22,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import STIFFNESSES, CableModel
 from dlo_casadi.parallel import map_in_order
 
 FloatArray = NDArray[np.floating]
@@ -49,8 +49,10 @@ def starting_points(
     an executor is given.
     """
     starts = [theta.copy() for _ in decades]
+    # Bending and torsion go together: their ratio is known better than either.
+    stiffnesses = [k for k, name in enumerate(problem.unknowns.names) if name in STIFFNESSES]
     for start, decade in zip(starts, decades, strict=True):
-        start[0] += decade * np.log(10)
+        start[stiffnesses] += decade * np.log(10)
     shapes, feet = measured_shapes(problem)
     if not problem.has_metric:
         problem.refresh(theta, shapes, feet)
@@ -122,12 +124,12 @@ def fit_model(
     if std is not None:
         declared = NoiseModel(std, source="declared")
         noise = with_repeats(declared, measured, model.cable.length)
-    scatter = tolerances.deviation
+    scatter = tolerances.deviation(model.node)
     if sum(item.readable and not item.held_out for item in measured) == 1:
         # One pose does not deviate from others: what is wrong with it is wrong with the session.
         scatter = SCATTER_FLOOR * scatter
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
-    theta = unknowns.pack(begin, np.zeros(model.rest.n_coefficients))
+    theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     best = None
     if len(problem.used) > POSES_OF_A_SEARCH and not model.has_state:
         rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)
@@ -204,7 +206,7 @@ def carried_shapes(problem: BatchProblem, start: Fit) -> Shapes:
             found = solve_equilibrium(start.model, start.p, start.rest, problem.history[index].pose)
         except EquilibriumError as error:
             raise EstimationError(error.message) from error
-        rows.append((found.x, found.multipliers, np.zeros(len(DEVIATIONS))))
+        rows.append((found.x, found.multipliers, np.zeros(len(start.model.deviation_names))))
     x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
     model = problem.unknowns.model
     shapes = with_border_of(Shapes(x, lam, deviation), start.model, model)

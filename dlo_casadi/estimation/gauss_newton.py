@@ -30,6 +30,7 @@ from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.rod.band import Vector
+from dlo_casadi.rod.node import Node
 
 FloatArray = NDArray[np.floating]
 
@@ -51,11 +52,14 @@ class Tolerances:
     end: float = 2e-4
     heading: float = 1e-2
     scale: float = 3e-4
+    rotation: float = 5e-3
 
-    @property
-    def deviation(self) -> FloatArray:
-        """Standard deviations of a pose's deviations, see `model.DEVIATIONS`; pulls are free."""
-        return np.array([self.end, self.end, self.heading, self.heading, np.inf, np.inf])
+    def deviation(self, node: type[Node]) -> FloatArray:
+        """Standard deviations of a pose's deviations, see `deviation_names`; pulls are free."""
+        turn = self.heading if node.increment == 1 else self.rotation
+        sizes = (self.end, turn, np.inf)
+        counts = (node.dimension, 2 * node.increment, node.dimension)
+        return np.repeat(sizes, counts)
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,7 @@ class BatchProblem:
     tolerances : Tolerances
     roughness_std : float
         Prior of the rest curvature, see `Unknowns.prior_precision`.
-    scatter : (len(DEVIATIONS),), optional
+    scatter : (n_deviations,), optional
         Standard deviations of a pose's own deviations; the tolerances by default.
     rest_scatter : RestScatter
         Rest curvature of each hanging's own; none by default.
@@ -166,7 +170,7 @@ class BatchProblem:
         self.sweep = sweep or Sweep(unknowns.model, [item.pose for item in self.measured])
         self.precision = unknowns.prior_precision(roughness_std)
         self.mean = unknowns.prior_mean()
-        self.scatter = tolerances.deviation if scatter is None else scatter
+        self.scatter = tolerances.deviation(unknowns.model.node) if scatter is None else scatter
         self.rest_scatter = rest_scatter
         self.deviation_std = self.scatter[self.sweep.used_deviations]
         self._whitening: dict[int, FloatArray] = {}

@@ -80,9 +80,10 @@ def refine(
             noise, rest = errors_of(problem, point, lin, modes, estimated=estimated)
         roughness = roughness_of(problem, point, lin)
         scatter = scatter_of(problem, point, lin)
+        ends = np.isfinite(scatter)
         moved = max(
             abs(np.log(roughness / problem.roughness_std)),
-            float(np.abs(np.log(scatter[:4] / problem.scatter[:4])).max()),
+            float(np.abs(np.log(scatter[ends] / problem.scatter[ends])).max()),
         )
         changed = abs(np.log(noise.std / problem.noise.std))
         same = rest.std == problem.rest_scatter.std or abs(
@@ -229,7 +230,7 @@ def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> flo
     if unknowns.n_rest < 3:
         return problem.roughness_std
     rest = slice(unknowns.n_parameters, unknowns.size)
-    rough = unknowns.model.rest.roughness
+    rough = unknowns.model.roughness
     hessian = problem.normal_equations(point, lin).hessian
     covariance = np.linalg.pinv(hessian, hermitian=True)[rest, rest]
     prior = rough.T @ rough / problem.roughness_std**2
@@ -253,9 +254,11 @@ def scatter_of(problem: BatchProblem, point: Point, lin: Linearization) -> Float
     square = (point.shapes.deviation[np.ix_(problem.used, columns)] ** 2).sum(axis=0)
     determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
     scatter = problem.scatter.copy()
-    limits = problem.tolerances.deviation
-    # Both coordinates of an end share one scatter, and so do both headings.
-    for group in ((0, 1), (2, 3)):
+    node = problem.unknowns.model.node
+    limits = problem.tolerances.deviation(node)
+    # The coordinates of an end share one scatter, and so do the turns of both clamps.
+    d, b = node.dimension, node.increment
+    for group in (range(d), range(d, d + 2 * b)):
         members = [k for k, column in enumerate(columns) if column in group]
         if members:
             found = np.sqrt(square[members].sum() / max(determined[members].sum(), 1e-3))

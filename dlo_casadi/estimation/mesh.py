@@ -20,7 +20,7 @@ def on_mesh(fit: Fit, n: int) -> tuple[Sweep, Shapes, FloatArray, bool]:
 
     Returns
     -------
-    Sweep, Shapes, (n_cells,), bool
+    Sweep, Shapes, (n_rests,), bool
         The finer model's poses, their shapes, the rest curvature, and whether they converged.
     """
     model = fit.model.with_mesh(n)

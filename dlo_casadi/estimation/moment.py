@@ -84,7 +84,7 @@ def measured_moment_curve(
     guess = np.concatenate([points[0], [np.arctan2(toward[1], toward[0])], np.zeros(COEFFICIENTS)])
     unknowns = least_squares(gap, guess, x_scale="jac").x
     curve = shape(unknowns)
-    force = weight * np.array(gravity) / np.hypot(*gravity)
+    force = weight * np.array(gravity) / np.linalg.norm(gravity)
     # Moment about s of what hangs beyond: int_s^L r dt x force - (L - s) r(s) x force.
     beyond = curve[:, 0] * force[1] - curve[:, 1] * force[0]
     whole = cumulative_trapezoid(beyond[::-1], fine, initial=0)[::-1]

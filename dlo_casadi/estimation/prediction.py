@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi.assembly import Given
 from dlo_casadi.equilibrium import NEARBY, Branch, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.estimation.chords import line_headings
+from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.model import CableModel
@@ -28,7 +28,7 @@ class Prediction:
     equilibrium : Equilibrium
     curve : NodeCurve
         As the camera would see it.
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
         Rest curvature that the pose finds.
     """
 
@@ -68,15 +68,15 @@ def predict_poses(
     Parameters
     ----------
     p : (n_parameters,)
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
         Before the first pose.
-    starts : sequence of (n_nodes,) [rad] or None, optional
-        Headings from which a pose is solved instead, whichever branch that leads to.
+    starts : sequence of (n_nodes, coordinates) or None, optional
+        Nodes from which a pose is solved instead, whichever branch that leads to.
     """
     out: list[Prediction | None] = []
     for pose, start in zip(poses, starts or [None] * len(poses), strict=True):
         try:
-            eq = solve_equilibrium(model, p, rest, pose, phi_init=start)
+            eq = solve_equilibrium(model, p, rest, pose, x_init=start)
         except EquilibriumError:
             out.append(None)
             continue
@@ -101,7 +101,7 @@ def measured_branches(
     and the measured one where it is nearer to the points.
     """
     starts = [
-        line_headings(item.points, item.pose, model.chain, item.places(model.cable.length))
+        line_nodes(item.points, item.pose, model.chain, item.places(model.cable.length))
         if item.readable
         else None
         for item in measured
@@ -115,7 +115,7 @@ def measured_branches(
             and known is not None
             and found is not None
             and found.equilibrium.stable
-            and not _same(known.equilibrium, found.equilibrium)
+            and not model.node.same(known.equilibrium.x, found.equilibrium.x, NEARBY)
             and _square(found, item) < _square(known, item)
         ):
             other = MeasuredBranch(found, _name_of(model, p, item.pose, found))
@@ -128,22 +128,17 @@ def _square(prediction: Prediction, item: MeasuredPose) -> float:
     return float((item.distances(prediction.curve) ** 2).mean())
 
 
-def _same(one: Equilibrium, other: Equilibrium) -> bool:
-    """Whether two equilibria are one; headings may differ by full turns of the whole cable."""
-    gap = one.phi - other.phi
-    gap = gap - 2 * np.pi * np.round(gap.mean() / (2 * np.pi))
-    return bool(np.abs(gap).max() < NEARBY)
-
-
 def _name_of(model: CableModel, p: FloatArray, pose: Pose, found: Prediction) -> Branch | None:
-    """The branch that a pose has to name for an equilibrium to be predicted."""
+    """The branch that a pose has to name for an equilibrium to be predicted; none in space."""
+    if model.in_space:
+        return None
     names: tuple[Branch, Branch] = ("ccw", "cw")
     for name in names:
         try:
             eq = solve_equilibrium(model, p, found.rest, replace(pose, branch=name))
         except EquilibriumError:
             continue
-        if _same(eq, found.equilibrium):
+        if model.node.same(eq.x, found.equilibrium.x, NEARBY):
             return name
     return None
 

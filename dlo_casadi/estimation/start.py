@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Directions, Shapes
-from dlo_casadi.equilibrium import guesses
-from dlo_casadi.estimation.chords import line_headings
+from dlo_casadi.assembly import Directions, Shapes
+from dlo_casadi.equilibrium import first_nodes
+from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import MeasuredPose
@@ -40,14 +40,15 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     sweep = problem.sweep
     if chain.kind.n_inner:
         sweep = Sweep(model.with_mesh(chain.n, chain.kind.plain), problem.sweep.poses)
-    flat = np.zeros(chain.n_cells)
-    first = [guesses(model, model.nominal, flat, item.pose)[0] for item in problem.measured]
-    x = np.array(first)[..., None]
+    flat = np.zeros(chain.n_rests)
+    x = np.array(
+        [first_nodes(model, model.nominal, flat, item.pose)[0] for item in problem.measured]
+    )
     feet: list[FloatArray] = []
     for j in used:
         item = problem.measured[j]
         places = item.places(chain.length)
-        x[j, :, 0] = line_headings(item.points, item.pose, chain, places)
+        x[j] = line_nodes(item.points, item.pose, chain, places)
         feet.append(places)
     shapes = problem.sweep.start_shapes(x)
     each = _each_node(sweep)
@@ -59,9 +60,10 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
                 now = Observed(curve, shapes.lam[j])
                 feet[k] = problem.measured[j].located(now, feet[k])
             if iteration < _KINEMATIC_STEPS:
-                x[j, :, 0] += _kinematic_step(
-                    problem.measured[j], model, curve, seen.slopes[j], x[j, :, 0], feet[k]
+                step = _kinematic_step(
+                    problem.measured[j], model, curve, seen.slopes[j], x[j], feet[k]
                 )
+                x[j] = model.node.moved(x[j], step)
     return shapes, feet
 
 
@@ -71,7 +73,7 @@ def _each_node(sweep: Sweep) -> Directions:
     q = a.n * a.b
     x = np.broadcast_to(np.eye(q).reshape((a.n, a.b, q)), (m, a.n, a.b, q))
     model = sweep.model
-    counts = (a.k, len(model.parameters), model.chain.n_cells, len(DEVIATIONS))
+    counts = (a.k, len(model.parameters), model.chain.n_rests, len(model.deviation_names))
     return Directions(x, *(np.zeros((m, count, q)) for count in counts))
 
 
@@ -80,33 +82,35 @@ def _kinematic_step(
     model: CableModel,
     curve: NodeCurve,
     slopes: FloatArray,
-    phi: FloatArray,
+    x: FloatArray,
     s: FloatArray,
 ) -> FloatArray:
-    """Step of the headings towards the measured points, at most half a radian."""
-    chain = model.chain
+    """Increments (n_nodes, b) towards the measured points, at most half a radian."""
+    chain, node = model.chain, model.node
+    n, b, d = len(x), node.increment, node.dimension
     gap = item.points - curve.at(s)
-    penalty = np.diff(np.eye(len(phi)), n=2, axis=0)
+    bends = node.difference(x[:-1], x[1:])
     # 3 mm of noise a point against bends that change by 0.3 turns per length from cell to cell.
-    rough = penalty * 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
+    weight = 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
+    rough = weight * np.kron(np.diff(np.eye(n), n=2, axis=0), np.eye(b))
     moved = curve.moved(s, slopes)
-    system: list[FloatArray] = [moved[:, 0], moved[:, 1], rough]
-    target: list[FloatArray] = [gap[:, 0], gap[:, 1], -rough @ phi]
+    system: list[FloatArray] = [*moved.transpose((1, 0, 2)), rough]
+    target: list[FloatArray] = [*gap.T, -weight * np.diff(bends, axis=0).ravel()]
     if item.pose.end is not None:
-        system.append(10 * slopes[-1, :2])
+        system.append(10 * slopes[-1, :d])
         target.append(10 * (np.array(item.pose.end) - curve.nodes[-1]))
-    for held, index, heading in (
-        (model.start == "clamped", 0, item.pose.start_heading),
-        (model.end == "clamped", len(phi) - 1, item.pose.end_heading),
+    for held, index, frame in (
+        (model.start == "clamped", 0, item.pose.frames[0]),
+        (model.end == "clamped", n - 1, item.pose.frames[1]),
     ):
-        if held and heading is not None:
-            row = np.zeros((1, len(phi)))
-            row[0, index] = 0.01
-            system.append(row)
-            target.append(np.array([0.01 * (heading - phi[index])]))
+        if held:
+            rows = np.zeros((b, n * b))
+            rows[:, index * b : (index + 1) * b] = 0.01 * np.eye(b)
+            system.append(rows)
+            target.append(0.01 * node.difference(x[index], frame))
     stacked = np.concatenate(system)
     step = np.linalg.solve(stacked.T @ stacked, stacked.T @ np.concatenate(target))
-    return step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
+    return (step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))).reshape((n, b))
 
 
 def all_at_once(

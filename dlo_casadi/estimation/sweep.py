@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import DEVIATIONS, Assembly, CurveSlopes, Directions, Given, Shapes
+from dlo_casadi.assembly import Assembly, CurveSlopes, Directions, Given, Shapes
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -51,7 +51,7 @@ class Sweep:
         self.assembly = model.assembly
         self.node = self.assembly.node
         self._ends = np.array([pose.vector for pose in self.poses])
-        self.used_deviations = [DEVIATIONS.index(name) for name in model.deviations]
+        self.used_deviations = [model.deviation_names.index(name) for name in model.deviations]
 
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes of these nodes (m, n_nodes, coordinates), without forces and deviations."""
@@ -60,9 +60,9 @@ class Sweep:
     # ---- state -----------------------------------------------------------------------------------
 
     def rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Rest curvature (m, n_cells) that each pose finds, from the first on.
+        """Rest curvature (m, n_rests) that each pose finds, from the first on.
 
-        A `rest` that is given per pose already, (m, n_cells), is returned as it is.
+        A `rest` that is given per pose already, (m, n_rests), is returned as it is.
         """
         if rest.ndim == 2:
             return rest
@@ -73,17 +73,17 @@ class Sweep:
         return out
 
     def _after(self, j: int, shapes: Shapes, p: FloatArray, rests: FloatArray) -> FloatArray:
-        """Rest curvature (1, n_cells) after pose j."""
+        """Rest curvature (1, n_rests) after pose j."""
         here = [j]
         given = Given.of(p, rests[here], self._ends[here])
         return self.assembly.state_after(shapes.subset(here), given)[0]
 
     def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Rest curvature (n_cells,) that the last pose leaves behind."""
+        """Rest curvature (n_rests,) that the last pose leaves behind."""
         return self._after(self.m - 1, shapes, p, self.rests(shapes, p, rest))[0]
 
     def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Curvature minus the rest curvature that each pose finds (m, n_cells) [1/m]."""
+        """Curvature minus the rest curvature that each pose finds (m, n_rests) [1/m]."""
         given = self._given(shapes, p, rest)
         return self.assembly.strain(shapes, given) - given.rest
 
@@ -118,7 +118,7 @@ class Sweep:
         shapes : Shapes
             Where to start; deviations are kept.
         p : (n_parameters,) or (m, n_parameters)
-        rest : (n_cells,) or (m, n_cells) [1/m]
+        rest : (n_rests,) or (m, n_rests) [1/m]
             Before the first pose, or of each pose.
         tolerance : float [rad]
             Largest step at convergence.
@@ -218,7 +218,7 @@ class Sweep:
         ----------
         slopes : (n_parameters, size)
             dp/dtheta.
-        rest_slopes : (n_cells, size)
+        rest_slopes : (n_rests, size)
             d rest / d theta before the first pose.
 
         Returns
@@ -234,12 +234,12 @@ class Sweep:
         p_along[:, :, :size] = slopes
         rest_along = np.zeros((m, rest_slopes.shape[0], q))
         rest_along[:, :, :size] = rest_slopes
-        deviation = np.zeros((m, len(DEVIATIONS), q))
+        deviation = np.zeros((m, len(self.model.deviation_names), q))
         deviation[:, self.used_deviations, size + np.arange(own)] = 1.0
         still = replace(_still(self.assembly, m, rest_along, p_along), deviation=deviation)
         if self.model.has_state:
             slopes_after = self.assembly.state_after(shapes, given)
-            if slopes_after[1].any() or np.any(slopes_after[2] != 1):
+            if slopes_after[1].any() or not self.assembly.rest_stays(slopes_after):
                 return self._carried(shapes, given, matrix, still, slopes_after)
             # A state that is not there yet hands on what it finds, and its own parameters' part.
             left = slopes_after[3] @ p_along
@@ -318,7 +318,7 @@ def _still(a: Assembly, m: int, rest: FloatArray, p: FloatArray) -> Directions:
         np.zeros((m, a.k, q)),
         p,
         rest,
-        np.zeros((m, len(DEVIATIONS), q)),
+        np.zeros((m, len(a.model.deviation_names), q)),
     )
 
 

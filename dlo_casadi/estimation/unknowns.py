@@ -49,7 +49,7 @@ class Unknowns:
     @property
     def n_rest(self) -> int:
         """Number of free rest-curvature coefficients."""
-        return self.model.rest.n_coefficients if self.rest_free else 0
+        return self.model.n_coefficients if self.rest_free else 0
 
     @property
     def size(self) -> int:
@@ -98,7 +98,7 @@ class Unknowns:
     def coefficients(self, theta: FloatArray) -> FloatArray:
         """Rest-curvature coefficients [1/m]."""
         if not self.rest_free:
-            return np.zeros(self.model.rest.n_coefficients)
+            return np.zeros(self.model.n_coefficients)
         return theta[self.n_parameters :] * self.model.cable.curvature_scale
 
     def rest(self, theta: FloatArray) -> FloatArray:
@@ -119,8 +119,8 @@ class Unknowns:
 
     @property
     def rest_slopes(self) -> FloatArray:
-        """Derivative of the rest curvature by theta (n_cells, size)."""
-        out = np.zeros((self.model.chain.n_cells, self.size))
+        """Derivative of the rest curvature by theta (n_rests, size)."""
+        out = np.zeros((self.model.chain.n_rests, self.size))
         if self.rest_free:
             out[:, self.n_parameters :] = self.model.rest_basis * self.model.cable.curvature_scale
         return out
@@ -141,7 +141,7 @@ class Unknowns:
     def prior_mean(self) -> FloatArray:
         """Mean of the Gaussian prior of theta."""
         nominal = self.model.nominal
-        return self.pack(nominal, np.zeros(self.model.rest.n_coefficients))
+        return self.pack(nominal, np.zeros(self.model.n_coefficients))
 
     def prior_precision(self, roughness_std: float) -> FloatArray:
         """Precision matrix (size, size) of the prior of theta.
@@ -158,7 +158,7 @@ class Unknowns:
             precision[k, k] = 0.0 if np.isinf(std) else 1 / std**2
         if self.n_rest:
             rest = slice(self.n_parameters, self.size)
-            rough = self.model.rest.roughness
+            rough = self.model.roughness
             precision[rest, rest] = rough.T @ rough / roughness_std**2
             precision[rest, rest] += np.eye(self.n_rest) / REST_TURNS_STD**2
         return precision

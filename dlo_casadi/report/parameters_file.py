@@ -115,7 +115,7 @@ class Parameters(NamedTuple):
     model : CableModel
     p : (n_parameters,)
         In the order of `model.names` (SI).
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
         Rest curvature that the next pose finds.
     metadata : Metadata
     """
@@ -241,7 +241,7 @@ def covariance_si(fit: Fit) -> tuple[tuple[str, ...], FloatArray]:
 
 
 def final_rest(fit: Fit) -> FloatArray:
-    """Rest curvature (n_cells,) [1/m] that the session's last pose leaves behind."""
+    """Rest curvature (n_rests,) [1/m] that the session's last pose leaves behind."""
     if not fit.model.has_state:
         return fit.rest
     return fit.problem.sweep.rest_after_last(fit.point.shapes, fit.p, fit.rest)
@@ -405,7 +405,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         names=names,
         covariance=covariance.reshape(len(names), len(names)),
         std={name: float(row.get("std") or 0.0) for name, row in rows.items()},
-        coefficients=_numbers(coefficients, model.rest.n_coefficients, "rest_curvature"),
+        coefficients=_numbers(coefficients, model.n_coefficients, "rest_curvature"),
         fixtures=dict(document.get("fixtures") or {}),
         identifiable=rows["bending_stiffness"].get("identifiable"),
         interval_95=None if interval is None else (interval[0], interval[1]),
@@ -418,7 +418,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     return Parameters(
         model,
         _numbers(values, len(values), "parameters"),
-        _numbers(rest, model.chain.n_cells, "state", "rest_curvature"),
+        _numbers(rest, model.chain.n_rests, "state", "rest_curvature"),
         metadata,
     )
 

@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.rod.arc import Arc
 from dlo_casadi.rod.element import Element, Layout
+from dlo_casadi.rod.helix import BowedHelix, Helix
 from dlo_casadi.rod.link import Link
 from dlo_casadi.rod.quadratic import Quadratic
 
 FloatArray = NDArray[np.floating]
 
 ELEMENTS: dict[str, Element] = {element.name: element for element in (Quadratic(), Arc(), Link())}
+ELEMENTS_IN_SPACE: dict[str, Element] = {
+    element.name: element for element in (BowedHelix(), Helix())
+}
 DEFAULT_ELEMENT = "quadratic"
 
 
@@ -31,8 +35,9 @@ class Chain:
     n : int
         Number of elements, >= 2.
     element : str
-        A name of ELEMENTS.
+        A name of ELEMENTS, or of ELEMENTS_IN_SPACE.
     start_clamped, end_clamped : bool
+    in_space : bool
     """
 
     length: float
@@ -40,17 +45,25 @@ class Chain:
     element: str = DEFAULT_ELEMENT
     start_clamped: bool = False
     end_clamped: bool = False
+    in_space: bool = False
 
     def __post_init__(self) -> None:
         if self.n < 2:
             raise DloError(f"a chain needs at least 2 elements, got n = {self.n}")
-        if self.element not in ELEMENTS:
-            raise DloError(f"element {self.element!r} is not known; use one of {tuple(ELEMENTS)}")
+        if self.element not in self._elements:
+            where = "in space" if self.in_space else "in a plane"
+            raise DloError(
+                f"element {self.element!r} is not known {where}; use one of {tuple(self._elements)}"
+            )
 
     @property
     def kind(self) -> Element:
         """What the chain is made of."""
-        return ELEMENTS[self.element]
+        return self._elements[self.element]
+
+    @property
+    def _elements(self) -> dict[str, Element]:
+        return ELEMENTS_IN_SPACE if self.in_space else ELEMENTS
 
     @property
     def h(self) -> float:
@@ -87,6 +100,11 @@ class Chain:
         """Number of bending cells."""
         return len(self.cells)
 
+    @property
+    def n_rests(self) -> int:
+        """Number of rest curvatures: of all cells about the first axis, then the next."""
+        return self.n_cells * len(self.kind.node.curvatures)
+
     @cached_property
     def rest_stencils(self) -> tuple[NDArray[np.intp], FloatArray]:
         """Cells (n_slots, 3) that tell the rest curvature inside a slot, and how (n_slots, 3, 3).
@@ -117,6 +135,11 @@ class Chain:
         return cells, weights
 
     def rest_inside(self, means: FloatArray) -> FloatArray:
-        """Rest curvature inside the slots (..., n_slots, 3, q) of means over cells (..., q)."""
+        """Rest curvature inside the slots (..., n_slots, 3 axes, q) of means (..., n_rests, q)."""
         cells, weights = self.rest_stencils
-        return np.asarray(weights @ means[..., cells, :])
+        by_axis = [weights @ part[..., cells, :] for part in self.by_axis(means)]
+        return np.concatenate(by_axis, axis=-2)
+
+    def by_axis(self, means: FloatArray) -> list[FloatArray]:
+        """Parts (..., n_cells, q) of means (..., n_rests, q), one for each curvature."""
+        return np.split(means, len(self.kind.node.curvatures), axis=-2)

@@ -65,6 +65,21 @@ class Law(Protocol):
 
 
 @dataclass(frozen=True)
+class Stiffness:
+    """What a section resists with.
+
+    Parameters
+    ----------
+    bending : scalar EI [N m^2]; in space (2, 2), about the material axes y and z
+    torsion : scalar GJ [N m^2]
+        0 in a plane.
+    """
+
+    bending: ca.SX
+    torsion: ca.SX
+
+
+@dataclass(frozen=True)
 class Layout:
     """Where the nodes and slots of a chain are.
 
@@ -106,10 +121,11 @@ class Slot:
 
     Parameters
     ----------
-    first, last : (coordinates,)
-        Its nodes.
-    rest : (3,) [1/m]
-        Rest curvature of the cell: mean, and linear and quadratic variation inside.
+    local : (n_local,)
+        Local coordinates of its nodes, see `Element.local`.
+    rest : (3 axes,) [1/m]
+        Rest curvature of the cell: mean, and linear and quadratic variation inside, about each
+        axis that has one.
     place : (5,)
         A row of `Layout.slots`.
     mesh : float [m]
@@ -124,8 +140,7 @@ class Slot:
         What stands for the square of the inner unknown.
     """
 
-    first: ca.SX
-    last: ca.SX
+    local: ca.SX
     rest: ca.SX
     place: ca.SX
     mesh: float
@@ -133,6 +148,16 @@ class Slot:
     ratio: ca.SX
     inner: ca.SX
     square: ca.SX
+
+    @property
+    def first(self) -> ca.SX:
+        """Heading of its first node, in a plane [rad]."""
+        return self.local[0]
+
+    @property
+    def last(self) -> ca.SX:
+        """Heading of its last node, in a plane [rad]."""
+        return self.local[1]
 
     @property
     def start(self) -> ca.SX:
@@ -200,9 +225,28 @@ class Element(ABC):
     def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
         """Nodes and slots of a cable of n elements; `clamped`: its start, its end."""
 
+    def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
+        """Local coordinates (n_local,) of two nodes: what the element is written in.
+
+        Derivatives are taken by their increments, and passed on to those of the nodes.
+        """
+        return ca.vertcat(first, last)
+
+    def local_moved(self, local: ca.SX, step: ca.SX) -> ca.SX:
+        """Local coordinates moved by increments (2 b,)."""
+        return local + step
+
+    def local_gap(self, local: ca.SX, other: ca.SX) -> ca.SX:
+        """Increments (2 b,) that move local coordinates to others."""
+        return other - local
+
     @abstractmethod
     def strain(self, slot: Slot) -> ca.SX:
-        """Mean curvature of the cell [1/m]; 0 without one."""
+        """Mean curvatures (axes,) of the cell [1/m]; 0 without one."""
+
+    def twist(self, slot: Slot) -> ca.SX:
+        """Mean twist of the cell [1/m]; 0 in a plane."""
+        return ca.SX(0)
 
     @abstractmethod
     def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
@@ -215,10 +259,10 @@ class Element(ABC):
         ]
         return slot.length * u * sum(parts[1:], start=parts[0])
 
-    def bending(self, slot: Slot, stiffness: ca.SX, laws: Sequence[Law]) -> ca.SX:
-        """Bending energy [J]: of the cell's mean bend, EI/2 (curvature - rest curvature)^2."""
+    def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
+        """Elastic energy [J]: of the cell's mean bend, EI/2 (curvature - rest curvature)^2."""
         bend = self.bend(slot)
-        density = stiffness / 2 * bend**2
+        density = stiffness.bending / 2 * bend**2
         for law in laws:
             density = density * law.factor(bend, slot.cell)
         return slot.has_cell * slot.cell.width * density * slot.stretch
@@ -233,6 +277,6 @@ class Element(ABC):
         """Eliminate the inner unknowns from the slot's Lagrangian, which is given with them."""
         return Condensed(lagrangian, slot.inner, slot.square)
 
-    def expanded(self, slot: Slot, energy: ca.SX) -> ca.SX:
+    def expanded(self, slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]) -> ca.SX:
         """Energy that is minimised over the inner unknowns; the same minimum as `condensed`."""
         return energy

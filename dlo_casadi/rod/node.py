@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.floating]
 
@@ -16,16 +17,36 @@ class Node(ABC):
     """The state of a node: `coordinates` numbers that move by increments of `increment` numbers.
 
     Nothing outside this contract adds a step to coordinates or interpolates them.
+
+    Attributes
+    ----------
+    coordinates, increment, dimension : int
+        Numbers of a node, of its increment, and of a position.
+    axes, turns : tuple of str
+        Names of the components of a position, and of an increment.
+    curvatures : tuple of str
+        Names of the curvatures that have a value at rest.
+    identity : tuple of float
+        Coordinates of the node whose tangent is the world's x axis.
     """
 
     coordinates: ClassVar[int]
     increment: ClassVar[int]
     dimension: ClassVar[int]
+    axes: ClassVar[tuple[str, ...]]
+    turns: ClassVar[tuple[str, ...]]
+    curvatures: ClassVar[tuple[str, ...]]
+    identity: ClassVar[tuple[float, ...]]
 
     @staticmethod
     @abstractmethod
     def retract(x: ca.SX, delta: ca.SX) -> ca.SX:
         """Coordinates (coordinates,) of the node moved by the increment (increment,) [rad]."""
+
+    @staticmethod
+    @abstractmethod
+    def gap(x: ca.SX, y: ca.SX) -> ca.SX:
+        """Increment (increment,) [rad] that moves x to y: of headings, whole turns included."""
 
     @staticmethod
     @abstractmethod
@@ -47,6 +68,21 @@ class Node(ABC):
     def tangent(x: ca.SX) -> ca.SX:
         """Unit tangent (dimension,) of the cable at a node."""
 
+    @staticmethod
+    @abstractmethod
+    def middle(x: ca.SX, y: ca.SX) -> ca.SX:
+        """Node half-way between two that are close to each other."""
+
+    @staticmethod
+    @abstractmethod
+    def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
+        """Moments (..., increment) about the axes of nodes (..., coordinates), to the world's."""
+
+    @classmethod
+    @abstractmethod
+    def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
+        """Whether two rows of nodes (n_nodes, coordinates) are one shape, to a tolerance [rad]."""
+
 
 class Heading(Node):
     """The direction of a planar cable: one angle against the board's x axis [rad]."""
@@ -54,11 +90,20 @@ class Heading(Node):
     coordinates = 1
     increment = 1
     dimension = 2
+    axes = ("x", "y")
+    turns = ("heading",)
+    curvatures = ("k",)
+    identity = (0.0,)
 
     @staticmethod
     def retract(x: ca.SX, delta: ca.SX) -> ca.SX:
         """Add the angle."""
         return x + delta
+
+    @staticmethod
+    def gap(x: ca.SX, y: ca.SX) -> ca.SX:
+        """Angle from x to y."""
+        return y - x
 
     @staticmethod
     def moved(x: FloatArray, delta: FloatArray) -> FloatArray:
@@ -80,3 +125,133 @@ class Heading(Node):
     def tangent(x: ca.SX) -> ca.SX:
         """(cos phi, sin phi)."""
         return ca.vertcat(ca.cos(x), ca.sin(x))
+
+    @staticmethod
+    def middle(x: ca.SX, y: ca.SX) -> ca.SX:
+        """Mean of the angles."""
+        return (x + y) / 2
+
+    @staticmethod
+    def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
+        """A moment in a plane is the same about both."""
+        return vectors
+
+    @classmethod
+    def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
+        """Full turns of the whole cable make no difference."""
+        gap = cls.difference(x, y)
+        return bool(np.abs(gap - 2 * np.pi * np.round(gap.mean() / (2 * np.pi))).max() < tolerance)
+
+
+class Frame(Node):
+    """The material frame of a cable in space: a unit quaternion (x, y, z, w), its x axis forward.
+
+    Increments are about the frame's own axes, by the Cayley map
+
+        q -> q * (delta / 2, 1) / sqrt(1 + |delta|^2 / 4)
+
+    a rotation by 2 atan(|delta| / 2): the exponential map to second order, smooth everywhere, and
+    rational. Neighbouring nodes carry quaternions of the same sign, which increments keep.
+
+    References
+    ----------
+    Simo and Vu-Quoc, Comput. Methods Appl. Mech. Eng. 58 (1986); Cayley map: Iserles et al., Acta
+    Numerica 9 (2000).
+    """
+
+    coordinates = 4
+    increment = 3
+    dimension = 3
+    axes = ("x", "y", "z")
+    turns = ("rotation_x", "rotation_y", "rotation_z")
+    curvatures = ("k_y", "k_z")
+    identity = (0.0, 0.0, 0.0, 1.0)
+
+    @staticmethod
+    def retract(x: ca.SX, delta: ca.SX) -> ca.SX:
+        """Turn about the frame's own axes."""
+        half = [d / 2 for d in ca.vertsplit(delta)]
+        scale = 1 / ca.sqrt(1 + sum((h * h for h in half), start=ca.SX(0)))
+        return ca.vertcat(*quaternion_product(ca.vertsplit(x), (*half, ca.SX(1)))) * scale
+
+    @staticmethod
+    def gap(x: ca.SX, y: ca.SX) -> ca.SX:
+        """2 tan(angle / 2) about the axis of the rotation from x to y, in the frame x."""
+        *vector, w = quaternion_product(conjugate(ca.vertsplit(x)), ca.vertsplit(y))
+        return ca.vertcat(*(2 * v / w for v in vector))
+
+    @staticmethod
+    def moved(x: FloatArray, delta: FloatArray) -> FloatArray:
+        """Turn about the frames' own axes."""
+        half = np.moveaxis(delta, -1, 0) / 2
+        product = quaternion_product(np.moveaxis(x, -1, 0), (*half, np.ones_like(half[0])))
+        out = np.stack(np.broadcast_arrays(*product), axis=-1)
+        return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+
+    @staticmethod
+    def difference(x: FloatArray, y: FloatArray) -> FloatArray:
+        """2 tan(angle / 2) about the axis of the rotation from x to y, in the frame x."""
+        first, last = np.moveaxis(x, -1, 0), np.moveaxis(y, -1, 0)
+        *vector, w = quaternion_product(conjugate(first), last)
+        # Turned by half a turn there is no such increment; it is then as long as can be told.
+        least = np.where(w < 0, -1e-12, 1e-12)
+        w = np.where(np.abs(w) < 1e-12, least, w)
+        return np.stack([2 * v / w for v in vector], axis=-1)
+
+    @staticmethod
+    def interpolated(places: FloatArray, known: FloatArray, x: FloatArray) -> FloatArray:
+        """Turned evenly from node to node, constant beyond."""
+        k = np.clip(np.searchsorted(known, places, side="right") - 1, 0, len(known) - 2)
+        u = np.clip((places - known[k]) / (known[k + 1] - known[k]), 0.0, 1.0)
+        first, last = x[..., k, :], x[..., k + 1, :]
+        cosine = np.clip((first * last).sum(axis=-1), -1.0, 1.0)
+        angle = np.maximum(np.arccos(np.abs(cosine)), 1e-12)
+        last = last * np.where(cosine < 0, -1.0, 1.0)[..., None]
+        weights = [np.sin((1 - u) * angle), np.sin(u * angle)]
+        out = weights[0][..., None] * first + weights[1][..., None] * last
+        return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+
+    @staticmethod
+    def tangent(x: ca.SX) -> ca.SX:
+        """The x axis of the frame."""
+        return rotated(x, ca.DM([1.0, 0.0, 0.0]))
+
+    @staticmethod
+    def middle(x: ca.SX, y: ca.SX) -> ca.SX:
+        """Normalised mean of the quaternions."""
+        return (x + y) / ca.norm_2(x + y)
+
+    @staticmethod
+    def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
+        """Turned by the frames."""
+        return Rotation.from_quat(x).apply(vectors)
+
+    @classmethod
+    def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
+        """Quaternions of either sign."""
+        return bool(np.abs(cls.difference(x, y)).max() < tolerance)
+
+
+def quaternion_product(p: Any, q: Any) -> tuple[Any, Any, Any, Any]:
+    """Components (x, y, z, w) of the product p q: of numbers, arrays or expressions."""
+    px, py, pz, pw = p
+    qx, qy, qz, qw = q
+    return (
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+        pw * qw - px * qx - py * qy - pz * qz,
+    )
+
+
+def conjugate(q: Any) -> tuple[Any, Any, Any, Any]:
+    """Components of the inverse of a unit quaternion."""
+    x, y, z, w = q
+    return (-x, -y, -z, w)
+
+
+def rotated(q: ca.SX, vector: Any) -> ca.SX:
+    """Vector (3,) turned by the unit quaternion q: v + 2 w (u x v) + 2 u x (u x v)."""
+    u, w = q[:3], q[3]
+    once = 2 * ca.cross(u, vector)
+    return vector + w * once + ca.cross(u, once)

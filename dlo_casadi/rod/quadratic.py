@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.rod.arc import Arc
-from dlo_casadi.rod.element import Condensed, Law, Slot
+from dlo_casadi.rod.element import Condensed, Law, Slot, Stiffness
 from dlo_casadi.rod.node import Heading
 
 
@@ -31,10 +31,10 @@ class Quadratic(Arc):
         bowed = ca.vertcat(-across * s - back * c, across * c - back * s)
         return slot.ratio * ca.vertcat(c, s) + slot.stretch * bowed
 
-    def bending(self, slot: Slot, stiffness: ca.SX, laws: Sequence[Law]) -> ca.SX:
+    def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
         """Energy of the mean bend and of the bow; uneven section laws by halves of the cell."""
         bend, cell = self.bend(slot), slot.cell
-        density, tangent, uneven = stiffness / 2 * bend**2, ca.SX(1), ca.SX(0)
+        density, tangent, uneven = stiffness.bending / 2 * bend**2, ca.SX(1), ca.SX(0)
         for law in laws:
             if law.even:
                 density = density * law.factor(bend, cell)
@@ -47,7 +47,7 @@ class Quadratic(Arc):
         # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
         bowed = 4 / np.sqrt(3) * slot.inner * (1 / (slot.length * slot.stretch))
         # Where the halves resist differently, a mean bend bows the cell.
-        density += stiffness / 2 * tangent * (bowed**2 + 2 * uneven * bend * bowed)
+        density += stiffness.bending / 2 * tangent * (bowed**2 + 2 * uneven * bend * bowed)
         return cell.width * density * slot.stretch
 
     def condensed(
@@ -62,7 +62,7 @@ class Quadratic(Arc):
         bow = -torque / (elastic * factor)
         return Condensed(given + torque * bow / 2, bow, bow**2 * slope)
 
-    def expanded(self, slot: Slot, energy: ca.SX) -> ca.SX:
+    def expanded(self, slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]) -> ca.SX:
         """To second order in the bow, as in `condensed`."""
         torque = ca.gradient(energy, slot.inner)
         stiffness = ca.jacobian(torque, slot.inner)

@@ -205,7 +205,7 @@ def _distance(model: CableModel, factor: float, measured: Sequence[MeasuredPose]
     """RMS distance [m] of the points from the shapes of a stiffness; infinite without a shape."""
     p = model.nominal.copy()
     p[0] *= factor
-    rest = np.zeros(model.chain.n_cells)
+    rest = np.zeros(model.chain.n_rests)
     predictions = predict_poses(model, p, rest, [item.pose for item in measured])
     gaps = [
         np.inf if prediction is None else item.distances(prediction.curve)

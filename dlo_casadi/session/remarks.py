@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dlo_casadi.assembly import DEVIATIONS
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.estimation.result import Fit
@@ -125,7 +124,7 @@ def _beside(fit: Fit) -> str:
 
 def _scatter(fit: Fit) -> str:
     """How far the poses' fixtures are from their declared places, one standard deviation."""
-    scatter = dict(zip(DEVIATIONS, fit.problem.scatter, strict=True))
+    scatter = dict(zip(fit.model.deviation_names, fit.problem.scatter, strict=True))
     parts = {
         "end_x": f"{1e3 * scatter['end_x']:.2g} mm at the end",
         "start_heading": f"{scatter['start_heading']:.2g} rad at the start clamp",

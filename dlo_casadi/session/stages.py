@@ -109,7 +109,7 @@ def _no_rest(length: float) -> RestCurvatureEstimate:
 def initial_stage(model: CableModel, measured: Sequence[MeasuredPose]) -> Stage:
     """Prior stiffness, straight at rest: the paper's alpha^0."""
     stiffness = ParameterEstimate(float(model.nominal[0]), 0.0, "N m^2")
-    rest = np.zeros(model.chain.n_cells)
+    rest = np.zeros(model.chain.n_rests)
     return _stage(
         "initial",
         model,
@@ -139,7 +139,7 @@ def stiffness_stage(
         "stiffness_only",
         model,
         p,
-        np.zeros(model.chain.n_cells),
+        np.zeros(model.chain.n_rests),
         measured,
         {"bending_stiffness": stiffness},
         _no_rest(model.cable.length),

@@ -28,7 +28,7 @@ class Plan:
     ----------
     model : CableModel
     p : (n_parameters,)
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
     branch : "ccw", "cw" or None
     parts : Path
         Folder of the finished chunks.

@@ -63,7 +63,7 @@ def rows_of_table_4(roundings: int = ROUNDINGS) -> list[Row]:
         before = solve_equilibrium(model, p, none, pose)
         after = solve_equilibrium(model, p, angles / model.chain.h, pose)
         rounded = [
-            solve_equilibrium(model, p, (angles + d) / model.chain.h, pose, phi_init=after.phi)
+            solve_equilibrium(model, p, (angles + d) / model.chain.h, pose, x_init=after.x)
             for d in draws
         ]
         rows.append(

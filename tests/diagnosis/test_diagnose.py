@@ -19,6 +19,7 @@ from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
 from dlo_casadi.effects import BendingSoftening, LumpedMass
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import read_poses
@@ -48,7 +49,10 @@ def test_held_out_poses_are_not_looked_at(session, fit):
     """Measured points of held-out poses are moved by a centimetre: nothing changes."""
     _, measured = session
     spoiled = tuple(
-        replace(item, points=item.points + 0.01) if item.held_out else item for item in measured
+        MeasuredPose.of_points(item.pose, item.points + 0.01, held_out=True)
+        if item.held_out
+        else item
+        for item in measured
     )
     assert any(item.held_out for item in measured)
     first, second = diagnose(fit), diagnose(fit_of(session, spoiled))

@@ -11,7 +11,7 @@ import pytest
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.rod.chain import ELEMENTS, Chain
-from dlo_casadi.rod.element import Slot
+from dlo_casadi.rod.element import Slot, Stiffness
 
 LENGTH = 0.8  # m
 ROUNDING = 1e-14  # a dozen sums of numbers of order one
@@ -33,8 +33,7 @@ def slots_of(chain: Chain, phi: np.ndarray, *, rest=None, stretch=1.0, bow=0.0) 
     after = np.minimum(np.arange(chain.n_slots) + 1, chain.n_nodes - 1)
     return [
         Slot(
-            first=ca.SX(float(phi[j])),
-            last=ca.SX(float(phi[after[j]])),
+            local=ca.SX([float(phi[j]), float(phi[after[j]])]),
             rest=ca.SX(ca.DM(inside[j])),
             place=ca.SX(ca.DM(chain.layout.slots[j])),
             mesh=chain.h,
@@ -256,7 +255,7 @@ def test_the_plain_element_has_the_same_nodes_and_no_inner_unknowns(element):
 def test_a_chain_that_cannot_be():
     with pytest.raises(DloError, match="at least 2 elements, got n = 1"):
         Chain(LENGTH, 1)
-    with pytest.raises(DloError, match="'beam' is not known; use one of"):
+    with pytest.raises(DloError, match="'beam' is not known in a plane; use one of"):
         Chain(LENGTH, 4, "beam")
 
 
@@ -307,7 +306,7 @@ def test_the_bow_is_the_least_energy_of_its_element(pull):
     slot = Slot(**{**vars(plain), "inner": bow, "square": bow**2})
 
     def bending(slot: Slot) -> ca.SX:
-        return kind.bending(slot, ca.SX(stiffness), ())
+        return kind.bending(slot, Stiffness(ca.SX(stiffness), ca.SX(0)), ())
 
     lagrangian = bending(slot) - ca.dot(ca.DM([pull, across]), kind.advance(slot))
     found = kind.condensed(slot, lagrangian, bending)

@@ -1,0 +1,61 @@
+"""Where the ends of a cable are held: the record of positions and frames behind a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+
+from dlo_casadi.rod.node import Node, quaternion_product
+
+
+@dataclass(frozen=True)
+class EndConditions:
+    """Where and how the ends are held: symbols of one pose.
+
+    `start`, `end` (dimension,) [m]; `start_frame`, `end_frame` (coordinates,): the clamps as a
+    node would carry them, in a plane their headings [rad]. `node` is what the nodes carry.
+    """
+
+    start: ca.SX
+    end: ca.SX
+    start_frame: ca.SX
+    end_frame: ca.SX
+    node: type[Node]
+
+    @staticmethod
+    def size(node: type[Node]) -> int:
+        """Numbers that declare both ends."""
+        return 2 * (node.dimension + node.coordinates)
+
+    @classmethod
+    def of(cls, values: ca.SX, node: type[Node]) -> EndConditions:
+        """From start, end, start frame, end frame in one vector."""
+        d, c = node.dimension, node.coordinates
+        start, end, first, last = ca.vertsplit(values, [0, d, 2 * d, 2 * d + c, 2 * (d + c)])
+        return cls(start, end, first, last, node)
+
+    @property
+    def vector(self) -> ca.SX:
+        """As given to `of`."""
+        return ca.vertcat(self.start, self.end, self.start_frame, self.end_frame)
+
+    def changed(self, **values: Any) -> EndConditions:
+        """Return a copy with some conditions replaced."""
+        return replace(self, **values)
+
+    def rolled(self, angle: ca.SX) -> EndConditions:
+        """Return a copy whose end clamp in space is turned about its x axis [rad]."""
+        roll = (ca.sin(angle / 2), ca.SX(0), ca.SX(0), ca.cos(angle / 2))
+        rolled = quaternion_product(ca.vertsplit(self.end_frame), roll)
+        return replace(self, end_frame=ca.vertcat(*rolled))
+
+    def turned(self, start: ca.SX | None = None, end: ca.SX | None = None) -> EndConditions:
+        """Return a copy whose clamps are turned by increments about their own axes."""
+        first, last = self.start_frame, self.end_frame
+        if start is not None:
+            first = self.node.retract(first, start)
+        if end is not None:
+            last = self.node.retract(last, end)
+        return replace(self, start_frame=first, end_frame=last)

@@ -1,0 +1,208 @@
+"""Elements of a rod in space: helices, and helices whose curvature changes inside.
+
+Between the frames R_0 and R_1 of two nodes the rod is a helix of the rotation vector phi,
+
+    R_1 = R_0 exp(phi),   r(u) = r_0 + h int_0^u R_0 exp(v phi) e_x dv
+
+with twist phi_x / h and curvatures phi_y / h, phi_z / h about the material axes y and z.
+
+References
+----------
+Kirchhoff rods: Antman, Nonlinear Problems of Elasticity, 2005. Elements of constant strain:
+Sonneville, Cardona, Bruels, Comput. Methods Appl. Mech. Eng. 268 (2014). Strain varying linearly,
+to fourth order: Magnus expansion, e.g. Iserles et al., Acta Numerica 9 (2000).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import factorial
+
+import casadi as ca
+import numpy as np
+
+from dlo_casadi.rod.arc import Arc
+from dlo_casadi.rod.element import Condensed, Element, Law, Layout, Slot, Stiffness
+from dlo_casadi.rod.node import Frame, conjugate, quaternion_product, rotated
+
+# Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
+_GAUSS = 0.5 / np.sqrt(3)
+# asin(x) / x in powers of x^2. Of a quarter of the half angle of an element that turns by a
+# quarter turn, x = 0.2, what is left out is 1e-13.
+_ARCSINE = tuple(factorial(2 * k) / (4**k * factorial(k) ** 2 * (2 * k + 1)) for k in range(8))
+# sin(x) / x and (1 - cos x) / x^2 in powers of x^2, to 1e-15 for x = 0.8: half of a quarter turn.
+_SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(7))
+_COSINE = tuple((-1) ** k / factorial(2 * k + 2) for k in range(7))
+
+
+def _series(coefficients: Sequence[float], y: ca.SX) -> ca.SX:
+    total = ca.SX(coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        total = coefficient + y * total
+    return total
+
+
+class Helix(Element):
+    """Constant curvature and twist between nodal frames."""
+
+    name = "arc"
+    plain = "arc"
+    nodes_are = "at the nodes"
+    node = Frame
+    order = 2
+    smooth = True
+    rule = Arc.rule
+
+    def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
+        """Nodes at the element boundaries, as those of a planar cable."""
+        return Arc().layout(length, n, clamped)
+
+    def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
+        """Frame in the middle (4,), and the rotation vector phi (3,) [rad] from node to node."""
+        x, y, z, w = quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(last))
+        # Halving the angle once more leaves an arc sine of which few terms are enough.
+        vector, halves = ca.vertcat(x, y, z), []
+        for _ in range(2):
+            cosine = ca.sqrt((1 + w) / 2)
+            vector, w = vector / (2 * cosine), cosine
+            halves.append((vector, w))
+        phi = 8 * _series(_ARCSINE, ca.sumsqr(vector)) * vector
+        half, w = halves[0]
+        middle = quaternion_product(ca.vertsplit(first), (*ca.vertsplit(half), w))
+        return ca.vertcat(*middle, phi)
+
+    def local_moved(self, local: ca.SX, step: ca.SX) -> ca.SX:
+        """The frame turned, the rotation vector added to."""
+        return ca.vertcat(Frame.retract(local[:4], step[:3]), local[4:] + step[3:])
+
+    def local_gap(self, local: ca.SX, other: ca.SX) -> ca.SX:
+        """Turn of the frame, difference of the rotation vectors."""
+        return ca.vertcat(Frame.gap(local[:4], other[:4]), other[4:] - local[4:])
+
+    def strain(self, slot: Slot) -> ca.SX:
+        """Mean curvatures about the axes y and z."""
+        return slot.local[5:] / (slot.length * slot.stretch)
+
+    def twist(self, slot: Slot) -> ca.SX:
+        """Mean twist."""
+        return slot.local[4] / (slot.length * slot.stretch)
+
+    def bends(self, slot: Slot) -> list[ca.SX]:
+        """Twist and curvatures minus rest curvatures (3,) [1/m] at the Gauss points."""
+        mean = ca.vertcat(self.twist(slot), self.strain(slot)) - _rest(slot, 0.0)
+        return [mean]
+
+    def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
+        """Energy of bending and twist [J], the mean over the Gauss points.
+
+            W = 1/2 (k - k_0)^T B (k - k_0) + 1/2 GJ tau^2
+
+        times the factors of the section laws, of each half of the cell at its own point.
+        """
+        bends = self.bends(slot)
+        cells = [slot.cell] if len(bends) == 1 else list(slot.cell.halves)
+        total = ca.SX(0)
+        for bend, cell in zip(bends, cells, strict=True):
+            density = stiffness.torsion / 2 * bend[0] ** 2
+            density += ca.dot(bend[1:], ca.mtimes(stiffness.bending, bend[1:])) / 2
+            for law in laws:
+                density = density * law.factor(_size(bend[1:]), cell)
+            total += density / len(bends)
+        return slot.cell.width * total * slot.stretch
+
+    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+        """The x axis of the frame at the fraction u."""
+        return slot.ratio * rotated(slot.local[:4], _turned(slot.local[4:], u - 0.5))
+
+
+def _rest(slot: Slot, x: float) -> ca.SX:
+    """Rest twist 0 and rest curvatures (3,) at x from -1/2 to 1/2 of the element."""
+    values = [slot.rest[3 * i] + x * slot.rest[3 * i + 1] for i in range(2)]
+    return ca.vertcat(0, *values)
+
+
+def _size(bend: ca.SX) -> ca.SX:
+    """Size of a bend about two axes [1/m], rounded at 1e-6/m."""
+    return ca.sqrt(ca.sumsqr(bend) + 1e-12)
+
+
+def _turned(phi: ca.SX, x: ca.SX | float) -> ca.SX:
+    """exp(x phi) e_x."""
+    a = x * phi
+    y = ca.sumsqr(a)
+    sine, cosine = _series(_SINE, y), _series(_COSINE, y)
+    # a x e_x = (0, a_z, -a_y), a x (a x e_x) = a a_x - |a|^2 e_x.
+    return ca.vertcat(
+        1 + cosine * (a[0] * a[0] - y),
+        sine * a[2] + cosine * a[0] * a[1],
+        -sine * a[1] + cosine * a[0] * a[2],
+    )
+
+
+class BowedHelix(Helix):
+    """Curvature and twist that change linearly inside the element: fourth order.
+
+        h omega(x) = phi - 8 x beta + 2/3 phi x beta,      -1/2 <= x <= 1/2
+
+    turns the frame at x, against the helix, by (1 - 4 x^2) (beta - x/3 phi x beta) about its own
+    axes. Positions are taken to first order in the bow beta; it is the minimum of the elastic
+    energy and the work of the loads for given nodes, which leaves out what is of the fifth order
+    in h per element.
+    """
+
+    name = "quadratic"
+    order = 4
+    n_inner = 3
+
+    def bends(self, slot: Slot) -> list[ca.SX]:
+        """At the two Gauss points."""
+        phi, beta = slot.local[4:], slot.inner
+        mean = phi + 2 / 3 * ca.cross(phi, beta)
+        width = slot.length * slot.stretch
+        return [(mean - 8 * x * beta) / width - _rest(slot, x) for x in (-_GAUSS, _GAUSS)]
+
+    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+        """The helix's, turned by the bow to first order."""
+        middle, phi = slot.local[:4], slot.local[4:]
+        x = u - 0.5
+        turn = (1 - 4 * x * x) * (slot.inner - x / 3 * ca.cross(phi, slot.inner))
+        across = ca.vertcat(0, turn[2], -turn[1])
+        bowed = across + x * ca.cross(phi, across)
+        return rotated(middle, slot.ratio * _turned(phi, x) + slot.stretch * bowed)
+
+    def condensed(
+        self, slot: Slot, lagrangian: ca.SX, bending: Callable[[Slot], ca.SX]
+    ) -> Condensed:
+        """Minimum over the bow, resisted by the section alone."""
+        torque, given, elastic = self._of_bow(slot, lagrangian, bending)
+        bow = -ca.mtimes(_inverse(elastic), torque)
+        return Condensed(given + ca.dot(torque, bow) / 2, bow, slot.square)
+
+    def expanded(self, slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]) -> ca.SX:
+        """To second order in the bow, as in `condensed`."""
+        torque, given, elastic = self._of_bow(slot, energy, bending)
+        bow = slot.inner
+        return given + ca.dot(torque, bow) + ca.dot(bow, ca.mtimes(elastic, bow)) / 2
+
+    @staticmethod
+    def _of_bow(
+        slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]
+    ) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Slope of an energy by the bow at 0, its value, and the section's own stiffness."""
+        elastic, _ = ca.hessian(bending(slot), slot.inner)
+        whole = [ca.gradient(energy, slot.inner), energy, elastic]
+        torque, given, elastic = ca.substitute(whole, [slot.inner], [ca.SX.zeros(3)])
+        return torque, given, elastic
+
+
+def _inverse(a: ca.SX) -> ca.SX:
+    """Inverse of a symmetric matrix (3, 3), by cofactors."""
+    c00 = a[1, 1] * a[2, 2] - a[1, 2] ** 2
+    c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
+    c02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
+    c11 = a[0, 0] * a[2, 2] - a[0, 2] ** 2
+    c12 = a[0, 1] * a[0, 2] - a[0, 0] * a[1, 2]
+    c22 = a[0, 0] * a[1, 1] - a[0, 1] ** 2
+    determinant = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    rows = [[c00, c01, c02], [c01, c11, c12], [c02, c12, c22]]
+    return ca.vertcat(*(ca.horzcat(*row) for row in rows)) / determinant
