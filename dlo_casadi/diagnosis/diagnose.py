@@ -170,7 +170,7 @@ def diagnose(
         found = search.with_cause_of(pull, found)
     if found.unexplained and found.added:
         found = search.without_wrong_causes(found, pull)
-        if found.added or not fit.noise.known:
+        if found.added or not fit.errors_known:
             pull = estimate_pull(found.fit, search.executor)
     tried = {row.name for row in found.ranked}
     added = tuple(
@@ -293,7 +293,7 @@ class _Search:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = _corrected(single, len(screened))
             closed = settle(winner.fit)
-            if not self.declared.noise.known:
+            if not closed.errors_known:
                 again = _p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
             if p_value > self.significance:
@@ -333,12 +333,12 @@ class _Search:
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> _Found:
         """What has been found, and whether it explains the data."""
-        if not added and not fit.noise.known:
+        if not added and not fit.noise.declared:
             fit = settle(fit)
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
         limit = max(UNSEEN * fit.noise.std, UNSEEN_LEFT * self.error)
         unpredicted = bool(added) and validation.rmse > limit
-        unexplained = structure.p_value < self.significance or unpredicted
+        unexplained = structure.p_noise < self.significance or unpredicted
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
 
     def with_cause_of(self, pull: Pull | None, found: _Found) -> _Found:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from dlo_casadi.diagnosis.screening import survival
+from dlo_casadi.estimation.hyperparameters import rest_scatter_of
 from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.thresholds import KEPT_INFORMATION, KEPT_VARIANCE, LEAST_NOISE_DEGREES
@@ -46,6 +47,9 @@ class Structure:
         of its plane, a scale), the same in all poses; as a normal score, at most LARGEST_SCORE.
     per_pose : dict
         Slow energy per degree of freedom by pose name.
+    p_systematic : float
+        Where the cable does not repeat: probability of as much that poses which are alike have in
+        common, if each hanging has a rest curvature of its own and nothing else is missing.
     """
 
     statistic: float
@@ -57,6 +61,12 @@ class Structure:
     span_z: float
     position_z: float
     per_pose: dict[str, float]
+    p_systematic: float = 1.0
+
+    @property
+    def p_noise(self) -> float:
+        """Probability of the residual if it is noise and rest curvatures of each hanging's own."""
+        return min(self.p_value, self.p_systematic)
 
 
 def noise_degrees(fit: Fit) -> float:
@@ -71,7 +81,7 @@ def screening_degrees(fit: Fit) -> float:
     of cable told it, which is too much: what is found so has to pass a second test, under the
     noise that is left once it is in the model.
     """
-    if fit.noise.known:
+    if fit.noise.declared:
         return noise_degrees(fit)
     if fit.noise.share == 0:
         return float(fit.problem.n_residuals)
@@ -129,7 +139,18 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         _rank_score(energies, spans),
         _position_score(fit, noise_dof),
         dict(zip(names, energies.tolist(), strict=True)),
+        _systematic(fit),
     )
+
+
+def _systematic(fit: Fit) -> float:
+    """Probability of what poses that are alike have in common; 1 where the cable repeats."""
+    if fit.problem.rest_scatter.std == 0:
+        return 1.0
+    found = rest_scatter_of(
+        fit.problem, fit.point, fit.linearization, fit.noise, noise_known=True
+    )
+    return found.p_systematic
 
 
 def _position_score(fit: Fit, noise_dof: float) -> float:

@@ -17,7 +17,6 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
 from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.repeats import with_repeats
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -120,10 +119,7 @@ def fit_model(
     unknowns = Unknowns(model, chosen, begin)
     if start is not None:
         return _continue(unknowns, measured, start, max_iterations)
-    noise = NoiseModel(FIRST_STD)
-    if std is not None:
-        declared = NoiseModel(std, source="declared")
-        noise = with_repeats(declared, measured, model.cable.length)
+    noise = NoiseModel(FIRST_STD) if std is None else NoiseModel(std, declared=True)
     scatter = tolerances.deviation(model.node)
     if sum(item.readable and not item.held_out for item in measured) == 1:
         # One pose does not deviate from others: what is wrong with it is wrong with the session.
@@ -248,10 +244,10 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     except EstimationError:
         # The coarse mesh was too far off to be followed: start again from the measured shapes.
         names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]
-        std = fit.noise.std if fit.noise.source == "declared" else None
+        std = fit.noise.std if fit.noise.declared else None
         return fit_model(model, problem.history, problem.tolerances, std, free=names, values=fit.p)
     problem, point, converged = refine(
-        moved.problem, moved.point, estimate=not fit.noise.known, rounds=2, modes=modes
+        moved.problem, moved.point, estimate=not fit.noise.declared, rounds=2, modes=modes
     )
     return Fit(problem, point, converged)
 

@@ -25,7 +25,7 @@ from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.rest_scatter import RestScatter, modes_of
+from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_of
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -215,16 +215,18 @@ class BatchProblem:
             return
         moved = self.moved_by_rest(theta, shapes, feet)
         for j, way in zip(self.used, moved, strict=True):
-            seen = self._whitening[j] @ (way * self.rest_scatter.sizes)
+            sizes = np.tile(self.rest_scatter.sizes, way.shape[1] // MODES)
+            seen = self._whitening[j] @ (way * sizes)
             factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
             self._whitening[j] = solve_triangular(factor, self._whitening[j], lower=True)
 
     def moved_by_rest(
         self, theta: FloatArray, shapes: Shapes, feet: Sequence[FloatArray]
     ) -> list[FloatArray]:
-        """Change (R_j, MODES) of the fitted poses' residuals by a rest curvature of their own."""
+        """Change (R_j, axes MODES) of the fitted residuals by rest curvatures of the poses' own."""
         p, rest, model = self.unknowns.p(theta), self.unknowns.rest(theta), self.unknowns.model
         modes = modes_of(model.chain.cells, model.cable.length)
+        modes = np.kron(np.eye(len(model.node.curvatures)), modes)
         along = self.sweep.by_rest(shapes, p, rest, modes)
         seen = self.sweep.observe(shapes, p, rest, along)
         return [

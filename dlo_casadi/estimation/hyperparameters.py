@@ -16,7 +16,6 @@ from dlo_casadi.estimation.noise import (
     smooth_modes,
     tell_of_noise,
 )
-from dlo_casadi.estimation.repeats import with_repeats
 from dlo_casadi.estimation.rest_scatter import (
     MOST_POSES,
     RestLikelihood,
@@ -47,7 +46,7 @@ def settle(fit: Fit) -> Fit:
     problem, point, converged = refine(
         fit.problem,
         fit.point,
-        estimate=not fit.noise.known,
+        estimate=not fit.noise.declared,
         rounds=2,
         modes=SETTLED_MODES,
     )
@@ -76,7 +75,7 @@ def refine(
         lin = problem.linearize(point)
         noise, rest = problem.noise, problem.rest_scatter
         if round_ < 2:
-            estimated = estimate and not noise.known
+            estimated = estimate
             noise, rest = errors_of(problem, point, lin, modes, estimated=estimated)
         roughness = roughness_of(problem, point, lin)
         scatter = scatter_of(problem, point, lin)
@@ -110,9 +109,7 @@ def errors_of(
 
     The noise is estimated with all that the shape may do projected out. Lines of few points
     leave nothing over then: fewer slow displacements are projected out of them, and at last the
-    noise is white, its size estimated together with that of the rest curvatures. As long as an
-    effect may be missing (`modes` above SETTLED_MODES), what poses that are alike have in common
-    counts as systematic.
+    noise is white, its size estimated together with that of the rest curvatures.
 
     Parameters
     ----------
@@ -130,13 +127,11 @@ def errors_of(
         for count in range(modes, -1, -1):
             samples = _noise_samples(problem, point, lin, count)
             if tell_of_noise(samples):
-                noise = with_repeats(estimate_noise(samples, length), problem.history, length)
+                noise = estimate_noise(samples, length)
                 break
         else:
             noise, together = _white_noise(problem, point), True
-    found = rest_scatter_of(
-        problem, point, lin, noise, noise_known=not together, systematic=modes > SETTLED_MODES
-    )
+    found = rest_scatter_of(problem, point, lin, noise, noise_known=not together)
     return replace(noise, std=found.noise * noise.std), found.rest
 
 
@@ -147,7 +142,6 @@ def rest_scatter_of(
     noise: NoiseModel,
     *,
     noise_known: bool,
-    systematic: bool,
 ) -> ScatterEstimate:
     """Rest curvature of each hanging's own; see `estimate_rest_scatter`."""
     if len(problem.used) < LEAST_POSES:
@@ -167,7 +161,7 @@ def rest_scatter_of(
     shapes = shapes - shapes[:, :1]
     gap = shapes[:, None] - shapes[None]
     distances = np.sqrt((gap**2).sum(axis=3).mean(axis=2))
-    return estimate_rest_scatter(RestLikelihood(samples, distances, noise_known), systematic)
+    return estimate_rest_scatter(RestLikelihood(samples, distances, noise_known))
 
 
 def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:

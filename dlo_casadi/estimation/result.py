@@ -43,6 +43,11 @@ class Fit:
         return self.problem.noise
 
     @property
+    def errors_known(self) -> bool:
+        """Whether nothing of what the residuals are held against was estimated from them."""
+        return self.noise.declared and self.problem.rest_scatter.std == 0
+
+    @property
     def p(self) -> FloatArray:
         """Parameter vector, in the order of `model.names` (SI)."""
         return self.problem.unknowns.p(self.point.theta)

@@ -384,11 +384,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary", "end"),
         gravity=(float(gravity[0]), float(gravity[1])),
         effects=tuple(_effect(row, k) for k, row in enumerate(document["effects"])),
-        n_rest=_count(
-            document,
-            "n_rest",
-            REST_COEFFICIENTS._replace(least=0) if cable.straight else REST_COEFFICIENTS,
-        ),
+        n_rest=_count(document, "n_rest", REST_COEFFICIENTS),
         priors={name: float(std) for name, std in tolerances.items() if std is not None},
     )
     if set(rows) != set(model.names):
