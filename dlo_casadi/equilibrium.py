@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
@@ -24,6 +26,8 @@ from dlo_casadi.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
+# In a session a pose may also continue the one before it, see `continued`.
+PoseBranch = Branch | Literal["previous"]
 
 # Sign of the turning from start to end on a branch.
 SIGNS: dict[Branch, int] = {"ccw": 1, "cw": -1}
@@ -57,8 +61,9 @@ class Pose:
         Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable.
     turns : float
         In space, full turns of twist at the end about its x axis beside the roll nearest to none.
-    branch : "ccw" or "cw", optional
-        Which way the cable turns from start to end: the sign of `Equilibrium.turn`.
+    branch : "ccw", "cw" or "previous", optional
+        Which way the cable turns from start to end: the sign of `Equilibrium.turn`; or as in the
+        pose before it, from which whoever predicts a series of poses follows it (`continued`).
     name : str
     camera_center : (float, float, float), optional [m]
         Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
@@ -71,7 +76,7 @@ class Pose:
     start_orientation: tuple[float, ...] | None = None
     end_orientation: tuple[float, ...] | None = None
     turns: float = 0.0
-    branch: Branch | None = None
+    branch: PoseBranch | None = None
     name: str = "pose"
     camera_center: tuple[float, float, float] | None = None
 
@@ -88,6 +93,20 @@ class Pose:
             return np.array([self.start_heading or 0.0]), np.array([self.end_heading or 0.0])
         first, last = self.start_orientation, self.end_orientation
         return _unit(first or Frame.identity), _unit(last or Frame.identity)
+
+    def moved(self, start: FloatArray, end: FloatArray, frames: Sequence[FloatArray]) -> Pose:
+        """The same pose elsewhere; what is free stays free."""
+        headings = [float(frame[0]) if len(frame) == 1 else None for frame in frames]
+        orientations = [tuple(frame) if len(frame) == 4 else None for frame in frames]
+        return replace(
+            self,
+            start=tuple(start),
+            end=None if self.end is None else tuple(end),
+            start_heading=headings[0],
+            end_heading=headings[1],
+            start_orientation=orientations[0],
+            end_orientation=orientations[1],
+        )
 
     @property
     def vector(self) -> FloatArray:
@@ -137,6 +156,9 @@ class Equilibrium:
         Largest violation of an end condition [m or rad].
     status : Status
     iterations : int
+    tipping : float or None [rad]
+        By how much the clamp of a cable with a free end must turn until the lowest equilibrium on
+        the other branch is as low; None if no stable one was found there, or none looked for.
     """
 
     x: FloatArray
@@ -153,6 +175,7 @@ class Equilibrium:
     residual: float
     status: Status
     iterations: int
+    tipping: float | None = None
 
     @property
     def shapes(self) -> Shapes:
@@ -206,6 +229,8 @@ IPOPT_ITERATIONS = 300
 # First guesses that seldom lead to the lowest equilibrium are left out, see `guesses` [rad].
 # Of 300 random problems with a clamp at the end or at both ends this loses none.
 FAR, CURVED = 1.5, 1.0
+# Farther no end is moved at once [lengths, rad]: shapes near a fold are followed, not jumped over.
+MOST_MOVED, MOST_TURNED = 0.05, 0.2
 # A joint so near to its bound is at it [rad].
 AT_BOUND = 1e-6
 
@@ -292,7 +317,9 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
 
     1. the rest shape from the start on;
     2. the cable falling down from the start's direction;
-    3. straight on.
+    3. straight on;
+    4. the cable falling down the other way round: where the nearer one turns by more than 1.5 rad,
+       or the rest shape by more than 1 rad.
 
     In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings.
     The generated solver tries the same ones: codegen/templates/guesses.c.in.
@@ -366,8 +393,11 @@ def _hanging(
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
     if first is None:
         first = down
-    fall = wrapped(down - first) * (1 - np.exp(-4 * u))
-    return [first + bent, first + fall, np.full_like(u, first)]
+    drop, decay = wrapped(down - first), 1 - np.exp(-4 * u)
+    found = [first + bent, first + drop * decay, np.full_like(u, first)]
+    if abs(drop) > FAR or np.ptp(bent) > CURVED:
+        found.append(first + (drop - 2 * np.pi * (1 if drop > 0 else -1)) * decay)
+    return found
 
 
 def _curved(n: int, u: FloatArray, bent: FloatArray, chord: FloatArray) -> list[FloatArray]:
@@ -451,7 +481,7 @@ def solve_equilibrium(
     if model.in_space:
         return _in_space(model, p, rest, pose, x_init)
     starts = [x_init[:, 0]] if x_init is not None else guesses(model, p, rest, pose)
-    branch = pose.branch if x_init is None else None
+    branch = None if x_init is not None or pose.branch == "previous" else pose.branch
     first_suffices = branch is not None and (model.start, model.end) == ("pinned", "pinned")
     found: list[Equilibrium] = []
     for phi in starts:
@@ -473,7 +503,7 @@ def solve_equilibrium(
     lowest = found[0]
     for eq in found:
         if eq.turns(branch) and eq.stable is lowest.stable:
-            return eq
+            return replace(eq, tipping=_tipping(model, eq, found))
     there = next((f"branch {branch}" for branch in SIGNS if lowest.turns(branch)), "neither branch")
     kind = "stable equilibrium" if lowest.stable else "equilibrium"
     raise EquilibriumError(
@@ -484,6 +514,57 @@ def solve_equilibrium(
         pose.name,
         pose.end,
     )
+
+
+def _tipping(model: CableModel, eq: Equilibrium, found: list[Equilibrium]) -> float | None:
+    """Angle [rad] of the clamp at which another way to fall is as low, to first order.
+
+    dV/d(heading) of the clamp is the moment on it.
+    """
+    others = [other for other in found if other.stable and other.turn * eq.turn < 0]
+    if (model.start, model.end) != ("clamped", "free") or not others:
+        return None
+    lever = abs(float(others[0].moments[0] - eq.moments[0]))
+    return abs(others[0].energy - eq.energy) / max(lever, 1e-300)
+
+
+def continued(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, before: Pose, x: FloatArray
+) -> Equilibrium:
+    """Shape to which a cable comes whose ends are moved from another pose's, slowly.
+
+    Ends and frames move evenly from one pose's to the other's. Where the shape loses its stability
+    on the way, the cable snaps to the equilibrium that its last shape leads to.
+
+    Parameters
+    ----------
+    p, rest
+        As in `solve_equilibrium`.
+    pose : Pose
+    before : Pose
+    x : (n_nodes, coordinates)
+        Nodes of the cable in the pose `before`.
+
+    Raises
+    ------
+    EquilibriumError
+        If no equilibrium is found in the pose.
+    """
+    ends = np.array([before.ends, pose.ends])[:, : 2 * model.node.dimension]
+    frames = np.array([before.frames, pose.frames])
+    # Of frames half a turn apart the increment is of any length.
+    turned = min(float(np.abs(model.node.difference(*frames)).max()), 2 * np.pi)
+    moved = float(np.abs(np.diff(ends, axis=0)).max()) / model.cable.length
+    count = int(np.ceil(max(turned / MOST_TURNED, moved / MOST_MOVED, 1.0)))
+    for k in range(1, count):
+        share = np.array([k / count])
+        start, end = (ends[0] + share * (ends[1] - ends[0])).reshape(2, -1)
+        held = [
+            model.node.interpolated(share, np.arange(2.0), way)[0] for way in frames.swapaxes(0, 1)
+        ]
+        with suppress(EquilibriumError):  # the way may lead out of reach
+            x = solve_equilibrium(model, p, rest, pose.moved(start, end, held), x_init=x).x
+    return solve_equilibrium(model, p, rest, pose, x_init=x)
 
 
 def _from_start(

@@ -403,13 +403,12 @@ class CableModel:
         d, b = self.node.dimension, self.node.increment
         place, first, last, _ = ca.vertsplit(self._deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
         declared = EndConditions.of(self._ends, self.node)
-        if END_ROLL in self.names:
-            # The material axes of an untwisted cable at the end, against the clamp's.
-            roll = self._p[self.names.index(END_ROLL)]
-            declared = declared.rolled(roll)
         ends = declared.changed(end=declared.end + place).turned(first, last)
         for effect, local in self._filling(BoundaryEffect):
             ends = effect.conditions(ends, local)
+        if END_ROLL in self.names:
+            # The material axes of an untwisted cable at the end, against the clamp's.
+            ends = ends.rolled(self._p[self.names.index(END_ROLL)])
         return ends
 
     @cached_property

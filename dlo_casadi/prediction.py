@@ -123,6 +123,7 @@ class PredictedShape:
             "moment_on_start": float(eq.moments[0]),
             "moment_on_end": float(eq.moments[1]),
             "min_bend_radius": eq.min_bend_radius,
+            "tipping": eq.tipping,
             "points": self.points(count).tolist(),
         }
 

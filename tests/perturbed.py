@@ -5,22 +5,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from dlo_casadi.assembly import DEVIATIONS, Assembly, Directions, Given, Shapes
+from dlo_casadi.assembly import Assembly, Directions, Given, Shapes, deviation_names
 
 FloatArray = np.ndarray
 
 
 def any_shapes(a: Assembly, m: int = 1, scale: float = 0.4) -> Shapes:
-    """Headings, multipliers and deviations of m poses without any symmetry."""
+    """Nodes, multipliers and deviations of m poses without any symmetry."""
     rng = np.random.default_rng(0)
-    x = rng.normal(scale=scale, size=(m, a.n, a.node.coordinates))
-    lam, deviation = rng.normal(size=(m, a.k)), rng.normal(scale=0.01, size=(m, len(DEVIATIONS)))
+    x = a.node.moved(np.array(a.node.identity), rng.normal(scale=scale, size=(m, a.n, a.b)))
+    lam = rng.normal(size=(m, a.k))
+    deviation = rng.normal(scale=0.01, size=(m, len(deviation_names(a.node))))
     return Shapes(x, lam, deviation)
 
 
 def any_rest(a: Assembly, m: int = 1) -> FloatArray:
-    """Rest curvatures (m, n_cells) [1/m]."""
-    return np.random.default_rng(1).normal(size=(m, a.chain.n_cells))
+    """Rest curvatures (m, n_rests) [1/m]."""
+    return np.random.default_rng(1).normal(size=(m, a.chain.n_rests))
 
 
 def directions(a: Assembly, m: int, *names: str) -> Directions:
@@ -29,8 +30,8 @@ def directions(a: Assembly, m: int, *names: str) -> Directions:
         "x": a.n * a.b,
         "lam": a.k,
         "p": len(a.model.parameters),
-        "rest": a.chain.n_cells,
-        "deviation": len(DEVIATIONS),
+        "rest": a.chain.n_rests,
+        "deviation": len(deviation_names(a.node)),
     }
     q = sum(rows[name] for name in names)
     parts, used = {}, 0

@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from perturbed import any_rest, any_shapes, central, directions
+from scipy.spatial.transform import Rotation
 
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.effects import (
@@ -38,27 +39,50 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.model import CableModel
+from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 # Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).
 POSE = Pose((0.1, 0.05), (0.5, -0.1), 0.4, -0.2, camera_center=(0.6, -0.4, 2.0)).vector
+IN_SPACE = replace(CABLE, torsional_stiffness=0.03)
+POSE_IN_SPACE = Pose(
+    (0.1, 0.05, -0.2),
+    (0.5, -0.1, 0.1),
+    start_orientation=(0.1, -0.2, 0.3, 0.9),
+    end_orientation=(-0.3, 0.1, 0.2, 0.9),
+).vector
+GRAVITY = {"plane": (1.0, -9.7), "space": (1.0, 0.5, -9.7)}
 SLOTS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
 UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad"}
 EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
+WHERE = (*(("plane", e) for e in ELEMENTS), *(("space", e) for e in ELEMENTS_IN_SPACE))
+CASES = [
+    (name, where, element)
+    for where, element in WHERE
+    for name, kind in sorted(EFFECTS.items())
+    if getattr(kind, f"in_{where}")
+]
+EVERYWHERE = pytest.mark.parametrize(("name", "where", "element"), CASES)
 
 
 @cache
-def plain(name: str, element: str) -> CableModel:
+def plain(name: str, where: str, element: str) -> CableModel:
     """Model without the effect, with the boundaries that it needs."""
-    held = "clamped" if name == "clamp_angle" else "pinned"
-    return CableModel(CABLE, n=5, element=element, start=held, end=held, gravity=(1.0, -9.7))
+    held = "pinned" if where == "plane" and name != "clamp_angle" else "clamped"
+    cable = CABLE if where == "plane" else IN_SPACE
+    return CableModel(cable, 5, element, held, held, GRAVITY[where])
 
 
 @cache
-def with_effect(name: str, element: str) -> CableModel:
-    return plain(name, element).with_effect(EFFECTS[name]())
+def with_effect(name: str, where: str, element: str) -> CableModel:
+    return plain(name, where, element).with_effect(EFFECTS[name]())
+
+
+def own_indices(model: CableModel) -> list[int]:
+    """Where the parameters of effects stand."""
+    return [i for i, name in enumerate(model.names) if "." in name]
 
 
 def own_parameters(model: CableModel, values: str) -> np.ndarray:
@@ -67,16 +91,16 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
     p = model.nominal.copy()
     if values == "nominal":
         return p
-    for i, q in enumerate(model.parameters[1:], start=1):
+    for i in own_indices(model):
+        q = model.parameters[i]
         moved = q.nominal + q.scale * rng.uniform(0.3, 0.8)
         p[i] = np.clip(moved, q.lower, q.upper)
     return p
 
 
-def posed(
-    model: CableModel, p: np.ndarray, headings: str = "random", pose: np.ndarray = POSE
-) -> tuple[Shapes, Given]:
+def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[Shapes, Given]:
     """One pose, straight and unloaded or without any symmetry."""
+    pose = POSE_IN_SPACE if model.in_space else POSE
     a, scale = model.assembly, 0.0 if headings == "straight" else 1.0
     shapes = any_shapes(a, scale=1.5 * scale)
     given = Given.of(p, scale * any_rest(a)[0], pose[None])
@@ -90,7 +114,7 @@ def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[
     a, (shapes, given) = model.assembly, posed(model, p, headings)
     total, slope, matrix = a.balance(shapes, given)
     along = directions(a, 1, "x", "lam", "p", "rest", "deviation")
-    kept = ~along.p[0, 1:].any(axis=0)
+    kept = ~along.p[0, own_indices(model)].any(axis=0)
     curve, after = a.curve_slopes(shapes, given), a.state_after(shapes, given)
     return {
         "Lagrangian": total,
@@ -117,8 +141,9 @@ def test_declaration(name):
     assert isinstance(effect, Effect)
     assert (effect.name, effect.label) == (name, name)
     assert effect.slot in SLOTS
-    declared = effect.parameters(CABLE)
+    declared = effect.parameters(CABLE if effect.in_plane else IN_SPACE)
     assert declared
+    assert effect.in_plane or effect.in_space
     for q in declared:
         assert q.unit in UNITS, f"{q.name}: unit {q.unit!r}"
         assert np.isfinite(q.nominal)
@@ -127,13 +152,12 @@ def test_declaration(name):
     assert len({q.name for q in declared}) == len(declared)
 
 
-@EVERY
-@ALL
+@EVERYWHERE
 @pytest.mark.parametrize("headings", ["straight", "random"])
 @pytest.mark.parametrize("values", ["nominal", "off"])
-def test_gradients_and_hessians_are_finite(name, element, headings, values):
+def test_gradients_and_hessians_are_finite(name, where, element, headings, values):
     """No sqrt(0), atan2(0, 0) or 0/0 in the Lagrangian, its Hessian, or the derivatives by p."""
-    model = with_effect(name, element)
+    model = with_effect(name, where, element)
     p = own_parameters(model, values)
     shapes, given = posed(model, p, headings)
     blocks = outputs(model, p, headings)
@@ -144,11 +168,10 @@ def test_gradients_and_hessians_are_finite(name, element, headings, values):
         assert np.all(np.isfinite(block)), what
 
 
-@EVERY
-@ALL
-def test_no_effect_at_nominal_values(name, element):
+@EVERYWHERE
+def test_no_effect_at_nominal_values(name, where, element):
     """Balance, Hessian, measured curve and state are those of the model without the effect."""
-    model, bare = with_effect(name, element), plain(name, element)
+    model, bare = with_effect(name, where, element), plain(name, where, element)
     with_it, without = outputs(model, model.nominal), outputs(bare, bare.nominal)
     if model.n_springs:
         with_it["gradient"] = with_it["gradient"][:, : without["gradient"].shape[1]]
@@ -158,10 +181,9 @@ def test_no_effect_at_nominal_values(name, element):
         np.testing.assert_allclose(block, without[what], rtol=1e-11, atol=1e-11, err_msg=what)
 
 
-@EVERY
-@ALL
-def test_every_effect_does_something(name, element):
-    model, bare = with_effect(name, element), plain(name, element)
+@EVERYWHERE
+def test_every_effect_does_something(name, where, element):
+    model, bare = with_effect(name, where, element), plain(name, where, element)
     with_it = outputs(model, own_parameters(model, "off"))
     without = outputs(bare, bare.nominal)
     missing = with_it["gradient"].shape[1] - without["gradient"].shape[1]
@@ -170,11 +192,10 @@ def test_every_effect_does_something(name, element):
     assert max(np.abs(with_it[what] - without[what]).max() for what in felt) > 1e-4
 
 
-@EVERY
-@ALL
-def test_derivatives_by_parameters_against_finite_differences(name, element):
+@EVERYWHERE
+def test_derivatives_by_parameters_against_finite_differences(name, where, element):
     """Of the balance, the measured curve and the state."""
-    model = with_effect(name, element)
+    model = with_effect(name, where, element)
     a, (shapes, given) = model.assembly, posed(model, own_parameters(model, "off"))
     along = directions(a, 1, "p")
     d = np.array([1e-5 * (q.nominal if q.log else q.scale) for q in model.parameters])
@@ -199,23 +220,32 @@ def test_derivatives_by_parameters_against_finite_differences(name, element):
         assert np.all(np.abs(found - exact) < 1e-6 * size + 1e-14 / d), what
 
 
-ELASTIC = sorted(k for k, kind in EFFECTS.items() if issubclass(kind, SectionLaw | Kinematics))
+ELASTIC = [case for case in CASES if issubclass(EFFECTS[case[0]], SectionLaw | Kinematics)]
 
 
-@pytest.mark.parametrize("name", ELASTIC)
-@ALL
-def test_elastic_effects_do_not_feel_rigid_motion(name, element):
+@pytest.mark.parametrize(("name", "where", "element"), ELASTIC)
+def test_elastic_effects_do_not_feel_rigid_motion(name, where, element):
     """Board, gravity and cable turned together by 1.1 rad and moved: the same energy and shape."""
-    model = with_effect(name, element)
-    angle, shift = 1.1, np.array([0.3, -0.7])
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    model = with_effect(name, where, element)
+    d, c = model.node.dimension, model.node.coordinates
+    rotation = Rotation.from_rotvec(1.1 * np.array([0.0, 0.0, 1.0] if d == 2 else [0.6, 0.0, 0.8]))
+    turn, shift = rotation.as_matrix()[:d, :d], np.array([0.3, -0.7, 0.2])[:d]
+
+    def turned_nodes(x):
+        if d == 2:
+            return x + 1.1
+        turned = rotation * Rotation.from_quat(x.reshape((-1, c)))
+        return turned.as_quat().reshape(x.shape)
+
     gravity = tuple(float(g) for g in turn @ np.array(model.gravity))
     turned = replace(model, gravity=gravity)
     p = own_parameters(model, "off")
-    start, end = POSE[:2], POSE[2:4]
-    pose = np.concatenate([turn @ start + shift, turn @ end + shift, POSE[4:6] + angle, POSE[6:]])
     shapes, given = posed(model, p)
-    there = Shapes.declared(shapes.x + angle, shapes.lam @ turn.T)
+    start, end, frames, sight = np.split(given.poses[0], [d, 2 * d, 2 * (d + c)])
+    pose = np.concatenate([turn @ start + shift, turn @ end + shift, turned_nodes(frames), sight])
+    lam = shapes.lam.copy()  # multipliers of clamps are about the frames' own axes
+    lam[:, :d] = lam[:, :d] @ turn.T
+    there = Shapes.declared(turned_nodes(shapes.x), lam)
     moved = replace(given, poses=pose[None])
     a, b = model.assembly, turned.assembly
     fall = -CABLE.mass * np.array(gravity) @ shift  # the weight has been moved, too
@@ -322,12 +352,14 @@ def test_a_soft_tether_to_a_far_anchor_is_a_point_force():
     )
 
 
+@pytest.mark.parametrize("cable", [CABLE, IN_SPACE], ids=["plane", "space"])
 @pytest.mark.parametrize("name", sorted(k for k, kind in EFFECTS.items() if issubclass(kind, Load)))
-def test_nothing_hangs_beyond_the_end(name):
+def test_nothing_hangs_beyond_the_end(name, cable):
     """What a spread load pulls at the part beyond s falls to zero at the end."""
     effect, s = EFFECTS[name](), ca.SX.sym("s")
-    params = {q.name: ca.SX(q.nominal + 0.5 * q.scale) for q in effect.parameters(CABLE)}
-    force = effect.resultant(s, ca.SX(ca.DM([1.0, -9.0])), CABLE, params)
+    params = {q.name: ca.SX(q.nominal + 0.5 * q.scale) for q in effect.parameters(cable)}
+    gravity = ca.SX(ca.DM([1.0, -9.0, 2.0][: len(cable.axes)]))
+    force = effect.resultant(s, gravity, cable, params)
     at_end = ca.substitute(ca.SX(force), s, CABLE.length)
     np.testing.assert_allclose(number(at_end), 0.0, atol=1e-14)
 
@@ -490,14 +522,22 @@ def test_drift_moves_the_rest_curvature_towards_the_bend():
     np.testing.assert_allclose(number(after), [1.5, -1.0], rtol=1e-14)
 
 
-def test_a_plastic_set_is_what_a_bend_exceeds_the_yield_by():
+@pytest.mark.parametrize("axes", [1, 2])
+def test_a_plastic_set_is_what_a_bend_exceeds_the_yield_by(axes):
+    """In its direction; of a vector, by its size."""
     bend = np.array([-7.0, -3.0, -1.0, 0.0, 1.0, 3.0, 7.0])
-    rest = ca.SX(ca.DM(np.linspace(-1.0, 2.0, 7)))
+    direction = np.array([[1.0], [0.6, 0.8]][axes - 1])
 
     def left(limit):
         params = {"yield_curvature": ca.SX(limit), "share": ca.SX(0.25)}
-        after = PlasticSet().next_rest(rest, rest + ca.DM(bend), CABLE, params)
-        return number(after - rest)
+        rest = ca.SX(ca.DM([0.4, -0.7][:axes]))
+        laws = (
+            PlasticSet().next_rest(rest, rest + ca.DM(k * direction), CABLE, params) for k in bend
+        )
+        moved = np.array([number(law - rest) for law in laws]).reshape((len(bend), axes))
+        along = moved @ direction
+        np.testing.assert_allclose(moved, np.outer(along, direction), atol=1e-14)
+        return along
 
     excess = np.sign(bend) * np.maximum(np.abs(bend) - 2.0, 0.0)
     # Kinks rounded over d = 0.01 turns per length: d^2 / (4 |x|) = 0.0015 1/m at x = 1 1/m from

@@ -143,17 +143,19 @@ def impossible_values(experiment: Experiment, length: float) -> Iterator[Problem
         ):
             yield Problem(place, f"std: {message}")
     # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
-    cable = EffectsCable(length, 1.0, 1.0, 1.0)
+    in_space = len(experiment.gravity) == 3
+    cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=1.0 if in_space else None)
+    declared = experiment.tolerances.model_dump()
     taken_up = {
         kind.tolerances[q.name]: q
         for kind in EFFECTS.values()
         for q in kind().parameters(cable)
-        if q.name in kind.tolerances
+        if kind.tolerances.get(q.name) in declared
     }
     for key, q in taken_up.items():
         most = min(q.upper - q.nominal, q.nominal - q.lower)
         for place, message in Range(_FINEST_TOLERANCE, most, q.unit).problems(
-            (*at, "tolerances", key), getattr(experiment.tolerances, key)
+            (*at, "tolerances", key), declared[key]
         ):
             yield Problem(place, f"tolerances.{key}: {message}")
     for i, pose in enumerate(experiment.poses):

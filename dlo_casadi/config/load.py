@@ -147,6 +147,8 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
             wrong("a clamped end needs an end_heading [rad], continuous along the cable")
         if held.end != "free" and pose.end is None:
             wrong(f"a {held.end} end needs its position: end: [x, y]")
+        if pose.branch == "previous" and i == 0:
+            wrong("the first pose continues none; branch: ccw or cw?", key="branch")
         if held.end == "free":
             for key in ("end", "end_heading"):
                 if getattr(pose, key) is not None:

@@ -294,8 +294,8 @@ class Pose(Section):
     """Direction of the cable in a clamped end, continuous along the cable [rad]."""
     role: Literal["fit", "held_out"] = "fit"
     """fit, or held_out to check the prediction."""
-    branch: Literal["ccw", "cw"] | None = None
-    """Which way the cable turns from start to end, where several equilibria exist."""
+    branch: Literal["ccw", "cw", "previous"] | None = None
+    """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
 
     @property
     def name(self) -> str:

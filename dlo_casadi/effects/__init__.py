@@ -1,8 +1,11 @@
 """Effects: the explicit list of what a configuration or the diagnosis may name."""
 
 from dlo_casadi.effects.axial_stretch import AxialStretch
+from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening
+from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamp_angle import ClampAngle
+from dlo_casadi.effects.clamp_rotation import ClampRotation
 from dlo_casadi.effects.edge_bias import EdgeBias
 from dlo_casadi.effects.effect import (
     BoundaryEffect,
@@ -26,6 +29,7 @@ from dlo_casadi.effects.image_distortion import ImageDistortion
 from dlo_casadi.effects.image_scale import ImageScale
 from dlo_casadi.effects.length_error import LengthError
 from dlo_casadi.effects.lumped_mass import LumpedMass
+from dlo_casadi.effects.mass_error import MassError
 from dlo_casadi.effects.plastic_set import PlasticSet
 from dlo_casadi.effects.point_force import PointForce
 from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
@@ -45,20 +49,24 @@ EFFECTS: dict[str, type[Effect]] = {
         Tether,
         SideLoad,
         GravityTilt,
+        MassError,
         StiffnessGradient,
         StiffSection,
         BendingSoftening,
+        BendingAnisotropy,
         AxialStretch,
         LengthError,
         StartSpring,
         EndSpring,
         ClampAngle,
+        ClampRotation,
         EndOffset,
         RestCurvatureDrift,
         PlasticSet,
         ImageScale,
         ImageDistortion,
         StandoffError,
+        CameraFrame,
     )
 }
 
@@ -75,10 +83,13 @@ __all__ = [
     "EFFECTS",
     "NUISANCES",
     "AxialStretch",
+    "BendingAnisotropy",
     "BendingSoftening",
     "BoundaryEffect",
     "Cable",
+    "CameraFrame",
     "ClampAngle",
+    "ClampRotation",
     "EdgeBias",
     "Effect",
     "EndConditions",
@@ -92,6 +103,7 @@ __all__ = [
     "LengthError",
     "Load",
     "LumpedMass",
+    "MassError",
     "MeasurementEffect",
     "PlasticSet",
     "PointForce",

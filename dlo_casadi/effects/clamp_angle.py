@@ -12,7 +12,55 @@ from dlo_casadi.parameters import Parameter
 
 
 @dataclass(frozen=True)
-class ClampAngle(BoundaryEffect):
+class ClampTurn(BoundaryEffect):
+    """True minus declared direction of the clamps, the same in all poses.
+
+    Parameters
+    ----------
+    start, end : bool
+        Which of the ends are clamped.
+    """
+
+    # Parameters of one clamp, behind the name of its end.
+    errors: ClassVar[tuple[str, ...]]
+
+    start: bool = True
+    end: bool = True
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the errors of the clamped ends."""
+        held = [side for side, used in (("start", self.start), ("end", self.end)) if used]
+        return tuple(
+            Parameter(f"{side}_{error}", "rad", scale=0.05, lower=-0.9, upper=0.9)
+            for side in held
+            for error in self.errors
+        )
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where an end is clamped."""
+        return super().applies(setup) and "clamped" in (setup.start, setup.end)
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """With the errors of those ends that are clamped."""
+        return cls(start=setup.start == "clamped", end=setup.end == "clamped")
+
+    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
+        """Without a clamp it has no parameters."""
+        if self.start or self.end:
+            return super().refusal(setup, values)
+        return (
+            "it turns a clamp, and no end is clamped. "
+            "Try: experiment.boundary, with start or end clamped"
+        )
+
+    def may_be(self, found: Fitted) -> bool:
+        """A local effect beside a clamp may be the clamp's."""
+        return (self.start and found.near_start) or (self.end and found.near_end)
+
+
+class ClampAngle(ClampTurn):
     """True minus declared heading of the clamps, the same in all poses.
 
         heading' = heading + heading_error
@@ -24,41 +72,9 @@ class ClampAngle(BoundaryEffect):
     """
 
     name = "clamp_angle"
+    in_space = False
+    errors = ("heading_error",)
     tolerances: ClassVar = {"start_heading_error": "heading", "end_heading_error": "heading"}
-
-    start: bool = True
-    end: bool = True
-
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
-        """Declare the errors of the clamped ends."""
-        held = [side for side, used in (("start", self.start), ("end", self.end)) if used]
-        return tuple(
-            Parameter(f"{side}_heading_error", "rad", scale=0.05, lower=-0.9, upper=0.9)
-            for side in held
-        )
-
-    @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """Where an end is clamped."""
-        return "clamped" in (setup.start, setup.end)
-
-    @classmethod
-    def made_for(cls, setup: Setup) -> Self:
-        """With the errors of those ends that are clamped."""
-        return cls(start=setup.start == "clamped", end=setup.end == "clamped")
-
-    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
-        """Without a clamp it has no parameters."""
-        if self.start or self.end:
-            return ""
-        return (
-            "it turns a clamp, and no end is clamped. "
-            "Try: experiment.boundary, with start or end clamped"
-        )
-
-    def may_be(self, found: Fitted) -> bool:
-        """A local effect beside a clamp may be the clamp's."""
-        return (self.start and found.near_start) or (self.end and found.near_end)
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Turn the clamps."""

@@ -36,6 +36,7 @@ class EdgeBias(MeasurementEffect):
     """
 
     name = "edge_bias"
+    in_space = False
     shown: ClassVar = False
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
@@ -47,7 +48,7 @@ class EdgeBias(MeasurementEffect):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where there are photographs."""
-        return setup.pixel is not None
+        return super().applies(setup) and setup.pixel is not None
 
     def prior(self, setup: Setup) -> dict[str, float]:
         """A share of a pixel for each coefficient; none without pixels."""

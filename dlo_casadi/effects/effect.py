@@ -69,6 +69,11 @@ class Cable:
         return 2 * pi / self.length
 
 
+def vector(params: Params, prefix: str) -> ca.SX:
+    """Vector (dimension,) of the parameters `prefix`x, `prefix`y and in space `prefix`z."""
+    return ca.vertcat(*(params[prefix + axis] for axis in "xyz" if prefix + axis in params))
+
+
 @dataclass(frozen=True)
 class PointForceAt:
     """A dead force (dimension,) [N] on the cable at the arc length `position` [m]."""
@@ -138,6 +143,9 @@ class Effect:
     inverses: ClassVar[Mapping[str, tuple[str, str]]] = {}
     # Whether tables of parameters show it while it is a nuisance.
     shown: ClassVar[bool] = True
+    # Whether there is such an effect on a cable in a plane, and on one in space.
+    in_plane: ClassVar[bool] = True
+    in_space: ClassVar[bool] = True
 
     label: str = ""
 
@@ -156,7 +164,7 @@ class Effect:
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Whether the effect makes sense in a setup, and measurements there can show it."""
-        return True
+        return cls.in_space if setup.in_space else cls.in_plane
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
@@ -165,7 +173,13 @@ class Effect:
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
         """Why it cannot be declared with these values, and what to try; empty if it can."""
-        return ""
+        if self.in_space if setup.in_space else self.in_plane:
+            return ""
+        own, other = ("a plane", "space") if setup.in_space else ("space", "a plane")
+        return (
+            f"it is of cables in {own}, and gravity has {len(setup.gravity)} numbers: the cable is "
+            f"in {other}. Try: without it, or experiment.gravity"
+        )
 
     def prior(self, setup: Setup) -> dict[str, float]:
         """Standard deviations of what is known of it before any shape; empty where nothing is."""
@@ -201,7 +215,10 @@ class Effect:
 
 
 class SectionLaw(Effect):
-    """Slot `section`: how much the section resists bending. Section laws multiply."""
+    """Slot `section`: how much the section resists bending. Section laws multiply.
+
+    In space the factor is on the energy of the twist, too.
+    """
 
     slot: ClassVar[str] = "section"
     # Whether the law is the same all along the cable.
@@ -217,7 +234,7 @@ class SectionLaw(Effect):
         cell : Cell
             From where to where it reaches.
         """
-        raise TypeError(f"{self.name} has no section law")
+        return ca.SX(1)
 
     def bending(self, stiffness: ca.SX, params: Params) -> ca.SX:
         """Bending stiffness (2, 2) [N m^2] of a cable in space about its material axes y and z."""
@@ -280,6 +297,33 @@ class Load(Effect):
         return ()
 
 
+@dataclass(frozen=True)
+class LoadAcrossGravity(Load):
+    """A load with as many components as there are directions across gravity: one, in space two.
+
+    Parameters
+    ----------
+    vertical : "x", "y" or "z", optional
+        The world's axis that gravity is most along, in space; z where nobody tells. Components
+        are named after the two others.
+    """
+
+    vertical: str = ""
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """With the axis that gravity is most along."""
+        if not setup.in_space:
+            return cls()
+        return cls(vertical="xyz"[int(np.argmax(np.abs(setup.gravity)))])
+
+    def components(self, name: str, cable: Cable) -> tuple[str, ...]:
+        """Names of a parameter's components: in a plane it is a single number."""
+        if len(cable.axes) == 2:
+            return (name,)
+        return tuple(f"{name}_{axis}" for axis in "xyz" if axis != (self.vertical or "z"))
+
+
 class PointLoad(Load):
     """A load at one place of the cable, its parameter `position` [m]."""
 
@@ -339,10 +383,13 @@ class StateEffect(Effect):
     slot: ClassVar[str] = "state"
 
     def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
-        """Rest curvature [1/m] of a cell after a pose of this curvature has been held."""
+        """Rest curvature (axes,) [1/m] of a cell after a pose of this curvature has been held.
+
+        One number in a plane; in space curvatures about the material axes y and z.
+        """
         raise TypeError(f"{self.name} has no law of the state")
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where the rest curvature is free to move, from one pose to another."""
-        return setup.n_poses > 1 and setup.curved
+        return super().applies(setup) and setup.n_poses > 1 and setup.curved

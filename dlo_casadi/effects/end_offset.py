@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import casadi as ca
-
-from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params
+from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params, vector
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
@@ -23,22 +21,22 @@ class EndOffset(BoundaryEffect):
     """
 
     name = "end_offset"
-    tolerances: ClassVar = {"dx": "end", "dy": "end"}
+    tolerances: ClassVar = {"dx": "end", "dy": "end", "dz": "end"}
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the offset."""
         bound = 0.3 * cable.length
         scale = 0.002 * cable.length
         return tuple(
-            Parameter(axis, "m", scale=scale, lower=-bound, upper=bound)
-            for axis in (f"d{name}" for name in cable.axes)
+            Parameter(f"d{axis}", "m", scale=scale, lower=-bound, upper=bound)
+            for axis in cable.axes
         )
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where the end is held."""
-        return setup.end != "free"
+        return super().applies(setup) and setup.end != "free"
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Move the end fixture."""
-        return ends.changed(end=ends.end + ca.vertcat(*params.values()))
+        return ends.changed(end=ends.end + vector(params, "d"))

@@ -25,6 +25,8 @@ class _PinSpring(BoundaryEffect):
         Direction in which the spring is relaxed.
     """
 
+    in_space = False
+
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare stiffness and relaxed heading."""
         scale = cable.bending_stiffness / cable.length
@@ -45,7 +47,7 @@ class StartSpring(_PinSpring):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where the start is a pin."""
-        return setup.start == "pinned"
+        return super().applies(setup) and setup.start == "pinned"
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
         """Look about the cable's mean heading at the start."""
@@ -68,7 +70,7 @@ class EndSpring(_PinSpring):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where the end is a pin."""
-        return setup.end == "pinned"
+        return super().applies(setup) and setup.end == "pinned"
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
         """Look about the cable's mean heading at the end."""

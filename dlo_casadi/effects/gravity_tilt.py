@@ -1,31 +1,41 @@
-"""Gravity turned against the board frame."""
+"""Gravity turned against the frame of the measurement."""
 
 from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.effects.effect import Cable, LoadAcrossGravity, Params
 from dlo_casadi.parameters import Parameter
+from dlo_casadi.rod.node import rotated, rotation
 
 
-class GravityTilt(Load):
-    """The board does not hang plumb: gravity is turned by `angle` for every weight.
+class GravityTilt(LoadAcrossGravity):
+    """The board or the robot does not stand plumb: gravity is turned for every weight.
 
         g' = R(angle) g
 
+    In space R is that of a rotation vector with two components: about the world's axes that
+    gravity is not most along.
+
     Parameters
     ----------
-    angle : scalar [rad]
-        Counter-clockwise; vanishes at 0; at most half a radian.
+    angle; in space angle_x, angle_y (or x, z; y, z) : scalar [rad]
+        Counter-clockwise; vanish at 0; at most half a radian.
     """
 
     name = "gravity_tilt"
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
-        """Declare the angle."""
-        return (Parameter("angle", "rad", scale=0.05, lower=-0.5, upper=0.5),)
+        """Declare the angles."""
+        return tuple(
+            Parameter(name, "rad", scale=0.05, lower=-0.5, upper=0.5)
+            for name in self.components("angle", cable)
+        )
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
-        """Turn gravity counter-clockwise by the angle."""
-        c, s = ca.cos(params["angle"]), ca.sin(params["angle"])
-        return ca.vertcat(c * gravity[0] - s * gravity[1], s * gravity[0] + c * gravity[1])
+        """Turn gravity counter-clockwise."""
+        if "angle" in params:
+            c, s = ca.cos(params["angle"]), ca.sin(params["angle"])
+            return ca.vertcat(c * gravity[0] - s * gravity[1], s * gravity[0] + c * gravity[1])
+        turn = ca.vertcat(*(params.get(f"angle_{axis}", ca.SX(0)) for axis in "xyz"))
+        return rotated(rotation(turn), gravity)

@@ -34,6 +34,7 @@ class ImageDistortion(MeasurementEffect):
     """
 
     name = "image_distortion"
+    in_space = False
 
     center: tuple[float, float] = (0.0, 0.0)
 
@@ -44,7 +45,7 @@ class ImageDistortion(MeasurementEffect):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where there are photographs."""
-        return setup.center is not None
+        return super().applies(setup) and setup.center is not None
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:

@@ -22,6 +22,7 @@ class ImageScale(MeasurementEffect):
     """
 
     name = "image_scale"
+    in_space = False
     tolerances: ClassVar = {"factor": "scale"}
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:

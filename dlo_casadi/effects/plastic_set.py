@@ -19,10 +19,10 @@ class PlasticSet(StateEffect):
     """After each pose a share of what the bend exceeds a yield curvature by has become rest shape.
 
         b = kappa - kappa_0
-        kappa_0 <- kappa_0 + share (max(b - y, 0) - max(-b - y, 0))
+        kappa_0 <- kappa_0 + share max(|b| - y, 0) b / |b|
 
-    At y = 0 it is a drift of the rest curvature. The kinks are rounded over a hundredth of a turn
-    per length, smoothly and oddly in b.
+    with the size |b| of the bend; in space it is a vector. At y = 0 it is a drift of the rest
+    curvature. The kink is rounded over a hundredth of a turn per length, smoothly and oddly in b.
 
     Parameters
     ----------
@@ -53,11 +53,14 @@ class PlasticSet(StateEffect):
         return tuple({"yield_curvature": share * bend} for share in YIELDS)
 
     def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
-        """Rest curvature after the pose [1/m]."""
-        delta = _ROUNDING * cable.curvature_scale
+        """Rest curvature after the pose [1/m].
 
-        def ramp(x: ca.SX) -> ca.SX:
-            return (x + ca.sqrt(x * x + delta**2)) / 2
-
+        With the kinks rounded, (ramp(|b| - y) - ramp(-|b| - y)) / |b| is 1 - 2 y / (S_- + S_+),
+        S = sqrt((|b| -+ y)^2 + d^2): written in |b|^2, which is smooth at 0.
+        """
         bend, limit = curvature - rest, params["yield_curvature"]
-        return rest + params["share"] * (ramp(bend - limit) - ramp(-bend - limit))
+        square, level = ca.sumsqr(bend), limit**2
+        rounding = (_ROUNDING * cable.curvature_scale) ** 2
+        product = ca.sqrt((square - level) ** 2 + 2 * rounding * (square + level) + rounding**2)
+        both = ca.sqrt(2 * (square + level + rounding + product))
+        return rest + params["share"] * (1 - 2 * limit / both) * bend

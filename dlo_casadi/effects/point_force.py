@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
+from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad, vector
 from dlo_casadi.parameters import Parameter
 
 
@@ -36,9 +36,4 @@ class PointForce(PointLoad):
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force."""
-        return (
-            PointForceAt(
-                ca.vertcat(*(params[f"f{axis}"] for axis in "xyz" if f"f{axis}" in params)),
-                params["position"],
-            ),
-        )
+        return (PointForceAt(vector(params, "f"), params["position"]),)

@@ -35,6 +35,7 @@ class StandoffError(MeasurementEffect):
     """
 
     name = "standoff_error"
+    in_space = False
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the distance."""
@@ -43,12 +44,12 @@ class StandoffError(MeasurementEffect):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where it is known from where the photographs were taken."""
-        return setup.camera
+        return super().applies(setup) and setup.camera
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
         """Without a camera there are no rays."""
         if setup.camera:
-            return ""
+            return super().refusal(setup, values)
         return (
             "it is a shift along the rays of a calibrated camera, and none is declared. "
             "Try: measurement.camera, or image_scale"

@@ -47,7 +47,7 @@ class StiffSection(SectionLaw):
         """A section has a length."""
         start, end = values["start"], values["end"]
         if start < end:
-            return ""
+            return super().refusal(setup, values)
         return (
             f"it starts at {start:g} m and ends at {end:g} m from the start of the cable, "
             "which leaves no section between. Try: start smaller than end"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import casadi as ca
-import numpy as np
 
-from dlo_casadi.effects.effect import Cable, Effect, Params, PointLoad, SpringAt
+from dlo_casadi.effects.effect import Cable, Effect, Params, PointLoad, SpringAt, vector
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
@@ -29,7 +29,7 @@ class Tether(PointLoad):
         Vanishes at 0; at most a thousand of the cable's weights on Earth per length.
     position : scalar [m], in [0, L]
         Arc length s from the start fixture. r(s) is once differentiable in s.
-    anchor_x, anchor_y : scalar [m]
+    anchor_x, anchor_y (, anchor_z) : scalar [m]
         The fixed point a in the board frame, at most ten lengths of the cable from its origin.
     """
 
@@ -43,19 +43,21 @@ class Tether(PointLoad):
             _stiffness(cable),
             self.position(cable),
             *(
-                Parameter(name, "m", scale=0.1 * cable.length, lower=-reach, upper=reach)
-                for name in ("anchor_x", "anchor_y")
+                Parameter(
+                    f"anchor_{axis}", "m", scale=0.1 * cable.length, lower=-reach, upper=reach
+                )
+                for axis in cable.axes
             ),
         )
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """In one pose it is a point force."""
-        return setup.n_poses > 1
+        return super().applies(setup) and setup.n_poses > 1
 
     def springs(self, params: Params) -> tuple[SpringAt, ...]:
         """The spring."""
-        k, anchor = params["stiffness"], ca.vertcat(params["anchor_x"], params["anchor_y"])
+        k, anchor = params["stiffness"], vector(params, "anchor_")
         return (SpringAt(k, k * anchor, k * ca.sumsqr(anchor) / 2, params["position"]),)
 
     def linear(self) -> Effect:
@@ -64,16 +66,11 @@ class Tether(PointLoad):
 
     def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
         """Stiffness, place and anchor a = f / k; k is raised where a would lie too far away."""
-        force = np.array([values["fx"], values["fy"]])
-        least = float(np.hypot(*force)) / (FARTHEST * cable.length)
+        force = {axis: values[f"f{axis}"] for axis in cable.axes}
+        least = math.hypot(*force.values()) / (FARTHEST * cable.length)
         stiffness = max(values["stiffness"], least)
-        anchor = force / stiffness if stiffness > 0 else np.zeros(2)
-        return {
-            "stiffness": stiffness,
-            "position": values["position"],
-            "anchor_x": float(anchor[0]),
-            "anchor_y": float(anchor[1]),
-        }
+        anchor = {f"anchor_{axis}": f / stiffness if f else 0.0 for axis, f in force.items()}
+        return {"stiffness": stiffness, "position": values["position"], **anchor}
 
 
 class _LinearTether(PointLoad):
@@ -92,14 +89,13 @@ class _LinearTether(PointLoad):
         return (
             _stiffness(cable),
             self.position(cable),
-            Parameter("fx", "N", scale=scale),
-            Parameter("fy", "N", scale=scale),
+            *(Parameter(f"f{axis}", "N", scale=scale) for axis in cable.axes),
         )
 
     def springs(self, params: Params) -> tuple[SpringAt, ...]:
         """The spring, its energy up to a constant."""
-        force = ca.vertcat(params["fx"], params["fy"])
-        return (SpringAt(params["stiffness"], force, ca.SX(0), params["position"]),)
+        spring = SpringAt(params["stiffness"], vector(params, "f"), ca.SX(0), params["position"])
+        return (spring,)
 
 
 def _stiffness(cable: Cable) -> Parameter:

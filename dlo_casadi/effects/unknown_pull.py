@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
+from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad, vector
 from dlo_casadi.parameters import Parameter
 
 
@@ -43,6 +43,5 @@ class UnknownPull(PointLoad):
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force of this pose."""
-        axes = [name[1:] for name in params if name.startswith("f")]
-        force = ca.vertcat(*(params[f"f{axis}"] + params[f"pull_{axis}"] for axis in axes))
+        force = vector(params, "f") + vector(params, "pull_")
         return (PointForceAt(force, params["position"]),)

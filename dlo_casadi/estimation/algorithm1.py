@@ -303,7 +303,7 @@ class InnerProblem:
 
     def first_guess(self, pose: Pose, target: _Target) -> FloatArray:
         """Arc through both ends on the pose's branch, or nearer to the measured points."""
-        sides = {"ccw": (1,), "cw": (-1,), None: (1, -1)}[pose.branch]
+        sides = {"ccw": (1,), "cw": (-1,)}.get(pose.branch or "", (1, -1))
         arcs = [
             arc_headings(self.chain.places, self.chain.length, np.zeros(2), target.end, side)
             for side in sides

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Shapes
-from dlo_casadi.equilibrium import solve_equilibrium
+from dlo_casadi.equilibrium import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
 from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
@@ -198,8 +198,13 @@ def carried_shapes(problem: BatchProblem, start: Fit) -> Shapes:
             k = known[index]
             rows.append((own.x[k], own.lam[k], own.deviation[k]))
             continue
+        pose = problem.history[index].pose
         try:
-            found = solve_equilibrium(start.model, start.p, start.rest, problem.history[index].pose)
+            if pose.branch == "previous" and rows:
+                before = problem.history[index - 1].pose
+                found = continued(start.model, start.p, start.rest, pose, before, rows[-1][0])
+            else:
+                found = solve_equilibrium(start.model, start.p, start.rest, pose)
         except EquilibriumError as error:
             raise EstimationError(error.message) from error
         rows.append((found.x, found.multipliers, np.zeros(len(start.model.deviation_names))))

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given
-from dlo_casadi.equilibrium import NEARBY, Branch, Equilibrium, Pose, solve_equilibrium
+from dlo_casadi.equilibrium import (
+    NEARBY,
+    Branch,
+    Equilibrium,
+    Pose,
+    PoseBranch,
+    continued,
+    solve_equilibrium,
+)
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.curve import NodeCurve
@@ -46,12 +55,12 @@ class MeasuredBranch:
     prediction : Prediction
         Solved from the measured shape: no prediction any more, but what one would be if it knew
         the branch.
-    branch : "ccw", "cw" or None
+    branch : "ccw", "cw", "previous" or None
         What the pose has to name for this equilibrium to be predicted; None if no name does.
     """
 
     prediction: Prediction
-    branch: Branch | None
+    branch: PoseBranch | None
 
 
 def predict_poses(
@@ -63,7 +72,8 @@ def predict_poses(
 ) -> list[Prediction | None]:
     """Predict poses in the order in which they are taken; None where there is no equilibrium.
 
-    Of several equilibria the stable one of lowest energy, unless the pose names a branch.
+    Of several equilibria the stable one of lowest energy, unless the pose names a branch, or
+    continues the last one before it that has an equilibrium.
 
     Parameters
     ----------
@@ -74,12 +84,17 @@ def predict_poses(
         Nodes from which a pose is solved instead, whichever branch that leads to.
     """
     out: list[Prediction | None] = []
+    last: tuple[Pose, FloatArray] | None = None
     for pose, start in zip(poses, starts or [None] * len(poses), strict=True):
         try:
-            eq = solve_equilibrium(model, p, rest, pose, x_init=start)
+            if start is None and last is not None and pose.branch == "previous":
+                eq = continued(model, p, rest, pose, *last)
+            else:
+                eq = solve_equilibrium(model, p, rest, pose, x_init=start)
         except EquilibriumError:
             out.append(None)
             continue
+        last = pose, eq.x
         shapes, given = eq.shapes, Given.of(p, rest, pose.vector[None])
         z = model.assembly.curve(shapes, given)[0]
         out.append(Prediction(eq, NodeCurve.of(model.cable.length, z), rest))
@@ -88,14 +103,14 @@ def predict_poses(
     return out
 
 
-def measured_branches(
+def measured_elsewhere(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
     measured: Sequence[MeasuredPose],
     predictions: Sequence[Prediction | None],
-) -> list[MeasuredBranch | None]:
-    """Poses that were measured in another stable equilibrium than the predicted one; else None.
+) -> list[Prediction | None]:
+    """Stable equilibria in which poses were measured, where others are predicted; else None.
 
     Each pose is solved from its measured shape. It is another equilibrium where headings differ,
     and the measured one where it is nearer to the points.
@@ -107,19 +122,37 @@ def measured_branches(
         for item in measured
     ]
     solved = predict_poses(model, p, rest, [item.pose for item in measured], starts)
+    return [
+        found
+        if item.readable
+        and known is not None
+        and found is not None
+        and found.equilibrium.stable
+        and not model.node.same(known.equilibrium.x, found.equilibrium.x, NEARBY)
+        and _square(found, item) < _square(known, item)
+        else None
+        for item, known, found in zip(measured, predictions, solved, strict=True)
+    ]
+
+
+def measured_branches(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    measured: Sequence[MeasuredPose],
+    predictions: Sequence[Prediction | None],
+) -> list[MeasuredBranch | None]:
+    """What `measured_elsewhere` finds, with the branch that a pose has to name for it."""
+    others = measured_elsewhere(model, p, rest, measured, predictions)
     out: list[MeasuredBranch | None] = []
-    for item, known, found in zip(measured, predictions, solved, strict=True):
-        other = None
-        if (
-            item.readable
-            and known is not None
-            and found is not None
-            and found.equilibrium.stable
-            and not model.node.same(known.equilibrium.x, found.equilibrium.x, NEARBY)
-            and _square(found, item) < _square(known, item)
-        ):
-            other = MeasuredBranch(found, _name_of(model, p, item.pose, found))
-        out.append(other)
+    last: tuple[Pose, FloatArray] | None = None
+    for item, known, found in zip(measured, predictions, others, strict=True):
+        branch = None
+        if found is not None:
+            branch = MeasuredBranch(found, _name_of(model, p, item.pose, found, last))
+        out.append(branch)
+        there = found or known
+        last = last if there is None else (item.pose, there.equilibrium.x)
     return out
 
 
@@ -128,11 +161,18 @@ def _square(prediction: Prediction, item: MeasuredPose) -> float:
     return float((item.distances(prediction.curve) ** 2).mean())
 
 
-def _name_of(model: CableModel, p: FloatArray, pose: Pose, found: Prediction) -> Branch | None:
-    """The branch that a pose has to name for an equilibrium to be predicted; none in space."""
-    if model.in_space:
-        return None
-    names: tuple[Branch, Branch] = ("ccw", "cw")
+def _name_of(
+    model: CableModel,
+    p: FloatArray,
+    pose: Pose,
+    found: Prediction,
+    last: tuple[Pose, FloatArray] | None,
+) -> PoseBranch | None:
+    """The branch that a pose has to name for an equilibrium to be predicted.
+
+    `last` is the pose before it and its nodes (n_nodes, coordinates), as measured.
+    """
+    names: tuple[Branch, ...] = () if model.in_space else ("ccw", "cw")
     for name in names:
         try:
             eq = solve_equilibrium(model, p, found.rest, replace(pose, branch=name))
@@ -140,6 +180,11 @@ def _name_of(model: CableModel, p: FloatArray, pose: Pose, found: Prediction) ->
             continue
         if model.node.same(eq.x, found.equilibrium.x, NEARBY):
             return name
+    if last is not None:
+        with suppress(EquilibriumError):
+            eq = continued(model, p, found.rest, pose, *last)
+            if model.node.same(eq.x, found.equilibrium.x, NEARBY):
+                return "previous"
     return None
 
 

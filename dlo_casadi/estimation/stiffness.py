@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
 
@@ -34,8 +34,8 @@ class StiffnessFit:
 def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> StiffnessFit:
     """Least squares of the distances of all fit points over EI, the cable straight at rest.
 
-    The equilibria are followed from the prior stiffness along the decades, so that each is on
-    the branch that prediction would choose there.
+    The equilibria are followed from the prior stiffness along the decades, each on the branch that
+    prediction would choose there, or on that on which the pose was measured.
     """
     used = [item for item in measured if item.readable and not item.held_out]
     sweep = Sweep(model, [item.pose for item in used])
@@ -81,9 +81,11 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
             shapes, total = follow(shapes, log_ei - direction * min(k, 1) * step, log_ei)
             grid[log_ei] = (shapes, total)
     best = min(grid, key=lambda q: grid[q][1])
+    # On the way there some may have lost the branch on which they were measured.
+    near = _cold(model, at(best), rest, used) or grid[best][0]
 
     def cost(log_ei: float) -> float:
-        return follow(grid[best][0], best, log_ei)[1]
+        return follow(near, best, log_ei)[1]
 
     found = minimize_scalar(
         cost, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-3}
@@ -99,10 +101,12 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
 def _cold(
     model: CableModel, p: FloatArray, rest: FloatArray, used: Sequence[MeasuredPose]
 ) -> Shapes | None:
-    """Stable equilibria of lowest energy, or None if one is missing."""
+    """Stable equilibria as predicted or measured, or None if one is missing."""
     predictions = predict_poses(model, p, rest, [item.pose for item in used])
+    others = measured_elsewhere(model, p, rest, used, predictions)
     x, lam = [], []
-    for prediction in predictions:
+    for known, other in zip(predictions, others, strict=True):
+        prediction = other or known
         if prediction is None:
             return None
         x.append(prediction.equilibrium.x)

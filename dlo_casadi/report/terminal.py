@@ -21,7 +21,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     StageName,
 )
-from dlo_casadi.thresholds import APART, NOTABLE
+from dlo_casadi.thresholds import APART, EITHER, NOTABLE
 
 # Parts of the run in the order in which they are done.
 TIMED = {
@@ -489,7 +489,11 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("energy", f"{shape['energy']:.6g} J"))
     rows.append(("smallest bend radius", _mm(shape["min_bend_radius"])))
     stable = "yes" if shape["stable"] else "NO: the cable would not stay there"
-    return [*rows, ("stable", stable)]
+    rows.append(("stable", stable))
+    if shape["tipping"] is not None and shape["tipping"] < EITHER:
+        turned = f"equally low with the clamp turned by {shape['tipping']:.2g} rad"
+        rows.append(("also stable", f"falling to the other side, {turned}"))
+    return rows
 
 
 def plus_minus(value: float, std: float) -> str:

@@ -23,23 +23,15 @@ import numpy as np
 
 from dlo_casadi.rod.arc import Arc
 from dlo_casadi.rod.element import Condensed, Element, Law, Layout, Slot, Stiffness
-from dlo_casadi.rod.node import Frame, conjugate, quaternion_product, rotated
+from dlo_casadi.rod.node import SINE, Frame, conjugate, quaternion_product, rotated, series
 
 # Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
 _GAUSS = 0.5 / np.sqrt(3)
 # asin(x) / x in powers of x^2. Of a quarter of the half angle of an element that turns by a
 # quarter turn, x = 0.2, what is left out is 1e-13.
 _ARCSINE = tuple(factorial(2 * k) / (4**k * factorial(k) ** 2 * (2 * k + 1)) for k in range(8))
-# sin(x) / x and (1 - cos x) / x^2 in powers of x^2, to 1e-15 for x = 0.8: half of a quarter turn.
-_SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(7))
+# (1 - cos x) / x^2 in powers of x^2: to 2e-15 for x = 0.785, half of a quarter turn.
 _COSINE = tuple((-1) ** k / factorial(2 * k + 2) for k in range(7))
-
-
-def _series(coefficients: Sequence[float], y: ca.SX) -> ca.SX:
-    total = ca.SX(coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        total = coefficient + y * total
-    return total
 
 
 class Helix(Element):
@@ -66,7 +58,7 @@ class Helix(Element):
             cosine = ca.sqrt((1 + w) / 2)
             vector, w = vector / (2 * cosine), cosine
             halves.append((vector, w))
-        phi = 8 * _series(_ARCSINE, ca.sumsqr(vector)) * vector
+        phi = 8 * series(_ARCSINE, ca.sumsqr(vector)) * vector
         half, w = halves[0]
         middle = quaternion_product(ca.vertsplit(first), (*ca.vertsplit(half), w))
         return ca.vertcat(*middle, phi)
@@ -130,7 +122,7 @@ def _turned(phi: ca.SX, x: ca.SX | float) -> ca.SX:
     """exp(x phi) e_x."""
     a = x * phi
     y = ca.sumsqr(a)
-    sine, cosine = _series(_SINE, y), _series(_COSINE, y)
+    sine, cosine = series(SINE, y), series(_COSINE, y)
     # a x e_x = (0, a_z, -a_y), a x (a x e_x) = a a_x - |a|^2 e_x.
     return ca.vertcat(
         1 + cosine * (a[0] * a[0] - y),

@@ -24,7 +24,7 @@ from dlo_casadi.session.plausibility import (
     repeated,
     suspicions,
 )
-from dlo_casadi.thresholds import CONTRADICTS, MUCH_BETTER, OUT_OF_STEP
+from dlo_casadi.thresholds import CONTRADICTS, FITS, MUCH_BETTER, OUT_OF_STEP
 
 FloatArray = NDArray[np.floating]
 
@@ -113,7 +113,8 @@ def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
     """
     poses = config.experiment.poses
     points = {item.name: item.points for item in inputs if len(item.points)}
-    lines = _lines(config, points)
+    known = {item.name: item.s for item in inputs if item.s is not None}
+    lines = _lines(config, points, known)
     if config.experiment.measurement.kind == "images" and config.experiment.boundary.end != "free":
         fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
         sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
@@ -121,22 +122,40 @@ def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
         if len(doubtful) > 1:
             again = {pose.name: line_without_end(config, pose) for pose in doubtful}
             points |= {name: line for name, line in again.items() if line is not None}
-            lines = _lines(config, points)
+            lines = _lines(config, points, known)
     return lines
 
 
-def _lines(config: Config, points: dict[str, FloatArray]) -> Lines:
+def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, FloatArray]) -> Lines:
+    """Ends and lengths of lines (K, 2), some of them markers at known arc lengths (K,)."""
+    length = config.cable.length
     poses = [pose for pose in config.experiment.poses if pose.name in points]
-    unknown = (np.nan, np.nan)
+    unknown, whole = (np.nan, np.nan), np.array([0.0, length])
+    spans = np.array([known.get(pose.name, whole)[[0, -1]] for pose in poses]).reshape(-1, 2)
+    measured = np.array(
+        [np.linalg.norm(np.diff(_sparse(points[p.name]), axis=0), axis=1).sum() for p in poses]
+    ).reshape(-1)
+    unseen = [0.0 if pose.name in known else _unseen(points[pose.name], length) for pose in poses]
+    # A single marker has no length.
+    share = np.where(spans[:, 1] > spans[:, 0], np.diff(spans)[:, 0], np.inf) / length
     return Lines(
         tuple(pose.name for pose in poses),
         np.array([(pose.start, pose.end or unknown) for pose in poses]).reshape(-1, 2, 2),
         np.array([points[pose.name][[0, -1]] for pose in poses]).reshape(-1, 2, 2),
-        np.array(
-            [np.linalg.norm(np.diff(_sparse(points[p.name]), axis=0), axis=1).sum() for p in poses]
-        ).reshape(-1),
-        config.cable.length,
+        measured / share,
+        length,
+        np.abs(spans - whole) + np.array(unseen).reshape(-1, 1),
     )
+
+
+def _unseen(points: FloatArray, length: float) -> float:
+    """Arc length [m] that points (K, 2) far apart leave to either side of them.
+
+    Zero where they are closer: the line then goes on to its fixture, up to what hides it.
+    """
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    apart = float(np.median(steps)) if len(steps) else length
+    return max(length - float(steps.sum()), 0.0) if apart > FITS * length else 0.0
 
 
 def _sparse(points: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
-from dlo_casadi.equilibrium import Branch
+from dlo_casadi.equilibrium import PoseBranch
 from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
@@ -60,12 +60,12 @@ class BranchShape:
     ----------
     rmse : float [m]
         Root mean square distance of the measured points to it.
-    branch : "ccw", "cw" or None
+    branch : "ccw", "cw", "previous" or None
         What the pose has to name for it to be predicted; None if no name does.
     """
 
     rmse: float
-    branch: Branch | None
+    branch: PoseBranch | None
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,8 @@ class PoseShape:
     stable : bool
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
+    tipping : float or None [rad]
+        See `Equilibrium`; None where the pose names its branch.
     """
 
     curve: FloatArray
@@ -98,6 +100,7 @@ class PoseShape:
     energy: float
     stable: bool
     measured_branch: BranchShape | None = None
+    tipping: float | None = None
 
 
 @dataclass(frozen=True)

@@ -65,9 +65,12 @@ class Lines:
     measured : (m, 2, 2) [m]
         The two ends of each measured line, in any order.
     lengths : (m,) [m]
-        Along each measured line, from point to point.
+        Along each measured line, from point to point; of markers so much longer as the cable is.
     length : float [m]
         Of the cable.
+    gaps : (m, 2) [m]
+        Arc lengths between the fixtures and the ends of what was measured, as far as that is to
+        be expected: of markers, and of lines whose points are far apart; else zero.
     """
 
     names: tuple[str, ...]
@@ -75,17 +78,25 @@ class Lines:
     measured: FloatArray
     lengths: FloatArray
     length: float
+    gaps: FloatArray
+
+    @property
+    def whole(self) -> bool:
+        """Whether nearly all were measured from fixture to fixture."""
+        return bool(np.mean(self.gaps.max(axis=1) < FITS * self.length) >= NEARLY_ALL)
 
     def misfit(self, measured: FloatArray, declared: FloatArray) -> FloatArray:
         """Distance of ends from fixtures over the length: the better order, RMS over both.
 
-        Shapes (..., 2, 2) and (..., 2, 2) -> (...).
+        Less the gaps that are to be expected.
+        Shapes (m, ..., 2, 2) and (..., 2, 2) -> (m, ...).
         """
+        gaps = self.gaps.reshape((len(self.gaps), *(1,) * (measured.ndim - 3), 2))
         ways = [
-            np.sqrt(np.nanmean(((ends - declared) ** 2).sum(axis=-1), axis=-1))
+            np.maximum(np.linalg.norm(ends - declared, axis=-1) - gaps, 0.0)
             for ends in (measured, measured[..., ::-1, :])
         ]
-        return np.minimum(*ways) / self.length
+        return np.minimum(*(np.sqrt(np.nanmean(way**2, axis=-1)) for way in ways)) / self.length
 
 
 def suspicions(lines: Lines) -> tuple[Suspicion, ...]:
@@ -129,7 +140,7 @@ def wrong_units(lines: Lines) -> Suspicion | None:
     declared = np.linalg.norm(np.diff(lines.declared, axis=1)[:, 0], axis=1)
     measured = np.linalg.norm(np.diff(lines.measured, axis=1)[:, 0], axis=1)
     apart = np.isfinite(declared) & (np.maximum(declared, measured) > CONTRADICTS * lines.length)
-    if apart.sum() < 2:
+    if apart.sum() < 2 or not lines.whole:
         return None
     spans = declared[apart] / np.maximum(measured[apart], 1e-12)
     for unit, size in UNITS.items():
@@ -146,7 +157,7 @@ def wrong_units(lines: Lines) -> Suspicion | None:
 def wrong_frame(lines: Lines) -> Suspicion | None:
     """Ends that fit all fixtures once the axes are turned or mirrored, or the origin is moved."""
     own = _overall(lines.misfit(lines.measured, lines.declared))
-    if own < CONTRADICTS:
+    if own < CONTRADICTS or not lines.whole:
         return None
     shifted, shift = _moved(lines, lines.measured)
     if shifted < min(FITS, MUCH_BETTER * own):

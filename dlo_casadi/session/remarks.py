@@ -11,7 +11,7 @@ from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.fitting import allowed_mesh_error
 from dlo_casadi.session.outcome import PoseInput, Stage
-from dlo_casadi.thresholds import FIXTURES, MESH_SHARE
+from dlo_casadi.thresholds import EITHER, FIXTURES, MESH_SHARE
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
@@ -50,7 +50,7 @@ def held_out_missing(
 
 
 def branch_warnings(stages: Sequence[Stage]) -> list[str]:
-    """Poses that the fitted models predict in another stable equilibrium than the measured one."""
+    """Poses predicted in another stable equilibrium than the measured one, or that may be."""
     lines = []
     for stage in stages:
         if stage.name not in ("batch", "closed"):
@@ -68,6 +68,20 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
                 f"stage {stage.name}: {', '.join(found)}: the equilibrium of lowest energy, which "
                 f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
                 f"off, on the measured branch {1e3 * measured:.3g} mm; {cure}"
+            )
+    for stage in stages[-1:]:
+        either = [
+            name
+            for name, shape in stage.shapes.items()
+            if shape.tipping is not None and shape.tipping < EITHER
+        ]
+        if either:
+            nearest = min(stage.shapes[name].tipping or 0.0 for name in either)
+            lines.append(
+                f"stage {stage.name}: {', '.join(either)}: the cable may fall to either side. Both "
+                "are stable, and the one of lower energy is predicted; with the clamp turned by "
+                f"{nearest:.2g} rad it would be the other. `branch: ccw`, `cw` or `previous` (as "
+                "in the pose before it) says which"
             )
     return lines
 

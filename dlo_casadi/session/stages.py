@@ -44,10 +44,13 @@ def pose_shape(
     curve = prediction.curve
     places = np.linspace(0.0, curve.length, _CURVE_POINTS)
     eq: Equilibrium = prediction.equilibrium
+    tipping = None if item.pose.branch else eq.tipping
     if not item.readable:
         empty = np.zeros(0)
         none = np.zeros((0, curve.d))
-        return PoseShape(curve.at(places), None, empty, none, empty, eq.energy, eq.stable)
+        return PoseShape(
+            curve.at(places), None, empty, none, empty, eq.energy, eq.stable, tipping=tipping
+        )
     s = item.nearest(curve)
     gap = item.points - curve.at(s)
     across = np.einsum("knd,kd->kn", curve.normals(s), gap)
@@ -57,7 +60,9 @@ def pose_shape(
     if other is not None:
         distances = item.distances(other.prediction.curve)
         branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)
-    return PoseShape(curve.at(places), rmse, s, gap, residual, eq.energy, eq.stable, branch)
+    return PoseShape(
+        curve.at(places), rmse, s, gap, residual, eq.energy, eq.stable, branch, tipping
+    )
 
 
 def _stage(

@@ -1,10 +1,13 @@
 """Photographs to centre-lines: arrays in, arrays out."""
 
-from dlo_casadi.vision.board import Board, locate_board
+from dlo_casadi.vision.board import Board, locate_board, locate_camera
 from dlo_casadi.vision.centerline import Centerline, extract_centerline
 from dlo_casadi.vision.image import read_image
 from dlo_casadi.vision.pictures import draw_steps, write_picture
+from dlo_casadi.vision.sight import Sight, see_cable
+from dlo_casadi.vision.space_line import SpaceLine, Views, measure_views
 from dlo_casadi.vision.view import Camera, Reference, View, from_reference
+from dlo_casadi.vision.viewpoint import Viewpoint
 from dlo_casadi.vision.workings import Workings
 
 __all__ = [
@@ -12,12 +15,19 @@ __all__ = [
     "Camera",
     "Centerline",
     "Reference",
+    "Sight",
+    "SpaceLine",
     "View",
+    "Viewpoint",
+    "Views",
     "Workings",
     "draw_steps",
     "extract_centerline",
     "from_reference",
     "locate_board",
+    "locate_camera",
+    "measure_views",
     "read_image",
+    "see_cable",
     "write_picture",
 ]

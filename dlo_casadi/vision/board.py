@@ -11,8 +11,14 @@ from numpy.typing import NDArray
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.view import Array, Camera, View
+from dlo_casadi.vision.viewpoint import Viewpoint
 
 _MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
+_LEAST_MARKERS = 3  # for the pose of a camera: fewer span no more than a line of the board
+_BEST_CORNER_PX = 0.05  # what sampling and rounding to grey levels leave of a corner at least
+_WHITE, _MUCH_WHITE = 250, 0.3  # grey level, and share of a picture that is overexposed
+_BLURRED_PX = 2.5  # standard deviation of edges from which markers of some 30 px are not read
+_SHARED = 4  # corners that share light, blur and print: those of a marker count as one
 
 
 @dataclass(frozen=True)
@@ -73,29 +79,123 @@ def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None =
             f"a standoff of {board.standoff:g} m needs a camera: without one only the board's own "
             "plane can be measured. Try: give camera.matrix, or standoff: 0."
         )
-    seen = found = _detect(image, board)
-    places = {marker: board.corners(marker) for marker in found}
-    homography, errors = _fit(found, places, board.standoff, camera)
-    majority = len(found) // 2 + 1
-    while max(errors.values()) > _MAX_ERROR_PX and len(found) > majority:
-        found, homography, errors = _without_worst(found, places, board.standoff, camera)
-    rms = float(np.sqrt(np.mean(np.square(list(errors.values())))))
-    if rms > _MAX_ERROR_PX:
-        raise VisionError(
-            f"the markers {sorted(found)} are {rms:.1f} px RMS off their declared places. "
-            "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
-            f"The picture is {image.shape[1]} x {image.shape[0]} px."
-            f"{_other_axes(seen, board, camera)}"
-        )
+    seen, repeated = _detect(image, board)
+    found, plane, rms = _agreeing(seen, image.shape, board, camera)
+    normal = np.cross(plane[:, 0], plane[:, 1])
+    raised = plane + board.standoff * np.outer(normal, [0.0, 0.0, 1.0])
     return View(
-        homography,
+        raised,
         (image.shape[0], image.shape[1]),
         camera,
         rms,
         np.array(list(found.values())),
         tuple(sorted(found)),
-        tuple(sorted(set(seen) - set(found))),
+        tuple(sorted((set(seen) - set(found)) | repeated)),
     )
+
+
+def locate_camera(image: NDArray[np.uint8], board: Board, camera: Camera) -> Viewpoint:
+    """Find the board and return where the camera stands before it.
+
+    The pose (R, t) minimises the reprojection error of all corners of all visible markers.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8
+        The photograph.
+    board : Board
+        Markers; the standoff does not count.
+    camera : Camera
+        Intrinsic matrix and distortion.
+
+    Raises
+    ------
+    VisionError
+        If fewer than three of the board's markers are seen where they are declared.
+    """
+    seen, repeated = _detect(image, board)
+    messages = [
+        f"marker {n} is seen more than once and not used. Try: cover or remove the copy."
+        for n in sorted(repeated)
+    ]
+    if len(seen) < _LEAST_MARKERS:
+        raise VisionError(
+            f"the camera's place needs {_LEAST_MARKERS} markers of the board, and "
+            f"{'only ' if seen else ''}{sorted(seen)} of {sorted(board.marker_centers)} are seen. "
+            "Try: a photograph with the whole board in it, sharp and not covered."
+            + _spoilt(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+            + "".join(f" The {message[:1].lower()}{message[1:]}" for message in messages)
+        )
+    found, plane, rms = _agreeing(seen, image.shape, board, camera)
+    for n in sorted(set(board.marker_centers) - set(found) - repeated):
+        why = "is not where it is declared" if n in seen else "is not found"
+        messages.append(f"marker {n} {why}; {len(found)} of {len(board.marker_centers)} are used")
+    if len(found) < _LEAST_MARKERS:
+        raise VisionError(
+            f"the camera's place needs {_LEAST_MARKERS} markers of the board where they are "
+            f"declared, and only {sorted(found)} of {sorted(seen)} are. Try: marker_centers?"
+        )
+    rotation = np.column_stack([plane[:, :2], np.cross(plane[:, 0], plane[:, 1])])
+    corners = np.vstack([board.corners(n) for n in found])
+    return Viewpoint(
+        camera,
+        rotation,
+        plane[:, 2],
+        (image.shape[0], image.shape[1]),
+        _pose_covariance(corners @ rotation[:, :2].T + plane[:, 2], rms, camera),
+        rms,
+        np.array(list(found.values())),
+        tuple(sorted(found)),
+        tuple(messages),
+    )
+
+
+def _agreeing(
+    seen: dict[int, Array], shape: tuple[int, ...], board: Board, camera: Camera | None
+) -> tuple[dict[int, Array], Array, float]:
+    """Markers that agree with their declared places, the board's plane and their RMS error [px].
+
+    Raises
+    ------
+    VisionError
+        If there is none, or if more than half of them contradict their declared places.
+    """
+    if not seen:
+        raise VisionError(
+            "every marker of the board is seen more than once. Try: cover or remove the copies."
+        )
+    found = seen
+    places = {marker: board.corners(marker) for marker in found}
+    plane, errors = _fit(found, places, camera)
+    majority = len(found) // 2 + 1
+    while max(errors.values()) > _MAX_ERROR_PX and len(found) > majority:
+        found, plane, errors = _without_worst(found, places, camera)
+    rms = float(np.sqrt(np.mean(np.square(list(errors.values())))))
+    if rms > _MAX_ERROR_PX:
+        raise VisionError(
+            f"the markers {sorted(found)} are {rms:.1f} px RMS off their declared places. "
+            "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
+            f"The picture is {shape[1]} x {shape[0]} px."
+            f"{_other_axes(seen, board, camera)}"
+        )
+    return found, plane, rms
+
+
+def _pose_covariance(at: Array, rms: float, camera: Camera) -> Array:
+    """Covariance (6, 6) [rad, m] of a pose from corners (K, 3) [m] in the camera's frame.
+
+    4 (J^T J)^-1 s^2 with the corners' own scatter s^2 = sum / (2 K - 6): corners of a marker err
+    together. On rendered boards poses are off by up to five times what sixteen independent
+    corners would leave.
+    """
+    still = np.zeros(3)
+    slopes = cv2.projectPoints(at, still, still, camera.matrix, camera.distortion)[1]
+    by_shift = np.asarray(slopes[:, 3:6], float).reshape(-1, 2, 3)
+    by_turn = np.cross(at[:, None, :], by_shift)
+    J = np.concatenate([by_turn, by_shift], axis=2).reshape(-1, 6)
+    free = 2 * len(at) - 6
+    scatter = max(rms**2 * len(at) / free, _BEST_CORNER_PX**2)
+    return np.asarray(np.linalg.inv(J.T @ J) * scatter * _SHARED)
 
 
 # Mistakes in marker_centers: what was written -> the board's axes, x right and y up.
@@ -114,14 +214,14 @@ def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) ->
     for what, axes in _AXES.items():
         centers = {n: axes @ np.asarray(board.marker_centers[n], float) for n in found}
         turned = replace(board, marker_centers=centers)
-        _, errors = _fit(found, {n: turned.corners(n) for n in found}, board.standoff, camera)
+        _, errors = _fit(found, {n: turned.corners(n) for n in found}, camera)
         if len(found) > 1 and max(errors.values()) < _MAX_ERROR_PX:
             return f" With {what} in marker_centers they fit."
     return ""
 
 
-def _detect(image: NDArray[np.uint8], board: Board) -> dict[int, Array]:
-    """Corners (4, 2) [px] of the board's markers, refined to sub-pixel."""
+def _detect(image: NDArray[np.uint8], board: Board) -> tuple[dict[int, Array], set[int]]:
+    """Corners (4, 2) [px] of the board's markers, and the numbers that are seen more than once."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:
         known = ", ".join(sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_"))[:6])
@@ -129,23 +229,43 @@ def _detect(image: NDArray[np.uint8], board: Board) -> dict[int, Array]:
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
     found = _markers(detector, grey)
-    ours = {n: _refine(grey, q) for n, q in found.items() if n in board.marker_centers}
+    ours = {n: quads for n, quads in found.items() if n in board.marker_centers}
     if not ours:
         other = f"only markers {sorted(found)}" if found else "no marker at all"
         raise VisionError(
             f"board not found: {other} of {board.dictionary} in the picture, but the board has "
             f"{sorted(board.marker_centers)}. Try: the right dictionary; markers flat, in focus, "
             f"inside the picture, with a white margin (mean brightness {grey.mean():.0f} of 255)."
-            f"{_mirrored(detector, grey, board)}"
+            f"{_spoilt(grey)}{_mirrored(detector, grey, board)}"
         )
-    return ours
+    single = {n: _refine(grey, quads[0]) for n, quads in ours.items() if len(quads) == 1}
+    return single, set(ours) - set(single)
 
 
-def _markers(detector: cv2.aruco.ArucoDetector, grey: NDArray[np.uint8]) -> dict[int, Array]:
-    """Corners (4, 2) [px] of all markers by their numbers."""
+def _markers(detector: cv2.aruco.ArucoDetector, grey: NDArray[np.uint8]) -> dict[int, list[Array]]:
+    """Corners (4, 2) [px] of all markers by their numbers, once for each time one is seen."""
     quads, numbers, _ = detector.detectMarkers(grey)
-    seen = [] if numbers is None else [int(n) for n in numbers.ravel()]
-    return {n: q.reshape(4, 2) for n, q in zip(seen, quads, strict=True)}
+    found: dict[int, list[Array]] = {}
+    for number, quad in zip([] if numbers is None else numbers.ravel(), quads, strict=True):
+        found.setdefault(int(number), []).append(quad.reshape(4, 2))
+    return found
+
+
+def _spoilt(grey: NDArray[np.uint8]) -> str:
+    """Sentence for a photograph that is overexposed or blurred.
+
+    A step of the height h blurred by the standard deviation s is nowhere steeper than
+    h / (s sqrt(2 pi)).
+    """
+    white = float(np.mean(grey >= _WHITE))
+    if white > _MUCH_WHITE:
+        return f" The picture is overexposed: {100 * white:.0f} % of it are white; less light."
+    step = float(np.subtract(*np.percentile(grey, [99.0, 1.0])))
+    slope = np.hypot(*np.gradient(grey.astype(np.float32)))
+    blur = step / (np.sqrt(2 * np.pi) * max(float(np.percentile(slope, 99.9)), 1e-3))
+    if blur > _BLURRED_PX:
+        return f" The picture is blurred: no edge is sharper than {blur:.0f} px."
+    return ""
 
 
 def _mirrored(detector: cv2.aruco.ArucoDetector, grey: NDArray[np.uint8], board: Board) -> str:
@@ -198,9 +318,9 @@ def _meet(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
 
 
 def _fit(
-    found: dict[int, Array], places: dict[int, Array], standoff: float, camera: Camera | None
+    found: dict[int, Array], places: dict[int, Array], camera: Camera | None
 ) -> tuple[Array, dict[int, float]]:
-    """Homography of the cable's plane and, per marker, the RMS error [px]."""
+    """Homography of the board's plane ([r_1, r_2, t] with a camera), errors per marker [px]."""
     pixels = np.vstack(list(found.values()))
     points = np.vstack([places[marker] for marker in found])
     if camera is None:
@@ -211,7 +331,7 @@ def _fit(
         _, rotation, shift = _pose(solid, pixels, camera)
         projected = cv2.projectPoints(solid, rotation, shift, camera.matrix, camera.distortion)[0]
         axes = cv2.Rodrigues(rotation)[0]
-        homography = np.column_stack([axes[:, :2], shift.ravel() + standoff * axes[:, 2]])
+        homography = np.column_stack([axes[:, :2], shift.ravel()])
     miss = np.sum((projected.reshape(-1, 4, 2) - pixels.reshape(-1, 4, 2)) ** 2, axis=2)
     return homography, dict(zip(found, np.sqrt(miss.mean(axis=1)), strict=True))
 
@@ -236,13 +356,13 @@ def _pose(solid: Array, pixels: Array, camera: Camera) -> tuple[float, Array, Ar
 
 
 def _without_worst(
-    found: dict[int, Array], places: dict[int, Array], standoff: float, camera: Camera | None
+    found: dict[int, Array], places: dict[int, Array], camera: Camera | None
 ) -> tuple[dict[int, Array], Array, dict[int, float]]:
     """Leave out the marker without which the others agree best."""
     trials = []
     for marker in found:
         rest = {n: q for n, q in found.items() if n != marker}
-        homography, errors = _fit(rest, places, standoff, camera)
+        homography, errors = _fit(rest, places, camera)
         trials.append((max(errors.values()), rest, homography, errors))
     _, rest, homography, errors = min(trials, key=lambda trial: trial[0])
     return rest, homography, errors

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.errors import VisionError
+from dlo_casadi.vision.ordering import Course
 from dlo_casadi.vision.search import find_cable
 from dlo_casadi.vision.trace import Trace, trace_cable
 from dlo_casadi.vision.view import Array, View
@@ -18,6 +19,7 @@ _SPACING = 0.0025  # m
 _MOST_POINTS = 400
 _FAR = 0.2  # of the length: a line that ends so far from a fixture in the picture is not the cable
 _LEAST = 0.2  # of the length: what must be measured
+_AROUND = 0.3  # of the length: how far beyond its reach other cables are looked for, in a plane
 _DOUBTFUL = 0.8  # confidence below which a user is told why
 _SHORT = 0.97  # of the length: a line that ends at both fixtures and is shorter is not to scale
 
@@ -89,13 +91,92 @@ def extract_centerline(
     """
     first = np.asarray(start, float)
     last = None if end is None else np.asarray(end, float)
-    plane = rectify(image, view, start=first, end=last, diameter=diameter, length=length)
-    workings = workings or Workings()
+    measured = measure_line(
+        image, view, first, last, diameter, Course(length, length), workings or Workings()
+    )
+    trace, kept, gaps, seen = measured.trace, measured.kept, measured.gaps, measured.seen
+    points = trace.points[kept]
+    return Centerline(
+        points,
+        trace.std[kept],
+        view.to_pixels(points),
+        min(1.0, seen / length),
+        gaps,
+        measured.confidence,
+        (
+            *_gap_messages(trace, kept, gaps, length),
+            *_messages(points, seen, first, last, length),
+            *measured.messages,
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class MeasuredLine:
+    """The trace of a cable and what of it counts.
+
+    Parameters
+    ----------
+    trace : Trace
+        The middle of the cable, profile by profile.
+    kept : (K,) int
+        Sound profiles, evenly spaced.
+    gaps : tuple of int
+        Indices of the kept ones after which a stretch is missing.
+    seen : scalar [m]
+        Length along the kept ones, without the gaps.
+    confidence : scalar in 0..1
+        Share of the line inside the picture that was measured soundly.
+    messages : tuple of str
+        On its width and soundness.
+    """
+
+    trace: Trace
+    kept: NDArray[np.intp]
+    gaps: tuple[int, ...]
+    seen: float
+    confidence: float
+    messages: tuple[str, ...]
+
+
+def measure_line(
+    image: NDArray[np.uint8],
+    view: View,
+    start: Array,
+    end: Array | None,
+    diameter: float,
+    course: Course,
+    workings: Workings,
+) -> MeasuredLine:
+    """Find the line in a plane, trace it, and choose the sound and evenly spaced profiles.
+
+    Raises
+    ------
+    VisionError
+        If no cable or more than one is found, or if it does not lead to the fixtures.
+    """
+    plane = rectify(
+        image,
+        view,
+        start=start,
+        end=end,
+        diameter=diameter,
+        length=course.longest,
+        margin=0.0 if course.in_space else _AROUND * course.longest,
+    )
     workings.plane = plane
     chain = find_cable(
-        plane, start=first, end=last, diameter=diameter, length=length, workings=workings
+        plane, start=start, end=end, diameter=diameter, course=course, workings=workings
     )
-    trace = trace_cable(image, view, chain.strands, start=first, end=last, diameter=diameter)
+    trace = trace_cable(
+        image,
+        view,
+        chain.strands,
+        start=start,
+        end=end,
+        diameter=diameter,
+        in_space=course.in_space,
+    )
     workings.trace = trace
 
     step = max(_SPACING, float(trace.t[-1] - trace.t[0]) / _MOST_POINTS)
@@ -104,35 +185,28 @@ def extract_centerline(
     jumps = np.diff(trace.t[kept])
     missing = jumps > max(2.5 * step, 0.5 * diameter)
     seen = float(jumps[~missing].sum())
-    if seen < _LEAST * length:
+    if seen < _LEAST * course.typical:
         raise VisionError(
             f"no cable found: a line of {chain.supported:.3f} m was found, but only {seen:.3f} m "
             f"of it look like a cable of {1e3 * diameter:.1f} mm with an edge on both sides. "
             "Try: the right diameter; a sharper photograph; a plainer background; more contrast."
         )
-    if not 0.45 * diameter < trace.width < max(1.7 * diameter, diameter + 2.5 / view.scale):
+    width = trace.shape.width
+    if not 0.45 * diameter < width < max(1.7 * diameter, diameter + 2.5 / view.scale):
         raise VisionError(
             f"no cable found: a line of {chain.supported:.3f} m was found, but it is "
-            f"{1e3 * trace.width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm. "
+            f"{1e3 * width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm. "
             "Try: the right diameter, in metres; is the cable in the picture?"
         )
-    points = trace.points[kept]
-    gaps = tuple(int(i) for i in np.nonzero(missing)[0])
-    _check_fixtures(points, view, first, last, length)
+    _check_fixtures(trace.points[kept], view, start, end, course.typical)
     confidence = float(np.clip(trace.sound.sum() / max(1, trace.inside.sum()), 0.0, 1.0))
-    return Centerline(
-        points,
-        trace.std[kept],
-        view.to_pixels(points),
-        min(1.0, seen / length),
-        gaps,
+    return MeasuredLine(
+        trace,
+        kept,
+        tuple(int(i) for i in np.nonzero(missing)[0]),
+        seen,
         confidence,
-        (
-            *_gap_messages(trace, kept, gaps, length),
-            *_messages(points, seen, first, last, length),
-            *_width_message(trace.width, diameter, 1.0 / view.scale),
-            *_confidence_message(confidence),
-        ),
+        (*_width_message(width, diameter, 1.0 / view.scale), *_confidence_message(confidence)),
     )
 
 

@@ -13,6 +13,32 @@ from dlo_casadi.vision.view import Array
 _State: TypeAlias = tuple[float, tuple[int, ...], float, float]  # cost, path, seen, total
 _BEAM = 40
 _LENGTH_TOLERANCE = 0.05  # relative; two clicked reference points are no better than this
+_TURN, _TURN_FOLDED = 2.0, 0.5  # price of a turn between strands, in diameters per rad^2
+_FOLD_REACH = 6.0  # diameters: so near to each other two strands may be those of a fold
+
+
+@dataclass(frozen=True)
+class Course:
+    """What is known of the line before it is seen.
+
+    Parameters
+    ----------
+    shortest, longest : scalar [m]
+        Its length lies between them: both are the cable's where that lies in the plane; in front
+        of it the picture may show less (a part that points to the camera) or more (a near one).
+    in_space : bool
+        Whether it may turn back sharply, as a bend seen from its side does, and pass in front of
+        other things than the board.
+    """
+
+    shortest: float
+    longest: float
+    in_space: bool = False
+
+    @property
+    def typical(self) -> float:
+        """Length [m] by which other lengths and areas are judged."""
+        return 0.5 * (self.shortest + self.longest)
 
 
 @dataclass(frozen=True)
@@ -47,18 +73,19 @@ def order_strands(
     start: Array,
     end: Array | None,
     diameter: float,
-    length: float,
+    course: Course,
 ) -> Chain | None:
-    """Find the chain of strands that explains a cable of known length best.
+    """Find the chain of strands that explains the cable best.
 
     The cost of a chain, in metres,
 
         J = -sum_strands seen (1 - p) + gaps + sum_links d (4 a^2 + 2 b^2)
-            + 0.5 L (max(0, |total / L - 1| - 0.02) / 0.05)^2
+            + 0.5 L (max(0, total / L - 1.02, 0.98 - total / S) / 0.05)^2
 
     prefers long seen stretches of the right width, short gaps, and links that go on in the
     direction of the strand: a is the difference of the turns into and out of the gap (0 on a
-    circle), b the whole turn, p = 0.8 max(0, |log(width / d)| - 0.25), at most 1/2.
+    circle), b the whole turn, p = 0.8 max(0, |log(width / d)| - 0.25), at most 1/2; S and L are
+    the shortest and the longest possible length. Where the line may fold, a turn costs d b^2 / 2.
 
     Parameters
     ----------
@@ -68,8 +95,10 @@ def order_strands(
         Their widths, relative to the cable's.
     start, end : (2,) [m]
         The fixtures; `end` is None for a free end.
-    diameter, length : scalar [m]
+    diameter : scalar [m]
         Of the cable.
+    course : Course
+        How long the line may be.
     """
     if not strands:
         return None
@@ -81,7 +110,8 @@ def order_strands(
     outwards = np.array([-_tangent(way[::-1], diameter) for way in ways])
     excess = np.abs(np.log(np.repeat(widths, 2))) - 0.25
     worth = seen * (1 - np.clip(0.8 * excess, 0.0, 0.5))
-    gap, link = _links(last, outwards, first, inwards, diameter)
+    gap, link = _links(last, outwards, first, inwards, diameter, course.in_space)
+    length = course.longest
 
     to_first = np.linalg.norm(first - start, axis=1)
     to_end = np.zeros(len(ways)) if end is None else np.linalg.norm(last - end, axis=1)
@@ -97,7 +127,8 @@ def order_strands(
         for cost, path, supported, total in states[:_BEAM]:
             tip = path[-1]
             whole = total + to_end[tip]
-            misfit = max(0.0, abs(whole / length - 1.0) - 0.02) / _LENGTH_TOLERANCE
+            off = max(whole / length - 1.0, 1.0 - whole / course.shortest)
+            misfit = max(0.0, off - 0.02) / _LENGTH_TOLERANCE
             closed = cost + to_end[tip] + 0.5 * length * misfit**2
             if best is None or closed < best[0]:
                 best = (closed, path, supported, whole)
@@ -128,7 +159,7 @@ def _tangent(line: Array, diameter: float) -> Array:
 
 
 def _links(
-    last: Array, outwards: Array, first: Array, inwards: Array, diameter: float
+    last: Array, outwards: Array, first: Array, inwards: Array, diameter: float, folds: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Gap [m] and cost [m] of going from the last point of way i to the first of way j."""
     across = first[None, :, :] - last[:, None, :]
@@ -139,10 +170,11 @@ def _links(
     turn = _wrap(heading_in - heading_out)
     before = _wrap(heading - heading_out)
     after = _wrap(heading_in - heading)
-    short = gap < 1.5 * diameter
+    short = gap < (_FOLD_REACH if folds else 1.5) * diameter
     uneven = np.where(short, 0.0, before - after)
-    cost = gap + diameter * (4 * uneven**2 + 2 * turn**2)
-    cost[(np.abs(turn) > 2.5) | (short & (np.abs(turn) > 1.0))] = np.inf
+    cost = gap + diameter * (4 * uneven**2 + (_TURN_FOLDED if folds else _TURN) * turn**2)
+    if not folds:
+        cost[(np.abs(turn) > 2.5) | (short & (np.abs(turn) > 1.0))] = np.inf
     cost[~short & ((np.abs(before) > 1.4) | (np.abs(after) > 1.4))] = np.inf
     return gap, cost
 

@@ -15,6 +15,8 @@ from dlo_casadi.vision.view import Array, View
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
 _BESIDE = 2.2  # where the surroundings begin, in blurs beyond the edge
 _BODY = 0.4  # half of the part in the middle that shows the cable's own level, in widths
+_LOCAL = 2.0  # diameters along the cable, over which steps are averaged
+_FAINT = 0.3  # of the usual step: less is no cable
 _BARE = 0.35  # share of it that no highlight reaches
 
 
@@ -144,8 +146,32 @@ def cable_direction(profiles: Profiles, trusted: NDArray[np.bool_], diameter: fl
     return fisher / np.linalg.norm(fisher)
 
 
+def local_directions(
+    profiles: Profiles, direction: Array, trusted: NDArray[np.bool_], diameter: float
+) -> Array:
+    """Weights of colours (K, 3) for a cable that passes in front of different surroundings.
+
+    Where the step from the surroundings to the cable, smoothed along it, falls below half of the
+    usual one or turns round in the common direction g, its own direction is taken, scaled to the
+    usual step h:
+
+        g_k = h d_k / |d_k|^2,  d_k the step in all colours
+    """
+    core = profiles.values[:, np.abs(profiles.offset) < 0.3 * diameter].mean(axis=1)
+    around = profiles.values[:, np.abs(profiles.offset) > 0.8 * diameter].mean(axis=1)
+    spacing = float(np.median(np.diff(profiles.t)))
+    step = gaussian_filter1d(core - around, _LOCAL * diameter / spacing, axis=0, mode="nearest")
+    usual = float(np.median((step @ direction)[trusted]))
+    size = np.sum(step**2, axis=1)
+    other = (step @ direction / usual < 0.5) & (size > (_FAINT * usual) ** 2)
+    own = usual * step / np.maximum(size, 1e-9)[:, None]
+    return np.where(other[:, None], own, direction)
+
+
 def find_edges(profiles: Profiles, direction: Array, shape: EdgeShape) -> Crossings:
     """Find both edges of every profile, and the middle between them.
+
+    The direction (3,) or (K, 3) weighs the colours.
 
     An edge is where the brightness is half-way between the cable and its surroundings, those of
     its own side and close by: a shadow that falls beside the cable changes the level of one side,
@@ -157,7 +183,9 @@ def find_edges(profiles: Profiles, direction: Array, shape: EdgeShape) -> Crossi
 
     The cable's level is the one that differs most from the surroundings, over a third of it.
     """
-    data = profiles.values @ direction
+    data = np.einsum(
+        "kmc,kc->km", profiles.values, np.broadcast_to(direction, (len(profiles.t), 3))
+    )
     centre = np.zeros(len(data))
     out = 0.5 * shape.width + _BESIDE * shape.blur
     reach = np.linspace(0.0, out, 64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import cv2
@@ -12,15 +12,17 @@ from scipy.ndimage import gaussian_filter1d
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.contrast import candidate_maps, local_contrast, thresholds
-from dlo_casadi.vision.ordering import Chain, order_strands
+from dlo_casadi.vision.ordering import Chain, Course, order_strands
 from dlo_casadi.vision.strands import find_strands
 from dlo_casadi.vision.view import Array
 from dlo_casadi.vision.workings import Workings
 from dlo_casadi.vision.workplane import WorkPlane
 
 _GOOD = -0.7  # cost per length of a cable that is seen nearly from fixture to fixture
+_GOOD_FOLDED = -0.9  # the same where a cable's length in the picture is not known beforehand
 _LEAST = 0.25  # share of the length that must be seen
 _TWIN = 0.5  # other strands this long, relative to the cable, are a second cable
+_ROOT = 3.0  # diameters: so near to the chain begins a strand that it covers twice
 _TWIN_CONTRAST = 0.6  # ... if they stand out as well, relative to the cable
 
 
@@ -43,6 +45,7 @@ class _Finding:
 
     chain: Chain
     ours: list[_Line]
+    rest: list[_Line]
     candidate: NDArray[np.float32]
     cut: float
 
@@ -53,7 +56,7 @@ def find_cable(
     start: Array,
     end: Array | None,
     diameter: float,
-    length: float,
+    course: Course,
     workings: Workings | None = None,
 ) -> Chain:
     """Try the candidate pictures in turn and keep the chain of least cost.
@@ -63,6 +66,7 @@ def find_cable(
     VisionError
         If no chain shows a quarter of the cable, or if what is left over shows a second cable.
     """
+    length = course.typical
     width_px = diameter / plane.pixel
     area_px = length * diameter / plane.pixel**2
     if plane.reachable.sum() < 2 * area_px * _LEAST:
@@ -74,6 +78,7 @@ def find_cable(
     contrast = local_contrast(plane.image, plane.reachable, width_px)
     best: _Finding | None = None
     longest = 0.0
+    good = _GOOD_FOLDED if course.in_space else _GOOD
     for candidate in candidate_maps(contrast, area_px):
         for cut in thresholds(candidate[plane.reachable], area_px):
             mask = (candidate > cut) & plane.reachable
@@ -88,15 +93,17 @@ def find_cable(
                 start=start,
                 end=end,
                 diameter=diameter,
-                length=length,
+                course=course,
             )
             if chain is not None and (best is None or chain.cost < best.chain.cost):
-                best = _Finding(chain, [lines[i] for i in chain.used], candidate, cut)
+                ours = [lines[i] for i in chain.used]
+                rest = [lines[i] for i in range(len(lines)) if i not in chain.used]
+                best = _Finding(chain, ours, rest, candidate, cut)
                 if workings is not None:
                     workings.candidate, workings.cut = candidate, cut
                     workings.lines = [line.points for line in lines]
                     workings.chosen = chain.strands
-        if best is not None and best.chain.cost < _GOOD * length:
+        if best is not None and best.chain.cost < good * min(best.chain.total, length):
             break
     if best is None or best.chain.supported < _LEAST * length:
         seen = 0.0 if best is None else best.chain.supported
@@ -107,8 +114,48 @@ def find_cable(
             "picture and in focus? start, end, length and diameter right? a background of another "
             "brightness or colour?"
         )
+    if course.in_space:
+        best = replace(best, chain=_with_folds(best, diameter))
+        if workings is not None:
+            workings.chosen = best.chain.strands
     _refuse_twins(best, plane, fixtures, diameter, length)
     return best.chain
+
+
+def _with_folds(found: _Finding, diameter: float) -> Chain:
+    """The chain, with strands inserted along which the cable goes forth and back.
+
+    Seen from its side, a bend is a strand with a free end that the cable covers twice: it begins
+    where the chain turns back, and both parts of the chain there lead into it.
+    """
+    level = float(np.median([line.level for line in found.ours]))
+    parts = list(found.chain.strands)
+    for line in found.rest:
+        if line.length < 2 * diameter or line.level < _TWIN_CONTRAST * level:
+            continue
+        whole = np.vstack(parts)
+        for way in (line.points, line.points[::-1]):
+            away = np.linalg.norm(whole - way[0], axis=1)
+            root = int(np.argmin(away))
+            free = np.linalg.norm(whole - way[-1], axis=1).min()
+            inwards = way[len(way) // 4] - way[0]
+            before = _towards(whole[: root + 1][::-1], diameter)
+            after = _towards(whole[root:], diameter)
+            # both parts of the chain lie behind the strand's beginning
+            if away[root] < _ROOT * diameter < free and max(before @ inwards, after @ inwards) < 0:
+                ends = np.cumsum([len(part) for part in parts])
+                k = int(np.searchsorted(ends, root, side="right"))
+                at = root - (int(ends[k - 1]) if k else 0)
+                split = [parts[k][: at + 1], way, way[::-1], parts[k][at + 1 :]]
+                parts[k : k + 1] = [part for part in split if len(part)]
+                break
+    return replace(found.chain, strands=tuple(parts))
+
+
+def _towards(line: Array, diameter: float) -> Array:
+    """Step (2,) [m] from the first point of a line to a point four diameters away."""
+    far = np.linalg.norm(line - line[0], axis=1) > 4 * diameter
+    return np.asarray(line[int(np.argmax(far)) if far.any() else -1] - line[0])
 
 
 def _lines(

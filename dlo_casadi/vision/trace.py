@@ -17,12 +17,13 @@ from dlo_casadi.vision.refine import (
     cable_direction,
     edge_shape,
     find_edges,
+    local_directions,
     sample_profiles,
 )
 from dlo_casadi.vision.view import Array, View
 
 _STEP = 1 / 8  # of the diameter: between profiles
-_RAW, _FINE = 0.15, 0.7  # of the diameter: average along the cable, to judge and to measure
+_RAW, FINE = 0.15, 0.7  # of the diameter: average along the cable, to judge and to measure
 _WHITE = 248  # grey level
 _FLOOR_PX = 0.06  # what the sampling and compression of a photograph leave, along centimetres
 
@@ -45,8 +46,12 @@ class Trace:
         Whether it lies in the photograph.
     glare : (K,) bool
         Whether the place of the cable is overexposed.
-    width : scalar [m]
-        Typical distance of the two edges; 0 where no edges were found.
+    direction : (3,)
+        Weights of blue, green and red by which most of the cable stands out.
+    shape : EdgeShape
+        Typical width and blur; a width of 0 where no edges were found.
+    width_std : scalar [m]
+        Scatter of the width along the line.
     """
 
     t: Array
@@ -55,7 +60,9 @@ class Trace:
     sound: NDArray[np.bool_]
     inside: NDArray[np.bool_]
     glare: NDArray[np.bool_]
-    width: float
+    direction: Array
+    shape: EdgeShape
+    width_std: float
 
 
 def trace_cable(
@@ -66,11 +73,13 @@ def trace_cable(
     start: Array,
     end: Array | None,
     diameter: float,
+    in_space: bool = False,
 ) -> Trace:
     """Lay a smooth curve through the strands and move it onto the middle between the edges.
 
     Two rounds on nearly raw profiles tell which of them show the cable; a last one measures on
-    profiles that are averaged along the cable, over sound ones only.
+    profiles that are averaged along the cable, over sound ones only. In space the cable may pass in
+    front of things of several colours.
     """
     curve, t = _first_curve(strands, diameter, start, end)
     bright = image.astype(np.float32)
@@ -80,7 +89,8 @@ def trace_cable(
         usual = profiles.inside
     if usual.sum() < 8:
         return _nothing(curve, t, profiles.inside)
-    direction = cable_direction(profiles, usual, diameter)
+    common = cable_direction(profiles, usual, diameter)
+    direction = local_directions(profiles, common, usual, diameter) if in_space else common
     guess = EdgeShape(diameter, 0.8 / view.scale)
     for _ in range(2):
         raw = sample_profiles(bright, view, curve, t, diameter)
@@ -95,13 +105,16 @@ def trace_cable(
         usual = sound
     raw = sample_profiles(bright, view, curve, t, diameter)
     rough = find_edges(average(raw, raw.inside, _RAW * diameter), direction, shape)
-    fine = find_edges(average(raw, sound, _FINE * diameter), direction, shape)
+    fine = find_edges(average(raw, sound, FINE * diameter), direction, shape)
     sound = _without_rims(
         raw.inside & _is_usual(rough, sound, diameter) & _is_usual(fine, sound, diameter)
     )
     points = curve.position(t) + fine.offset[:, None] * curve.normal(t)
     std = _std(rough.offset, fine.offset, sound, view)
-    return Trace(t, points, std, sound, raw.inside, _glare(raw, diameter), shape.width)
+    scatter = np.abs(fine.width[sound] - shape.width)
+    width_std = 1.4826 * float(np.median(scatter)) if len(scatter) else 0.0
+    glare = _glare(raw, diameter)
+    return Trace(t, points, std, sound, raw.inside, glare, common, shape, width_std)
 
 
 def _glare(profiles: Profiles, diameter: float) -> NDArray[np.bool_]:
@@ -113,7 +126,8 @@ def _glare(profiles: Profiles, diameter: float) -> NDArray[np.bool_]:
 def _nothing(curve: SmoothCurve, t: Array, inside: NDArray[np.bool_]) -> Trace:
     """Trace without a sound profile."""
     none = np.zeros(len(t), bool)
-    return Trace(t, curve.position(t), np.zeros(len(t)), none, inside, none, 0.0)
+    at = curve.position(t)
+    return Trace(t, at, np.zeros(len(t)), none, inside, none, np.zeros(3), EdgeShape(0.0, 0.0), 0.0)
 
 
 def _first_curve(
@@ -187,7 +201,7 @@ def _std(rough: Array, fine: Array, sound: NDArray[np.bool_], view: View) -> Arr
     deviation = 2.0 / _STEP
     weight = gaussian_filter1d(sound.astype(float), deviation)
     spread = gaussian_filter1d(np.where(sound, rough - fine, 0.0) ** 2, deviation)
-    scatter = np.sqrt(spread / np.maximum(weight, 1e-6) * _RAW / _FINE)
+    scatter = np.sqrt(spread / np.maximum(weight, 1e-6) * _RAW / FINE)
     corners = max(1, 4 * len(view.markers))
     board = 1.5 * view.reprojection_error / np.sqrt(corners)
     return np.sqrt(scatter**2 + (_FLOOR_PX**2 + board**2) / view.scale**2)

@@ -37,6 +37,11 @@ class Camera:
         object.__setattr__(self, "matrix", np.asarray(self.matrix, float).reshape(3, 3))
         object.__setattr__(self, "distortion", np.asarray(self.distortion, float).ravel())
 
+    @property
+    def focal(self) -> float:
+        """Focal length [px], the mean of both axes."""
+        return float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
+
     def distort(self, rays: Array) -> Array:
         """Pixels (K, 2) at which undistorted normalised rays (K, 2) are seen."""
         if not len(rays):

@@ -21,7 +21,6 @@ _LONGEST_SIDE = 32767
 _LEAST_PIXELS = 8
 """Sides of a photograph, shrunk until the cable is CABLE_PX wide: below, nothing of it is left."""
 
-_AROUND = 0.3  # of the length: how far beyond its reach other cables are looked for
 _MARKER_MARGIN = 1.45  # of the marker: its white margin is one cell of six or more
 
 
@@ -66,6 +65,7 @@ def rectify(
     end: Array | None,
     diameter: float,
     length: float,
+    margin: float = 0.0,
 ) -> WorkPlane:
     """Resample the photograph onto the cable's plane, where the cable is `CABLE_PX` wide.
 
@@ -76,7 +76,7 @@ def rectify(
     height, width = image.shape[:2]
     reach = 1.08 * length + 2 * diameter
     centre, half = _reachable_box(start, end, reach)
-    half = half + _AROUND * length
+    half = half + margin
     lower = np.maximum(centre - half, _seen(view, np.min))
     upper = np.minimum(centre + half, _seen(view, np.max))
     size = np.maximum(upper - lower, diameter)

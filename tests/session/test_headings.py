@@ -6,9 +6,10 @@ import pytest
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.measurements import write_points
-from dlo_casadi.session.checks import without_implausible
+from dlo_casadi.session.checks import lines_of, without_implausible
 from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import read_inputs
+from dlo_casadi.session.plausibility import suspicions
 
 LENGTH = 0.8  # m
 BEGINS = (-1.1, -0.6, 0.2)  # rad, where the arcs begin
@@ -101,3 +102,17 @@ def test_points_far_apart_do_not_show_the_direction_of_a_clamp(apart, tmp_path):
     """A third of the cable on, arcs have turned by radians."""
     assert wrong_headings(*session(tmp_path, turn=13.0, apart=apart)) == ()
     assert wrong_headings(*session(tmp_path, turn=-6.0, apart=apart)) == ()
+
+
+@pytest.mark.parametrize("apart", [5, 100, 133])
+def test_lines_of_few_points_may_end_before_their_fixtures(apart, tmp_path):
+    """But no farther than what they leave of the cable."""
+    config, inputs = session(tmp_path, apart=apart)
+    assert suspicions(lines_of(config, inputs)) == ()
+
+    def elsewhere(pose, k):
+        if k == 1:
+            pose["end"] = [0.0, 0.9 * LENGTH]
+
+    (found,) = suspicions(lines_of(*session(tmp_path, elsewhere, apart=apart)))
+    assert found.pose == "arc_1"

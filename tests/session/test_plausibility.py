@@ -35,7 +35,32 @@ def session(count=9, seed=0):
     measured = declared + 5e-3 * rng.standard_normal((count, 2, 2)) / np.sqrt(2)
     measured[::2] = measured[::2, ::-1]
     lengths = LENGTH * (1 + 0.01 * rng.standard_normal(count))
-    return Lines(tuple(f"pose_{k}" for k in range(count)), declared, measured, lengths, LENGTH)
+    names = tuple(f"pose_{k}" for k in range(count))
+    return Lines(names, declared, measured, lengths, LENGTH, np.zeros((count, 2)))
+
+
+def markers(count=9):
+    """First and last marker, at 0.3 and 1.0 of cables that hang from a gripper at the origin."""
+    angle = np.linspace(-2.0, -1.1, count)
+    way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    measured = LENGTH * np.stack([0.29 * way, 0.95 * way], axis=1)
+    declared = np.full((count, 2, 2), np.nan)
+    declared[:, 0] = 0.0
+    names = tuple(f"pose_{k}" for k in range(count))
+    gaps = np.tile([0.3 * LENGTH, 0.0], (count, 1))
+    return Lines(names, declared, measured, np.full(count, LENGTH * 0.66 / 0.7), LENGTH, gaps)
+
+
+def test_markers_need_not_be_where_the_cable_ends():
+    lines = markers()
+    assert suspicions(lines) == ()
+    scaled = replace(lines, measured=1e3 * lines.measured, lengths=1e3 * lines.lengths)
+    assert "the points look like millimetres" in wrong_units(scaled).message
+    # No cable reaches farther than it is long.
+    moved = lines.measured.copy()
+    moved[4] += [0.0, -0.5 * LENGTH]
+    (found,) = suspicions(replace(lines, measured=moved))
+    assert found.pose == "pose_4"
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -1,0 +1,56 @@
+"""A camera whose frame is not quite where the robot's is."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight, vector
+from dlo_casadi.parameters import Parameter
+from dlo_casadi.rod.node import rotated, rotation
+
+_ROTATIONS = ("rotation_x", "rotation_y", "rotation_z")
+_TRANSLATIONS = ("translation_x", "translation_y", "translation_z")
+
+
+class CameraFrame(MeasurementEffect):
+    """Points are measured in a frame that is turned and shifted against that of the fixtures.
+
+        measured = start + R (true - start) + t
+
+    with R of the rotation vector (rotation_x, rotation_y, rotation_z) about the world's axes.
+
+    Parameters
+    ----------
+    rotation_x, rotation_y, rotation_z : scalar [rad]
+    translation_x, translation_y, translation_z : scalar [m]
+        Vanish at 0.
+
+    References
+    ----------
+    Hand-eye calibration, e.g. Tsai and Lenz, IEEE Trans. Robotics and Automation 5 (1989).
+    """
+
+    name = "camera_frame"
+    in_plane = False
+    tolerances: ClassVar = {
+        **dict.fromkeys(_ROTATIONS, "camera_rotation"),
+        **dict.fromkeys(_TRANSLATIONS, "camera_translation"),
+    }
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the rotation and the translation."""
+        bound, scale = 0.3 * cable.length, 0.002 * cable.length
+        return (
+            *(Parameter(name, "rad", scale=0.01, lower=-0.5, upper=0.5) for name in _ROTATIONS),
+            *(
+                Parameter(name, "m", scale=scale, lower=-bound, upper=bound)
+                for name in _TRANSLATIONS
+            ),
+        )
+
+    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
+        """Turn about the start fixture, then shift."""
+        turned = rotated(rotation(vector(params, "rotation_")), point - sight.start)
+        return sight.start + turned + vector(params, "translation_")

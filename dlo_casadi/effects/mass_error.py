@@ -1,0 +1,39 @@
+"""A cable that is heavier or lighter than declared."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.effects.setup import Setup
+from dlo_casadi.parameters import Parameter
+
+
+class MassError(Load):
+    """The mass of the cable itself is not the declared one.
+
+        true mass = factor mass
+
+    Without other loads shapes depend on the ratio of mass and bending stiffness alone: it takes a
+    measured force to tell them apart.
+
+    Parameters
+    ----------
+    factor : scalar, > 0
+        Vanishes at 1; from a fifth to five.
+    """
+
+    name = "mass_error"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the factor."""
+        return (Parameter("factor", nominal=1.0, scale=0.1, lower=0.2, upper=5.0),)
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where forces are measured, and the cable has weight."""
+        return super().applies(setup) and setup.readings and any(setup.gravity)
+
+    def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Weight of the part beyond s, over the declared one."""
+        return (params["factor"] - 1) * cable.mass * gravity * (1 - s / cable.length)

@@ -1,0 +1,130 @@
+"""Which pixels of two photographs show the same points of the cable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlo_casadi.vision.sight import Sight
+from dlo_casadi.vision.view import Array
+
+_CAP = 4.0  # standard deviations: how much a pair off its epipolar line may cost
+_SKIP = 1.0  # cost of a pixel at either end that the other photograph does not show
+_STEP = 0.05  # cost of a pair: of equal ways, along an epipolar line, the shortest is taken
+_POSE_PX = 0.5  # px: what the cameras' places add to the error of an epipolar line
+
+
+@dataclass(frozen=True)
+class Match:
+    """Pairs of pixels of two photographs, in order along the cable.
+
+    Parameters
+    ----------
+    first, second : (P,) int
+        Their places in the two lines.
+    share : scalar in 0..1
+        Share of the pixels of both lines that found a partner on their epipolar line.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    share: float
+
+
+def match_lines(one: Sight, other: Sight) -> Match:
+    """Match two lines, in order, by the distances from each other's epipolar lines.
+
+    For rays a and b of the same point b^T E a = 0, with the essential matrix E = [t]_x R of the
+    second camera's place seen from the first. The way of least cost
+
+        sum min(d_kl / s_kl, 4)^2 + 0.05,  d^2 = (b^T E a)^2 / (|(E a)_xy|^2 + |(E^T b)_xy|^2)
+
+    through all pairs (k, l) that never goes back, by dynamic programming; s^2 adds up the
+    variances of both pixels and of the cameras' places. Pixels at the ends may be left over.
+
+    References
+    ----------
+    Sampson's distance: Hartley, Zisserman, Multiple View Geometry, 2004, section 11.4.3. Ordering:
+    Ohta, Kanade, Stereo by intra- and inter-scanline search, 1985.
+    """
+    off = _epipolar_distance(one, other)
+    variance = one.std[:, None] ** 2 + other.std[None, :] ** 2 + _POSE_PX**2
+    off /= np.sqrt(variance)
+    cost = np.minimum(off, _CAP) ** 2 + _STEP
+    first, second = cheapest_way(cost)
+    good = off[first, second] < _CAP / 2
+    first, second = first[good], second[good]
+    found = len(np.unique(first)) + len(np.unique(second))
+    return Match(first, second, found / (len(one.pixels) + len(other.pixels)))
+
+
+def triangulate(one: Sight, other: Sight, match: Match) -> Array:
+    """Points (P, 3) [m] of least squares from the matched rays.
+
+    With a = q_xy / q_z and q = R p + t each ray gives two equations, (a R_z - R_xy) p = t_xy - a
+    t_z.
+    """
+    rows, sides = [], []
+    for sight, chosen in ((one, match.first), (other, match.second)):
+        R, t = sight.viewpoint.rotation, sight.viewpoint.translation
+        rays = sight.rays[chosen]
+        rows.append(rays[:, :, None] * R[2] - R[:2])
+        sides.append(t[:2] - rays * t[2])
+    A, b = np.concatenate(rows, axis=1), np.concatenate(sides, axis=1)
+    normal = np.einsum("pki,pkj->pij", A, A)
+    return np.linalg.solve(normal, np.einsum("pki,pk->pi", A, b)[..., None])[..., 0]
+
+
+def _epipolar_distance(one: Sight, other: Sight) -> Array:
+    """Sampson's distance (K, L) [px] of all pairs of pixels."""
+    R = other.viewpoint.rotation @ one.viewpoint.rotation.T
+    t = other.viewpoint.translation - R @ one.viewpoint.translation
+    E = np.cross(t, R, axisb=0, axisc=0)
+    a = np.column_stack([one.rays, np.ones(len(one.pixels))])
+    b = np.column_stack([other.rays, np.ones(len(other.pixels))])
+    in_other, in_one = a @ E.T, b @ E
+    slope = np.sum(in_other[:, :2] ** 2, axis=1)[:, None] + np.sum(in_one[:, :2] ** 2, axis=1)
+    focal = np.sqrt(one.viewpoint.camera.focal * other.viewpoint.camera.focal)
+    return np.asarray(focal * np.abs(in_other @ b.T) / np.sqrt(slope))
+
+
+def cheapest_way(cost: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Places (P,), (P,) of the pairs on the cheapest way through a table of costs (K, L).
+
+    In a row, D_l = c_l + min(A_l, D_l-1) with A the best from the row before; with C the running
+    sum of c that is D_l = C_l + min_{m <= l} (A_m - C_m-1), which needs no loop.
+    """
+    high, wide = cost.shape
+    total = np.empty_like(cost)
+    total[0] = np.minimum(cost[0] + _SKIP * np.arange(wide), np.cumsum(cost[0]))
+    for k in range(1, high):
+        above = total[k - 1].copy()
+        above[1:] = np.minimum(above[1:], total[k - 1, :-1])
+        above[0] = min(above[0], _SKIP * k)
+        run = np.cumsum(cost[k])
+        total[k] = run + np.minimum.accumulate(above - run + cost[k])
+    last_row = total[-1] + _SKIP * np.arange(wide)[::-1]
+    last_column = total[:, -1] + _SKIP * np.arange(high)[::-1]
+    if last_row.min() <= last_column.min():
+        k, m = high - 1, int(last_row.argmin())
+    else:
+        k, m = int(last_column.argmin()), wide - 1
+    way = [(k, m)]
+    while k > 0 or m > 0:
+        behind = total[k, m] - cost[k, m]
+        ways = [(total[i, j], i, j) for i, j in _before(k, m)]
+        skipped = _SKIP * (m if k == 0 else k if m == 0 else np.inf)
+        best = min(ways)
+        if skipped <= behind + 1e-9 and skipped <= best[0]:
+            break
+        _, k, m = best
+        way.append((k, m))
+    first, second = np.array(way[::-1]).T
+    return first, second
+
+
+def _before(k: int, m: int) -> list[tuple[int, int]]:
+    """Pairs from which (k, m) can be reached."""
+    steps = [(k - 1, m - 1), (k - 1, m), (k, m - 1)]
+    return [(i, j) for i, j in steps if i >= 0 and j >= 0]

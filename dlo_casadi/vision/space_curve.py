@@ -1,0 +1,321 @@
+"""Smooth curves in space through what several photographs show of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.vision.correspondence import cheapest_way
+from dlo_casadi.vision.sight import Sight
+from dlo_casadi.vision.view import Array
+from dlo_casadi.vision.viewpoint import Viewpoint
+
+_DEGREE = 3
+_GRID = 401  # places along the curve among which the nearest to a pixel is looked for
+_NEAR_PX = 2.0  # px: how far off the first curve may be seen; pixels four times as far do not count
+_TANGENTIAL = 1e-5  # m: a curve does not change by moving along itself
+_HUBER = 3.0  # standard deviations, from where on a pixel counts less
+# Spectral densities q of the third derivative that are tried, in L^2, where a curve of length L has
+# 0 <= t <= 1: from a bow of 0.3 L to waves of 300 L; afterwards those near the last.
+_WANDER, _WANDER_NEXT = np.logspace(-1.0, 5.0, 13), np.array([0.3, 0.6, 1.0, 1.7, 3.0])
+_LOOPS, _SETTLED = 15, 1e-5  # m
+
+
+@dataclass(frozen=True)
+class SpaceCurve:
+    """A cubic B-spline r(t), 0 <= t <= 1, with t close to arc length over the whole.
+
+    Parameters
+    ----------
+    coefficients : (n, 3) [m]
+        In the board frame.
+    """
+
+    coefficients: Array
+
+    def design(self, t: Array) -> Array:
+        """Basis functions (K, n) at t (K,)."""
+        return _design(t, len(self.coefficients))
+
+    def position(self, t: Array) -> Array:
+        """Points (K, 3) [m]."""
+        return self.design(t) @ self.coefficients
+
+    def tangent(self, t: Array) -> Array:
+        """Give the unit tangents (K, 3)."""
+        slope = np.asarray(BSpline(_knots(len(self.coefficients)), self.coefficients, 3)(t, 1))
+        return slope / np.linalg.norm(slope, axis=1, keepdims=True)
+
+    @property
+    def length(self) -> float:
+        """Arc length [m]."""
+        return float(np.linalg.norm(np.diff(self.position(_fine()), axis=0), axis=1).sum())
+
+    def evenly(self) -> SpaceCurve:
+        """Give the same curve with t proportional to its arc length."""
+        grid = _fine()
+        steps = np.linalg.norm(np.diff(self.position(grid), axis=0), axis=1)
+        s = np.concatenate([[0.0], np.cumsum(steps)])
+        at = np.interp(grid * s[-1], s, grid)
+        even = np.linalg.lstsq(self.design(grid), self.position(at), rcond=None)[0]
+        return SpaceCurve(np.asarray(even, float))
+
+
+@dataclass(frozen=True)
+class CurveFit:
+    """A curve, how well it is known, and where on it each pixel lies.
+
+    Parameters
+    ----------
+    curve : SpaceCurve
+        The estimate.
+    covariance : (n, 3, n, 3) [m^2]
+        Of its coefficients, across the curve.
+    params : tuple of (K,)
+        Parameter of each pixel of each photograph; nan where it does not belong to the curve.
+    residuals : tuple of (K,) [px]
+        Distance of the pixel across the projected curve; nan there.
+    surprise : scalar
+        -2 log of the marginal likelihood, up to a constant: tells hypotheses on the pixels apart.
+    """
+
+    curve: SpaceCurve
+    covariance: Array
+    params: tuple[Array, ...]
+    residuals: tuple[Array, ...]
+    surprise: float
+
+    def std(self, t: Array) -> tuple[Array, Array]:
+        """Covariance (K, 3, 3) [m^2] and largest standard deviation (K,) [m] of points at t."""
+        basis = self.curve.design(t)
+        at = np.einsum("ka,aibj,kb->kij", basis, self.covariance, basis, optimize=True)
+        return at, np.sqrt(np.maximum(np.linalg.eigvalsh(at)[:, -1], 0.0))
+
+
+def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
+    """Smooth curve through scattered points.
+
+    Parameters
+    ----------
+    points : (P, 3) [m]
+        In order.
+    along : (P,)
+        Not decreasing: how far along the curve each lies.
+    spans : int
+        Polynomials of the spline.
+    """
+    t = (along - along[0]) / (along[-1] - along[0])
+    n = spans + _DEGREE
+    basis, rough = _design(t, n), np.diff(np.eye(n), 3, axis=0)
+    # a point weighs as much as a wave of three spans that is as high as it is off
+    normal = basis.T @ basis + len(points) / n * rough.T @ rough
+    return SpaceCurve(np.asarray(np.linalg.solve(normal, basis.T @ points), float)).evenly()
+
+
+def fit_curve_to_sights(
+    sights: Sequence[Sight], first: SpaceCurve, params: Sequence[Array] | None = None
+) -> CurveFit:
+    """Move a curve onto what all photographs show of it.
+
+        minimise  sum (n . (pi(r(t_k)) - u_k) / s_k)^2 + sum_v d_v^T C_v^-1 d_v
+                  + 1/q integral |r'''|^2 dt
+
+    over the coefficients of r and small motions d_v of each camera (Gauss-Newton): n is the normal
+    of the projected curve, t_k the nearest place on it, C_v the covariance of the camera's pose. So
+    a place where one photograph shows the curve along an epipolar line is left to the others. s_k
+    counts pixels that share their errors as fewer. The prior, a white third derivative of spectral
+    density q, fills gaps as smoothly as the rest of the curve is; q has the largest marginal
+    likelihood. Pixels far off count less (Huber).
+
+    Parameters
+    ----------
+    sights : sequence of Sight
+        At least two photographs.
+    first : SpaceCurve
+        Close enough to be seen within some pixels of the right place.
+    params : sequence of (K,), optional
+        About where on it the pixels of each photograph lie; the nearest places, in order, if not
+        given.
+
+    References
+    ----------
+    Wahba, Spline Models for Observational Data, 1990: smoothing splines as Gaussian processes.
+    """
+    curve = first
+    n = len(curve.coefficients)
+    params = list(params or [_assign(curve, sight) for sight in sights])
+    motions = [np.zeros(6) for _ in sights]
+    whitened = [_independent_std(sight) for sight in sights]
+    rigid = [np.linalg.inv(sight.viewpoint.covariance) for sight in sights]
+    prior = block_diag(np.zeros((3 * n, 3 * n)), *rigid)
+    rough = block_diag(_roughness(n), np.zeros((6 * len(sights), 6 * len(sights))))
+    wander = _WANDER * curve.length**2
+    for loop in range(_LOOPS):
+        still = np.hstack([_along_itself(curve), np.zeros((3 * n, 6 * len(sights)))])
+        rows, errors, residuals = [still], [np.zeros(3 * n)], []
+        for v, sight in enumerate(sights):
+            params[v] = _nearest(curve, sight, motions[v], params[v])
+            J, error = _linearise(curve, sight, motions[v], params[v])
+            residuals.append(error)
+            used = np.isfinite(error)
+            whole = np.zeros((int(used.sum()), 3 * n + 6 * len(sights)))
+            whole[:, : 3 * n] = J[used, : 3 * n]
+            whole[:, 3 * n + 6 * v : 3 * n + 6 * v + 6] = J[used, 3 * n :]
+            scaled = error[used] / whitened[v][used]
+            weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(scaled), 1e-9)))
+            rows.append(whole * (weight / whitened[v][used])[:, None])
+            errors.append(scaled * weight)
+        A, e = np.vstack(rows), np.concatenate(errors)
+        x = np.concatenate([curve.coefficients.ravel(), *motions])
+        solved = _solve(A, e, x, rough, prior, wander)
+        wander = solved.q * _WANDER_NEXT
+        x = x + solved.step
+        moved = float(np.abs(_design(_fine(), n) @ solved.step[: 3 * n].reshape(n, 3)).max())
+        motions = [x[3 * n + 6 * v : 3 * n + 6 * v + 6] for v in range(len(sights))]
+        curve = SpaceCurve(x[: 3 * n].reshape(n, 3)).evenly()
+        if loop > 2 and moved < _SETTLED:
+            break
+    covariance = cho_solve(solved.factor, np.eye(len(x)))[: 3 * n, : 3 * n]
+    return CurveFit(
+        curve, covariance.reshape(n, 3, n, 3), tuple(params), tuple(residuals), solved.surprise
+    )
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A Gauss-Newton step under the likeliest prior."""
+
+    step: Array
+    factor: tuple[Array, bool]
+    surprise: float
+    q: float
+
+
+def _solve(A: Array, e: Array, x: Array, rough: Array, prior: Array, wander: Array) -> _Step:
+    """Gauss-Newton step with the likeliest of the densities `wander`.
+
+    -2 log p(e | q) = |e - A dx|^2 + x^T (P + K / q) x + log det(H) + m log q, with the normal
+    matrix H = A^T A + P + K / q and m the rank of K across the curve.
+    """
+    n = int(np.count_nonzero(np.diag(rough))) // 3
+    fixed, gradient = A.T @ A + prior, A.T @ e - prior @ x
+    best: _Step | None = None
+    for q in wander:
+        factor = cho_factor(fixed + rough / q)
+        step = cho_solve(factor, gradient - rough @ x / q)
+        y = x + step
+        surprise = np.sum((e - A @ step) ** 2) + y @ prior @ y + y @ rough @ y / q
+        surprise += 2.0 * np.log(np.diag(factor[0])).sum() + 2 * (n - _DEGREE) * np.log(q)
+        if best is None or surprise < best.surprise:
+            best = _Step(step, factor, float(surprise), float(q))
+    assert best is not None
+    return best
+
+
+def _along_itself(curve: SpaceCurve) -> Array:
+    """Rows (3 n, 3 n) that hold a curve where it is along itself, where no photograph does."""
+    t = np.linspace(0.0, 1.0, 3 * len(curve.coefficients))
+    rows = curve.design(t)[:, :, None] * curve.tangent(t)[:, None, :] / _TANGENTIAL
+    return rows.reshape(len(t), -1)
+
+
+def _linearise(curve: SpaceCurve, sight: Sight, motion: Array, t: Array) -> tuple[Array, Array]:
+    """Residuals (K,) [px] across the projected curve, and minus their slopes (K, 3 n + 6)."""
+    n = len(curve.coefficients)
+    error = np.full(len(t), np.nan)
+    J = np.zeros((len(t), 3 * n + 6))
+    used = np.isfinite(t)
+    camera = moved_camera(sight.viewpoint, motion)
+    basis, points = curve.design(t[used]), curve.position(t[used])
+    pixels, slopes = camera.project(points)
+    tangent = np.einsum("kij,kj->ki", slopes, curve.tangent(t[used]))
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    error[used] = np.sum((sight.pixels[used] - pixels) * normal, axis=1)
+    by_point = np.einsum("ki,kij->kj", normal, slopes)
+    by_shift = by_point @ camera.rotation.T
+    turned = points @ camera.rotation.T + camera.translation - motion[3:]
+    J[used] = np.hstack(
+        [
+            (basis[:, :, None] * by_point[:, None, :]).reshape(len(points), 3 * n),
+            np.cross(turned, by_shift),
+            by_shift,
+        ]
+    )
+    return J, error
+
+
+def moved_camera(viewpoint: Viewpoint, motion: Array) -> Viewpoint:
+    """Turn the board by the rotation vector w and shift it by d in the camera's frame."""
+    turn = Rotation.from_rotvec(motion[:3]).as_matrix()
+    return replace(
+        viewpoint,
+        rotation=turn @ viewpoint.rotation,
+        translation=turn @ viewpoint.translation + motion[3:],
+    )
+
+
+def _assign(curve: SpaceCurve, sight: Sight) -> Array:
+    """Parameters (K,) of the pixels, in order along the curve; nan for those far off."""
+    t = np.linspace(0.0, 1.0, _GRID)
+    seen = sight.viewpoint.to_pixels(curve.position(t))
+    away = np.linalg.norm(sight.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX
+    first, second = cheapest_way(away)
+    params = np.full(len(sight.pixels), np.nan)
+    order = np.argsort(-away[first, second], kind="stable")
+    params[first[order]] = t[second[order]]
+    near = np.full(len(params), np.inf)
+    near[first[order]] = away[first[order], second[order]]
+    params[near > 4.0] = np.nan
+    return params
+
+
+def _nearest(curve: SpaceCurve, sight: Sight, motion: Array, t: Array) -> Array:
+    """Nearest places on the projected curve, from near ones; nan beyond its ends."""
+    t = t.copy()
+    camera = moved_camera(sight.viewpoint, motion)
+    for _ in range(2):
+        used = np.nonzero(np.isfinite(t))[0]
+        pixels, slopes = camera.project(curve.position(t[used]))
+        tangent = np.einsum("kij,kj->ki", slopes, curve.tangent(t[used])) * curve.length
+        off = np.sum((sight.pixels[used] - pixels) * tangent, axis=1)
+        step = off / np.maximum(np.sum(tangent**2, axis=1), 1e-9)
+        moved = t[used] + np.clip(step, -2.0 / _GRID, 2.0 / _GRID)
+        t[used] = np.where((moved >= 0.0) & (moved <= 1.0), moved, np.nan)
+    return t
+
+
+def _independent_std(sight: Sight) -> Array:
+    """Standard deviations (K,) [px] of independent pixels that tell as much.
+
+    Pixels a distance h apart whose errors are correlated over the length c (the integral of the
+    correlation, on both sides) are worth h / (2 c) independent ones.
+    """
+    return sight.std * np.sqrt(max(2.0 * sight.correlation / max(sight.spacing, 1e-6), 1.0))
+
+
+def _roughness(n: int) -> Array:
+    """K (3 n, 3 n): c^T K c = integral |r'''|^2 dt, constant within a span."""
+    third = np.diff(np.eye(n), 3, axis=0)
+    return np.asarray(np.kron(third.T @ third * (n - _DEGREE) ** 5, np.eye(3)), float)
+
+
+def _knots(n: int) -> Array:
+    return np.asarray(np.arange(-_DEGREE, n + 1) / (n - _DEGREE))
+
+
+def _design(t: Array, n: int) -> Array:
+    if not len(t):
+        return np.zeros((0, n))
+    inside = np.clip(t, 0.0, 1.0 - 1e-12)
+    return np.asarray(BSpline.design_matrix(inside, _knots(n), _DEGREE).toarray())
+
+
+def _fine() -> NDArray[np.float64]:
+    return np.linspace(0.0, 1.0, 1001)

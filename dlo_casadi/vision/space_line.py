@@ -1,0 +1,326 @@
+"""The line in space that several photographs of one cable give without any model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dlo_casadi.errors import VisionError
+from dlo_casadi.vision.board import Board, locate_camera
+from dlo_casadi.vision.correspondence import Match, match_lines, triangulate
+from dlo_casadi.vision.curve import chord_length
+from dlo_casadi.vision.sight import Sight, other_stretches, see_beside, see_cable
+from dlo_casadi.vision.space_curve import CurveFit, first_curve, fit_curve_to_sights
+from dlo_casadi.vision.view import Array, Camera
+
+_SPACING = 0.0025  # m, as of centre-lines in the plane
+_SPAN = (
+    2.0  # diameters, of the spline: no cable bends sharper; with half of it the lines in space of
+)
+# rendered photographs move by less than a tenth of their std
+_SPANS = (20, 100)
+_AGREE = 0.8  # share of its pixels that a photograph must share with the others
+_AGREE_PX = 1.0  # px, beside four standard deviations: errors of cameras' places
+_FAR = 0.1  # of the length: a line that ends so far from a fixture is not this pose's
+_LONGER = 1.1  # of the length: a line in space cannot be longer
+_NARROW = np.radians(5.0)  # between two cameras: below, depths are ten times worse than the rest
+
+
+@dataclass(frozen=True)
+class SpaceLine:
+    """A line in space, and how well each of its points is known.
+
+    Parameters
+    ----------
+    points : (K, 3) [m]
+        In the board frame, ordered from start to end, evenly spaced.
+    covariance : (K, 3, 3) [m^2]
+        Across the line; where a point lies along it, photographs do not tell.
+    std : (K,) [m]
+        Largest standard deviation in any direction across the line.
+    gaps : tuple of int
+        Indices of the points after which a stretch is missing.
+    """
+
+    points: Array
+    covariance: Array
+    std: Array
+    gaps: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Views:
+    """What the photographs of one pose show.
+
+    Parameters
+    ----------
+    line : SpaceLine or None
+        None where fewer than two photographs agree.
+    sights : dict of str to Sight
+        What is seen in each usable photograph, by its name, in pixels.
+    problems : dict of str to str
+        Why a photograph is not used, and what to try.
+    messages : tuple of str
+        What else a user should know; those on one photograph begin with its name.
+    """
+
+    line: SpaceLine | None
+    sights: Mapping[str, Sight]
+    problems: Mapping[str, str]
+    messages: tuple[str, ...]
+
+
+def measure_views(
+    photographs: Mapping[str, NDArray[np.uint8]],
+    board: Board,
+    camera: Camera,
+    *,
+    start: ArrayLike,
+    end: ArrayLike | None,
+    diameter: float,
+    length: float,
+) -> Views:
+    """Measure a cable in photographs from several places: the line in each, and in space.
+
+    Parameters
+    ----------
+    photographs : dict of str to (H, W, 3) uint8
+        Pictures of one pose, blue, green, red, by their names.
+    board : Board
+        The board that is seen in each.
+    camera : Camera
+        That took them all.
+    start, end : (3,) [m]
+        The fixtures in the board frame; `end` is None for a free end.
+    diameter, length : scalar [m]
+        Of the cable.
+
+    Nothing is raised for a photograph that cannot be used: `problems` names it, and the others
+    are used. One photograph alone gives no line.
+    """
+    problems: dict[str, str] = {}
+    sights: dict[str, Sight] = {}
+    for name, image in photographs.items():
+        try:
+            viewpoint = locate_camera(image, board, camera)
+            sights[name] = see_cable(
+                image, viewpoint, start=start, end=end, diameter=diameter, length=length
+            )
+        except VisionError as error:
+            problems[name] = f"{name}: {error.message}"
+    fixtures = [np.asarray(at, float) for at in (start, end) if at is not None]
+    spans = int(np.clip(length / (_SPAN * diameter), *_SPANS))
+    fit, order = _agreeing_fit(sights, problems, fixtures, length, spans)
+    line = None
+    if fit is not None:
+        seen = [sights[name] for name in order]
+        fit, seen = _resolve(fit, seen, [photographs[name] for name in order])
+        sights.update(zip(order, seen, strict=True))
+        line = _points(fit, diameter)
+        if len(line.points) < 2:
+            line = None
+    messages = [
+        f"{name}: {message}"
+        for name, sight in sights.items()
+        for message in (*sight.viewpoint.messages, *sight.messages)
+    ]
+    if line is None and len(sights) == 1:
+        messages.append(
+            f"{next(iter(sights))} alone gives no line in space; its pixels serve a fit. Try: a "
+            "second photograph from another place, 30 to 90 degrees around the cable."
+        )
+    elif line is not None:
+        messages += _line_messages(line, fit, fixtures, length)
+    return Views(line, sights, problems, tuple(messages))
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two photographs, what matches in them, and the angle [rad] between their directions."""
+
+    names: tuple[str, str]
+    match: Match
+    angle: float
+
+
+def _agreeing_fit(
+    sights: dict[str, Sight],
+    problems: dict[str, str],
+    fixtures: list[Array],
+    length: float,
+    spans: int,
+) -> tuple[CurveFit | None, list[str]]:
+    """The curve that most photographs agree on, and their names.
+
+    Those that contradict it are moved from the sights to the problems.
+    """
+    while len(sights) > 1:
+        pair = _best_pair(sights)
+        if pair.angle < _NARROW:
+            one, other = pair.names
+            for name in list(sights)[1:]:
+                problems[name] = (
+                    f"{name}: the photographs are taken from nearly the same place ({one}, {other} "
+                    f"{np.degrees(pair.angle):.1f} degrees apart): no depth. Try: step aside, 30 "
+                    "to 90 degrees around the cable."
+                )
+                del sights[name]
+            return None, []
+        names = list(sights)
+        fit = _fit(sights, pair, spans) if pair.match.share > _AGREE else None
+        if fit is None or not _possible(fit, fixtures, length):
+            _blame(sights, problems, pair, fixtures)
+            continue
+        shares = [_agreement(sights[n], r) for n, r in zip(names, fit.residuals, strict=True)]
+        worst = int(np.argmin(shares))
+        if shares[worst] >= _AGREE:
+            return fit, names
+        name = names[worst]
+        problems[name] = (
+            f"{name}: only {100 * shares[worst]:.0f} % of the line in it lie on the line in space "
+            "that the other photographs of this pose show. Try: is it of this pose? Was the cable "
+            "or the board moved between the photographs?"
+        )
+        del sights[name]
+    return None, []
+
+
+def _best_pair(sights: dict[str, Sight]) -> _Pair:
+    """The two photographs whose lines match best, seen from the most different places."""
+    names = list(sights)
+    pairs = []
+    for i, one in enumerate(names):
+        for other in names[i + 1 :]:
+            ahead = float(sights[one].viewpoint.rotation[2] @ sights[other].viewpoint.rotation[2])
+            match = match_lines(sights[one], sights[other])
+            pairs.append(_Pair((one, other), match, float(np.arccos(np.clip(ahead, -1, 1)))))
+    return max(pairs, key=lambda pair: (pair.match.share > _AGREE, np.sin(pair.angle)))
+
+
+def _fit(sights: dict[str, Sight], pair: _Pair, spans: int) -> CurveFit:
+    """First curve of a pair, moved onto what all photographs show."""
+    one, other = (sights[name] for name in pair.names)
+    match = pair.match
+    points = triangulate(one, other, match)
+    along = chord_length(one.pixels)[match.first] + chord_length(other.pixels)[match.second]
+    return fit_curve_to_sights(list(sights.values()), first_curve(points, along, spans))
+
+
+def _possible(fit: CurveFit, fixtures: list[Array], length: float) -> bool:
+    """Whether a curve is no longer than the cable, and leads from fixture to fixture."""
+    ends = fit.curve.position(np.array([0.0, 1.0]))
+    away = [np.linalg.norm(end - at) for end, at in zip(ends, fixtures, strict=False)]
+    return bool(fit.curve.length < _LONGER * length and max(away) < _FAR * length)
+
+
+def _agreement(sight: Sight, residuals: Array) -> float:
+    """Share of the pixels with two edges that lie on the curve."""
+    near = np.abs(residuals) < _AGREE_PX + 4.0 * sight.std
+    return float(near[sight.whole].sum() / max(int(sight.whole.sum()), 1))
+
+
+def _blame(
+    sights: dict[str, Sight], problems: dict[str, str], pair: _Pair, fixtures: list[Array]
+) -> None:
+    """Leave out the photograph whose line ends farthest from where the fixtures are declared."""
+    off = {name: _tips_off(sight, fixtures) for name, sight in sights.items()}
+    worst = max(off, key=lambda name: off[name])
+    others = ", ".join(name for name in sights if name != worst)
+    problems[worst] = (
+        f"{worst}: the line in it and that in {others} are not of the same cable in space: at most "
+        f"{100 * pair.match.share:.0f} % of their pixels can be matched, or the line would not "
+        f"lead from fixture to fixture. The line in {worst} ends {off[worst]:.0f} px from where "
+        "the fixtures are declared. Try: are both of this pose? Was the cable or the board moved "
+        "between the photographs?"
+    )
+    del sights[worst]
+
+
+def _tips_off(sight: Sight, fixtures: list[Array]) -> float:
+    """Distance [px] of the line's ends from the fixtures, the larger one."""
+    places = sight.viewpoint.to_pixels(fixtures)
+    ends = sight.pixels[[0, -1]][: len(places)]
+    return float(np.linalg.norm(ends - places, axis=1).max())
+
+
+def _resolve(
+    fit: CurveFit, sights: list[Sight], images: list[NDArray[np.uint8]]
+) -> tuple[CurveFit, list[Sight]]:
+    """Measure the stretches that share an outline in a photograph, now that the rest is known.
+
+    Whether they cross in it is what makes the line in space likelier; then once more with the
+    sides of that line.
+    """
+    t = np.linspace(0.0, 1.0, 1001)
+    points = fit.curve.position(t)
+    shared = []
+    for sight in sights:
+        seen = sight.viewpoint.to_pixels(points)
+        beside = other_stretches(seen, chord_length(seen), sight.width)
+        shared.append(bool(np.isfinite(beside).any()))
+    if not any(shared):
+        return fit, sights
+
+    def measure(crossed: bool | None, fit: CurveFit) -> tuple[CurveFit, list[Sight]]:
+        points = fit.curve.position(t)
+        seen, params = list(sights), list(fit.params)
+        for v, image in enumerate(images):
+            if shared[v]:
+                whole = before.params[v]
+                seen[v], params[v] = see_beside(image, sights[v], points, t, whole, crossed)
+        return fit_curve_to_sights(seen, fit.curve, params), seen
+
+    before = fit
+    likelier = min((measure(crossed, fit)[0] for crossed in (False, True)), key=_surprise)
+    return measure(None, likelier)
+
+
+def _surprise(fit: CurveFit) -> float:
+    return fit.surprise
+
+
+def _points(fit: CurveFit, diameter: float) -> SpaceLine:
+    """Evenly spaced points that are known better than the cable is thick."""
+    count = max(2, round(fit.curve.length / _SPACING) + 1)
+    t = np.linspace(0.0, 1.0, count)
+    covariance, std = fit.std(t)
+    known = np.nonzero(std < 0.5 * diameter)[0]
+    gaps = np.nonzero(np.diff(known) > 1)[0]
+    return SpaceLine(
+        fit.curve.position(t[known]),
+        covariance[known],
+        std[known],
+        tuple(int(i) for i in gaps),
+    )
+
+
+def _line_messages(
+    line: SpaceLine, fit: CurveFit | None, fixtures: list[Array], length: float
+) -> list[str]:
+    """Sentences on how the line in space fits its fixtures and its length."""
+    assert fit is not None
+    messages = []
+    steps = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
+    seen = float(np.delete(steps, list(line.gaps)).sum())
+    whole = fit.curve.length
+    ends = fit.curve.position(np.array([0.0, 1.0]))
+    for name, end, at in zip(("start", "end"), ends, fixtures, strict=False):
+        away = float(np.linalg.norm(end - at))
+        whole += away
+        if away > max(0.03 * length, 0.01):
+            messages.append(f"the line in space stops {1e3 * away:.0f} mm before the {name}")
+    if len(fixtures) == 2 and abs(whole / length - 1.0) > 0.03:
+        messages.append(
+            f"the line in space is {100 * abs(whole / length - 1):.1f} % "
+            f"{'longer' if whole > length else 'shorter'} than declared ({whole:.3f} of "
+            f"{length:g} m, up to both fixtures): check the length, camera.matrix and marker_size"
+        )
+    if seen < 0.95 * length:
+        messages.append(
+            f"{100 * (1 - seen / length):.0f} % of the cable are not known in space: hidden, or "
+            "seen along their depth. A third photograph from another side would show them"
+        )
+    return messages

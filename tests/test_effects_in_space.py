@@ -1,0 +1,335 @@
+"""Effects in space, against the same cable in a plane, turned frames, and beams in closed form."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.assembly import Given, Shapes
+from dlo_casadi.effects import (
+    EFFECTS,
+    NUISANCES,
+    BendingAnisotropy,
+    Cable,
+    CameraFrame,
+    ClampRotation,
+    GravityTilt,
+    LumpedMass,
+    MassError,
+    PointForce,
+    Setup,
+    SideLoad,
+    Sight,
+    Tether,
+)
+from dlo_casadi.equilibrium import Pose, solve_equilibrium
+from dlo_casadi.model import CableModel
+
+FLAT = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
+CABLE = replace(FLAT, torsional_stiffness=0.03)
+GRAVITY = (0.3, 0.5, -9.7)
+HELD = Pose(
+    (0.1, 0.05, -0.2),
+    (0.6, 0.0, -0.1),
+    start_orientation=(0.05, -0.1, 0.2, 0.97),
+    end_orientation=(-0.1, 0.1, 0.05, 0.98),
+)
+
+
+def solved(effects=(), values=(), pose=HELD, gravity=GRAVITY, cable=CABLE, **held):
+    """Equilibrium of a cable that is straight at rest."""
+    ends = {"start": "clamped", "end": "clamped", **held}
+    model = CableModel(cable, 10, "arc", gravity=gravity, effects=tuple(effects), **ends)
+    p = model.nominal.copy()
+    p[len(p) - len(values) :] = values
+    return solve_equilibrium(model, p, np.zeros(model.chain.n_rests), pose)
+
+
+# ---- the plane is a special case ---------------------------------------------------------------
+
+# Values in the plane, and what comes behind each parameter in space.
+PLANAR = {
+    "lumped_mass": {"mass": 0.05, "position": 0.3},
+    "point_force": {"fx": 0.3, "fy": -0.2, "fz": 0.0, "position": 0.5},
+    "tether": {"stiffness": 4.0, "position": 0.4, "anchor_x": 0.3, "anchor_y": 0.3, "anchor_z": 0},
+    "side_load": {"force_per_length": 0.4, "force_per_length_x": 0.4, "force_per_length_z": 0.0},
+    "gravity_tilt": {"angle": 0.2, "angle_x": 0.0, "angle_z": 0.2},
+    "mass_error": {"factor": 1.3},
+    "stiffness_gradient": {"slope": 0.4},
+    "stiff_section": {"start": 0.2, "end": 0.35, "factor": 3.0},
+    "bending_softening": {"softness": 0.1},
+    "axial_stretch": {"compliance": 5e-3},
+    "length_error": {"length_difference": 0.02},
+    "end_offset": {"dx": 0.01, "dy": -0.02, "dz": 0.0},
+    "rest_curvature_drift": {"rate": 0.3},
+    "plastic_set": {"yield_curvature": 2.0, "share": 0.3},
+}
+
+
+def test_every_effect_of_both_is_compared():
+    both = {k for k, kind in EFFECTS.items() if kind.in_plane and kind.in_space}
+    assert set(PLANAR) == both
+
+
+def in_space(model, flat):
+    """Nodes and multipliers of a planar shape, as those of a model in space."""
+    half, named = flat.x[:, 0] / 2, dict(zip(flat_names(model), flat.multipliers, strict=True))
+    zero = np.zeros_like(half)
+    x = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
+    return Shapes.declared(x[None], np.array([[named.get(k, 0.0) for k in model.border_names]]))
+
+
+def flat_names(model):
+    """Names of what a planar model has, as the same model in space calls them."""
+    absent = ("_z", "rotation_x", "rotation_y")
+    return [k for k in model.border_names if k.endswith("rotation_z") or not k.endswith(absent)]
+
+
+@pytest.mark.parametrize("name", PLANAR)
+def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
+    """Its shapes are equilibria in space, of the same energy, curve and state."""
+    gravity, headings, rest = (0.0, -9.7), (0.6, -0.5), -1.5
+    models, ps, rests = [], [], []
+    for cable, g in ((FLAT, gravity), (CABLE, (*gravity, 0.0))):
+        effect = EFFECTS[name].made_for(Setup(cable, "clamped", "clamped", g))
+        model = CableModel(cable, 10, "arc", "clamped", "clamped", g, (effect,))
+        p = model.nominal.copy()
+        for q in effect.parameters(cable):
+            p[model.names.index(f"{name}.{q.name}")] = PLANAR[name][q.name]
+        models.append(model)
+        ps.append(p)
+        rests.append(np.repeat([rest] if len(g) == 2 else [0.0, rest], model.chain.n_cells))
+    pose = Pose((0.0, 0.0), (0.5, -0.1), *headings)
+    first, last = (tuple(Rotation.from_rotvec([0, 0, a]).as_quat()) for a in headings)
+    same = Pose((0.0, 0.0, 0.0), (0.5, -0.1, 0.0), start_orientation=first, end_orientation=last)
+    flat = solve_equilibrium(models[0], ps[0], rests[0], pose)
+    shapes = [Shapes.declared(flat.x[None], flat.multipliers[None]), in_space(models[1], flat)]
+    given = [
+        Given.of(*of) for of in zip(ps, rests, (pose.vector[None], same.vector[None]), strict=True)
+    ]
+    planar, spatial = (
+        (a.energy(s, g), a.curve(s, g), a.state_after(s, g)[0], a.balance(s, g)[1].rows)
+        for a, s, g in zip((m.assembly for m in models), shapes, given, strict=True)
+    )
+    n = models[0].chain.n_cells
+    # Rounding of a few dozen terms; forces and moments as far as the planar shape balances.
+    np.testing.assert_allclose(spatial[0], planar[0], atol=1e-12)
+    np.testing.assert_allclose(spatial[1][..., [0, 1, 3, 4]], planar[1], atol=1e-12)
+    np.testing.assert_allclose(spatial[1][..., [2, 5]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(spatial[2][:, n:], planar[2], atol=1e-11)
+    np.testing.assert_allclose(spatial[2][:, :n], 0.0, atol=1e-12)
+    assert np.abs(spatial[3]).max() < np.abs(planar[3]).max() + 1e-10
+
+
+# ---- turned frames -----------------------------------------------------------------------------
+
+
+def test_tilted_gravity_is_turned_about_the_axes_across_it():
+    for gravity, axes in (((0.3, 0.5, -9.7), "xy"), ((0.3, -9.7, 0.5), "xz")):
+        effect = GravityTilt.made_for(Setup(CABLE, gravity=gravity))
+        assert [q.name for q in effect.parameters(CABLE)] == [f"angle_{axis}" for axis in axes]
+        vector = np.array([0.3 * (axis == axes[0]) - 0.2 * (axis == axes[1]) for axis in "xyz"])
+        turned = tuple(map(float, Rotation.from_rotvec(vector).apply(gravity)))
+        found = solved((effect,), (0.3, -0.2), gravity=gravity)
+        np.testing.assert_allclose(found.points, solved(gravity=turned).points, atol=1e-8)
+
+
+def test_a_side_load_is_a_gravity_of_its_own_across_gravity():
+    """As of q L / m, along unit vectors perpendicular to gravity and nearest to x and y."""
+    down, q = np.array(GRAVITY) / np.linalg.norm(GRAVITY), (0.5, -0.3)
+    across = np.eye(3)[:2] - np.outer(down[:2], down)
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    np.testing.assert_allclose(across @ down, 0.0, atol=1e-15)
+    wind = np.array(GRAVITY) + np.array(q) @ across * CABLE.length / CABLE.mass
+    effect = SideLoad.made_for(Setup(CABLE, gravity=GRAVITY))
+    assert [p.name for p in effect.parameters(CABLE)] == [f"force_per_length_{a}" for a in "xy"]
+    found = solved((effect,), q)
+    np.testing.assert_allclose(found.points, solved(gravity=tuple(wind)).points, atol=1e-8)
+    np.testing.assert_allclose(found.lam, solved(gravity=tuple(wind)).lam, atol=1e-7)
+
+
+def test_without_weight_a_side_load_is_along_the_worlds_axes():
+    effect, s = SideLoad(), ca.SX(0.2)
+    names = [q.name for q in effect.parameters(CABLE)]
+    params = dict(zip(names, (ca.SX(0.5), ca.SX(-0.3)), strict=True))
+    force = ca.evalf(effect.resultant(s, ca.SX.zeros(3), CABLE, params))
+    np.testing.assert_allclose(np.array(force)[:, 0], [0.3, -0.18, 0.0], rtol=1e-14)
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.7])
+def test_clamps_are_turned_about_their_own_axes(roll):
+    """As if the poses had been declared so, whatever the cable's roll in its clamp."""
+    errors = (0.3, -0.2, 0.1, 0.4)
+    turned = [
+        Rotation.from_quat(declared) * Rotation.from_rotvec([0.0, y, z])
+        for declared, (y, z) in (
+            (HELD.start_orientation, errors[:2]),
+            (HELD.end_orientation, errors[2:]),
+        )
+    ]
+    first, last = (tuple(map(float, turn.as_quat())) for turn in turned)
+    found = solved((ClampRotation(),), (roll, *errors))
+    moved = replace(HELD, start_orientation=first, end_orientation=last)
+    np.testing.assert_allclose(found.points, solved((), (roll,), moved).points, atol=1e-8)
+    start = Rotation.from_quat(found.x[0]).as_matrix()
+    np.testing.assert_allclose(start, turned[0].as_matrix(), atol=1e-8)
+    along = Rotation.from_quat(found.x[-1]).as_matrix()[:, 0]
+    np.testing.assert_allclose(along, turned[1].as_matrix()[:, 0], atol=1e-8)
+
+
+def test_clamp_rotations_of_one_end_only():
+    setup = Setup(CABLE, "clamped", "free", GRAVITY, tolerances={"rotation": 5e-3})
+    effect = ClampRotation.made_for(setup)
+    assert [q.name for q in effect.parameters(CABLE)] == ["start_y", "start_z"]
+    assert effect.prior(setup) == {"start_y": 5e-3, "start_z": 5e-3}
+
+
+def test_a_cameras_frame_is_turned_about_the_start_and_shifted():
+    start, point = np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.2, -0.1])
+    turn, shift = (0.3, -0.2, 0.4), (0.01, -0.02, 0.03)
+    names = [q.name for q in CameraFrame().parameters(CABLE)]
+    params = dict(zip(names, map(ca.SX, (*turn, *shift)), strict=True))
+    sight = Sight(ca.SX(ca.DM(start)), ca.SX.zeros(2), ca.SX(0))
+    seen = CameraFrame().observe(ca.SX(ca.DM(point)), ca.SX(0), sight, params)
+    exact = start + Rotation.from_rotvec(turn).apply(point - start) + shift
+    np.testing.assert_allclose(np.array(ca.evalf(seen))[:, 0], exact, atol=1e-15)
+    tolerances = {"camera_rotation": 2e-3, "camera_translation": 1e-3}
+    prior = CameraFrame().prior(Setup(CABLE, gravity=GRAVITY, tolerances=tolerances))
+    assert list(prior.values()) == 3 * [2e-3] + 3 * [1e-3]
+
+
+# ---- loads and sections ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cable", [FLAT, CABLE], ids=["plane", "space"])
+def test_a_heavier_cable(cable):
+    """True over declared mass; what hangs on the cable stays as heavy."""
+    clip, factor = LumpedMass(), 1.4
+    pose, gravity = HELD, GRAVITY
+    if cable is FLAT:
+        pose, gravity = Pose((0.0, 0.0), (0.5, -0.1), 0.6, -0.5), (0.5, -9.7)
+    found = solved((clip, MassError()), (0.05, 0.3, factor), pose, gravity, cable)
+    heavier = replace(cable, mass=factor * cable.mass)
+    by_hand = solved((clip,), (0.05, 0.3), pose, gravity, heavier)
+    np.testing.assert_allclose(found.points, by_hand.points, atol=1e-8)
+    np.testing.assert_allclose(found.lam, by_hand.lam, atol=1e-7)
+
+
+def test_a_mass_error_takes_a_reading():
+    setup = Setup(CABLE, gravity=GRAVITY)
+    assert not MassError.applies(setup)
+    assert MassError.applies(replace(setup, readings=True))
+    assert not MassError.applies(replace(setup, readings=True, gravity=(0.0, 0.0, 0.0)))
+    assert MassError().refusal(setup, {"factor": 1.2}) == ""
+
+
+def test_reactions_carry_the_weight_and_the_pull_of_a_tether():
+    anchor = np.array([0.3, 0.4, 0.2])
+    found = solved((Tether(),), (5.0, 0.4, *anchor))
+    loads = 5.0 * (anchor - found.points[5]) + CABLE.mass * np.array(GRAVITY)
+    np.testing.assert_allclose(found.lam + found.lam_start, loads, atol=1e-6)
+
+
+def test_a_soft_tether_to_a_far_anchor_keeps_its_force():
+    effect, force = Tether(), {"fx": -0.6, "fy": 0.8, "fz": 2.4, "position": 0.3}
+    far = effect.of_linear(CABLE, {"stiffness": 0.0, **force})
+    anchor = np.array([far[f"anchor_{axis}"] for axis in "xyz"])
+    assert np.linalg.norm(anchor) == pytest.approx(10 * CABLE.length)
+    np.testing.assert_allclose(far["stiffness"] * anchor, [-0.6, 0.8, 2.4], rtol=1e-14)
+    nowhere = effect.of_linear(CABLE, dict.fromkeys((*force, "stiffness"), 0.0))
+    assert (nowhere["stiffness"], nowhere["anchor_z"]) == (0.0, 0.0)
+
+
+def principal(ratio: float, angle: float) -> np.ndarray:
+    """Stiffness matrix about y and z, over that about the first axis."""
+    first, second = (np.array([np.cos(a), np.sin(a)]) for a in (angle, angle + np.pi / 2))
+    return np.outer(first, first) + ratio * np.outer(second, second)
+
+
+@pytest.mark.parametrize(("ratio", "angle"), [(3.0, 0.0), (3.0, 0.4), (0.3, -0.7), (1.0, 0.4)])
+def test_a_cantilever_of_two_stiffnesses(ratio, angle):
+    """Small tip loads: u = (L^3 / 3) B^-1 F, with M_y = -F_z (L - s), M_z = F_y (L - s)."""
+    force = np.array([2e-5, -1e-5])  # y, z [N]: deflections of 1e-4 L
+    pose = Pose((0.0, 0.0, 0.0), start_orientation=(0.0, 0.0, 0.0, 1.0))
+    effects, values = (BendingAnisotropy(), PointForce()), (ratio, angle, 0.0, *force, CABLE.length)
+    found = solved(effects, values, pose, (0.0, 0.0, 0.0), end="free")
+    curvatures = np.linalg.inv(CABLE.bending_stiffness * principal(ratio, angle)) @ [
+        -force[1],
+        force[0],
+    ]
+    exact = CABLE.length**3 / 3 * np.array([curvatures[1], -curvatures[0]])
+    # Ten elements of constant curvature: (1 / 10)^2 / 4 of it, and no more than the slope squared.
+    np.testing.assert_allclose(found.points[-1, 1:], exact, rtol=0.004, atol=1e-8)
+
+
+@pytest.mark.parametrize("ratio", [0.4, 0.9, 1.2, 5.0])
+@pytest.mark.parametrize("angle", [-0.7, 0.0, 0.5])
+def test_anisotropy_in_the_parameters_of_its_score_test(ratio, angle):
+    """EI (1 + a, b; b, 1 - a) is the same matrix but for the mean, which EI takes up."""
+    effect, own = BendingAnisotropy(), {"ratio": ratio, "angle": angle}
+    matrix = ca.evalf(effect.bending(ca.SX.eye(2), {k: ca.SX(v) for k, v in own.items()}))
+    np.testing.assert_allclose(np.array(matrix), principal(ratio, angle), atol=1e-15)
+    mean = np.trace(principal(ratio, angle)) / 2
+    scaled = principal(ratio, angle) / mean
+    values = {"difference": scaled[0, 0] - 1, "coupling": scaled[0, 1]}
+    linear = effect.linear()
+    assert linear.label == effect.label
+    found = ca.evalf(linear.bending(ca.SX.eye(2), {k: ca.SX(v) for k, v in values.items()}))
+    np.testing.assert_allclose(np.array(found), scaled, atol=1e-14)
+    assert effect.of_linear(CABLE, values) == pytest.approx(own, abs=1e-12)
+
+
+def test_a_matrix_that_is_no_stiffness_is_cut():
+    """A step of the score test may leave no stiffness about one axis."""
+    found = BendingAnisotropy().of_linear(CABLE, {"difference": -1.0, "coupling": 0.8})
+    assert found["ratio"] == pytest.approx(100.0)
+    assert abs(found["angle"]) < np.pi / 4
+
+
+# ---- where they apply --------------------------------------------------------------------------
+
+ONLY = {
+    "plane": {
+        "clamp_angle",
+        "end_spring",
+        "image_distortion",
+        "image_scale",
+        "standoff_error",
+        "start_spring",
+    },
+    "space": {"bending_anisotropy", "camera_frame", "clamp_rotation"},
+}
+FULL = {"curved": True, "n_poses": 3, "center": (0.0, 0.0), "camera": True, "readings": True}
+
+
+def applied(where):
+    cable, gravity = (FLAT, (0.0, -9.81)) if where == "plane" else (CABLE, GRAVITY)
+    setups = [Setup(cable, end, end, gravity, **FULL) for end in ("pinned", "clamped")]
+    return {k for k, kind in EFFECTS.items() if any(kind.applies(setup) for setup in setups)}
+
+
+def test_where_effects_apply():
+    assert applied("plane") == set(EFFECTS) - ONLY["space"]
+    assert applied("space") == set(EFFECTS) - ONLY["plane"]
+
+
+@pytest.mark.parametrize("where", ["plane", "space"])
+def test_effects_of_the_other_kind_of_cable_are_refused(where):
+    cable, gravity = (CABLE, GRAVITY) if where == "plane" else (FLAT, (0.0, -9.81))
+    setup = Setup(cable, "clamped", "clamped", gravity, **FULL)
+    for name, kind in EFFECTS.items():
+        effect = kind.made_for(setup)
+        nominal = {q.name: q.nominal for q in effect.parameters(cable)}
+        refused = effect.refusal(setup, nominal)
+        assert bool(refused) == (name in ONLY[where]), name
+        if refused:
+            assert f"{len(gravity)} numbers" in refused
+
+
+def test_what_a_camera_sees_of_an_edge_is_of_a_plane():
+    assert all(kind.in_plane != kind.in_space for kind in NUISANCES.values())
+    assert not any(
+        kind.applies(Setup(CABLE, gravity=GRAVITY, pixel=1e-4)) for kind in NUISANCES.values()
+    )

@@ -1,0 +1,172 @@
+"""A cable in space, photographed from several places, against the curve that was drawn."""
+
+import cv2
+import numpy as np
+import pytest
+from scene import BOARD, CAMERA, DIAMETER, PLACES, bow, length_of, loop, photograph
+from scipy.spatial import cKDTree
+
+from dlo_casadi.errors import VisionError
+from dlo_casadi.vision import locate_camera, measure_views, see_cable
+
+CURVES = {"bow": bow(), "loop": loop()}
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return {
+        name: {where: photograph(curve, where) for where in PLACES}
+        for name, curve in CURVES.items()
+    }
+
+
+def measured(photographs, curve):
+    return measure_views(
+        photographs,
+        BOARD,
+        CAMERA,
+        start=curve[0],
+        end=curve[-1],
+        diameter=DIAMETER,
+        length=length_of(curve),
+    )
+
+
+def true_pixels(curve, where):
+    rotation, translation = PLACES[where]
+    at = curve @ rotation.T + translation
+    return CAMERA.distort(at[:, :2] / at[:, 2:])
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_a_camera_stands_where_it_stood(pictures, where):
+    """Corners drawn to a quarter of a pixel, 0.05 px on average; 1 px is 1.2 mm at 1 m."""
+    rotation, translation = PLACES[where]
+    found = locate_camera(pictures["bow"][where], BOARD, CAMERA)
+    assert found.reprojection_error < 0.15
+    assert found.center == pytest.approx(-rotation.T @ translation, abs=1e-3)
+    turn = found.rotation @ rotation.T
+    angles = 0.5 * np.array(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
+    shift = found.translation - turn @ translation
+    error = np.concatenate([angles, shift])
+    assert error @ np.linalg.solve(found.covariance, error) < 6 * 3.0**2
+
+
+def test_slopes_of_a_projection_are_its_differences(pictures):
+    view = locate_camera(pictures["bow"]["left"], BOARD, CAMERA)
+    points, step = CURVES["bow"][::200], 1e-6
+    _, slopes = view.project(points)
+    for axis in range(3):
+        moved = step * np.eye(3)[axis]
+        differences = (view.to_pixels(points + moved) - view.to_pixels(points - moved)) / (2 * step)
+        assert slopes[:, :, axis] == pytest.approx(differences, rel=1e-5, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize("where", PLACES)
+def test_the_line_in_a_photograph(pictures, name, where):
+    """It crosses itself, its shadow and the outline of the board."""
+    curve = CURVES[name]
+    view = locate_camera(pictures[name][where], BOARD, CAMERA)
+    sight = see_cable(
+        pictures[name][where],
+        view,
+        start=curve[0],
+        end=curve[-1],
+        diameter=DIAMETER,
+        length=length_of(curve),
+    )
+    truth = true_pixels(curve, where)
+    away, nearest = cKDTree(truth).query(sight.pixels)
+    # the picture's noise leaves 0.1 px; beside the squares of a marker single pixels are far off
+    middle, most = np.quantile(away[sight.whole], [0.5, 0.98])
+    assert middle < 0.12
+    assert most < 0.4
+    assert np.mean(cKDTree(sight.pixels).query(truth)[0] < 5.0) > 0.95
+    clear = nearest[sight.whole]
+    assert np.mean(np.diff(clear) > 0) > 0.97  # from start to end, but for crossings
+
+
+@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize(
+    "places", [("left", "ahead", "right"), ("left", "ahead"), ("ahead", "right"), ("left", "right")]
+)
+def test_the_line_in_space(pictures, name, places):
+    curve = CURVES[name]
+    found = measured({where: pictures[name][where] for where in places}, curve)
+    assert not found.problems
+    away = cKDTree(curve).query(found.line.points)[0]
+    assert rms(away) < 0.5e-3
+    assert np.mean(cKDTree(found.line.points).query(curve)[0] < 2.5e-3) > 0.95
+    assert rms(away / found.line.std) < 2.0
+    assert set(found.sights) == set(places)
+
+
+def test_one_photograph_is_no_line_but_pixels(pictures):
+    curve = CURVES["bow"]
+    found = measured({"ahead": pictures["bow"]["ahead"]}, curve)
+    assert found.line is None
+    assert rms(cKDTree(true_pixels(curve, "ahead")).query(found.sights["ahead"].pixels)[0]) < 0.15
+    assert "ahead alone gives no line in space" in found.messages[-1]
+
+
+def test_a_photograph_of_another_pose_is_named_and_left_out(pictures):
+    curve = CURVES["bow"]
+    mixed = {**pictures["bow"], "ahead": pictures["loop"]["ahead"]}
+    found = measured(mixed, curve)
+    assert list(found.problems) == ["ahead"]
+    assert "of this pose" in found.problems["ahead"]
+    assert rms(cKDTree(curve).query(found.line.points)[0]) < 0.5e-3
+    pair = {"left": pictures["bow"]["left"], "ahead": pictures["loop"]["ahead"]}
+    found = measured(pair, curve)
+    assert found.line is None
+    assert list(found.sights) == ["left"]
+    assert found.problems["ahead"].startswith("ahead: ")
+
+
+def test_two_photographs_from_one_place_have_no_depth(pictures):
+    curve = CURVES["bow"]
+    same = {"a": pictures["bow"]["left"], "b": pictures["bow"]["left"]}
+    found = measured(same, curve)
+    assert found.line is None
+    assert "nearly the same place" in found.problems["b"]
+
+
+def test_a_covered_board_is_named(pictures):
+    """Of four markers one may be hidden, not two; the other photographs are used."""
+    curve = CURVES["bow"]
+    covered = pictures["bow"]["left"].copy()
+    covered[:, :330] = 150
+    found = measured({**pictures["bow"], "left": covered}, curve)
+    assert found.problems["left"].startswith("left: the camera's place needs 3 markers")
+    assert rms(cKDTree(curve).query(found.line.points)[0]) < 0.5e-3
+
+
+def test_a_marker_that_is_seen_twice_is_not_used():
+    curve = CURVES["bow"]
+    twice = photograph(curve, "ahead", twice=((12, (0.05, -0.35)),))
+    view = locate_camera(twice, BOARD, CAMERA)
+    assert view.numbers == (10, 11, 13)
+    assert view.messages == (
+        "marker 12 is seen more than once and not used. Try: cover or remove the copy.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda image: np.ascontiguousarray(image[:, ::-1]), "The picture is mirrored"),
+        (lambda image: np.clip(image * 3.0 + 120, 0, 255).astype(np.uint8), "overexposed"),
+        (lambda image: cv2.GaussianBlur(image, (0, 0), 6.0), "blurred"),
+        (lambda image: np.full_like(image, 90), "no marker at all"),
+    ],
+)
+def test_a_photograph_that_cannot_be_used_says_why(pictures, spoil, said):
+    with pytest.raises(VisionError, match=said):
+        locate_camera(spoil(pictures["bow"]["left"]), BOARD, CAMERA)
