@@ -41,6 +41,10 @@ CLEARLY_WORSE = 2.0
 # Kass and Raftery 1995), whatever its cross-validated error.
 BIC_APART = 10.0
 
+# Different poses from which effects are told by how they change from pose to pose: two may differ
+# by chance, as two hangings of one do.
+DIFFERENT = 3
+
 # ---- what an explanation has to do -------------------------------------------------------------
 
 # Effects are no explanation if a pose that is left out is predicted worse than so many times the
@@ -64,13 +68,6 @@ ALONG_GRAVITY = 2.0
 # Absolute correlation of two nuisances beyond which their effects on the shapes are one: either's
 # variance is then five times, 1 / (1 - 0.9^2), what it would be if the other were known.
 ALIKE = 0.9
-# Poses that repeat worse than this many times the noise limit every prediction. Noise alone gives
-# (simulated, white and correlated over 3 % of the length) 1.1 to 1.3 with five hangings, 1.4 to 1.6
-# with two, of which half may thus be flagged without need.
-REPEATS = 1.5
-# Repeats that differ by more than so many times the noise take its place. Below, chi-square per
-# degree of freedom widens the intervals, and the shapes stay those of one line's noise.
-REPEATS_ARE_NOISE = 2.0
 
 # ---- intervals ---------------------------------------------------------------------------------
 

@@ -18,7 +18,6 @@ from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.equivalents import untried_equivalents
 from dlo_casadi.diagnosis.next_pose import NextPose, next_pose
 from dlo_casadi.diagnosis.pull import Pull, estimate_pull
-from dlo_casadi.diagnosis.repeatability import limiting_spread
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
 from dlo_casadi.diagnosis.structure import (
     Structure,
@@ -35,6 +34,7 @@ from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
 from dlo_casadi.thresholds import (
     BIC_APART,
+    DIFFERENT,
     LEAST_NOISE_DEGREES,
     LEFT,
     REFITTED,
@@ -248,10 +248,12 @@ class _Search:
         """Whether a pull may have a cause: in one pose a force fits as well as any."""
         return len(self.declared.problem.used) > 1 and self.max_effects > 0
 
-    @cached_property
+    @property
     def doubt(self) -> float | None:
-        """What a gain has to be held against where poses do not repeat; None where they do."""
-        return self.significance if limiting_spread(self.declared) is not None else None
+        """What a gain has to be held against where a pose or two were taken again and again."""
+        used = self.declared.problem.used
+        poses = {tuple(self.declared.problem.measured[j].pose.ends) for j in used}
+        return self.significance if len(poses) < min(DIFFERENT, len(used)) else None
 
     @cached_property
     def first(self) -> list[Screened]:
@@ -336,7 +338,7 @@ class _Search:
         if not added and not fit.noise.declared:
             fit = settle(fit)
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
-        limit = max(UNSEEN * fit.noise.std, UNSEEN_LEFT * self.error)
+        limit = max(UNSEEN * fit.expected_error, UNSEEN_LEFT * self.error)
         unpredicted = bool(added) and validation.rmse > limit
         unexplained = structure.p_noise < self.significance or unpredicted
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
@@ -356,7 +358,7 @@ class _Search:
         than LEFT of what it was: then what is missing beside them is small against what they
         explain. And all go if one force in each pose explains more than they do.
         """
-        floor = found.fit.noise.std**2 + found.fit.fixture_error**2
+        floor = found.fit.expected_error**2
         after, before = (max(x**2 - floor, 0.0) for x in (found.validation.rmse, self.error))
         if after <= LEFT * before and not self._needless(found, pull):
             return found
@@ -429,9 +431,9 @@ def _improving(
 ) -> list[Confirmed]:
     """Refits that improve both the fit and what it predicts.
 
-    Where the same pose does not repeat to the noise, scores count points as if they were
-    independent, and they are not. There whole poses alone decide: a gain as large must have less
-    than the probability `doubt` if poses that are left out are predicted no better (Student's t).
+    Hangings of one or two poses have in common whatever is wrong with their measurement. There
+    whole hangings decide: a gain as large must have less than the probability `doubt` if those
+    left out are predicted no better (Student's t).
     """
     out = []
     for item in tried:

@@ -71,7 +71,7 @@ class Structure:
 
 def noise_degrees(fit: Fit) -> float:
     """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
-    return max(LEAST_NOISE_DEGREES, fit.noise.slow_dof)
+    return max(LEAST_NOISE_DEGREES, min(fit.noise.slow_dof, fit.problem.rest_scatter.dof))
 
 
 def screening_degrees(fit: Fit) -> float:
@@ -81,12 +81,13 @@ def screening_degrees(fit: Fit) -> float:
     of cable told it, which is too much: what is found so has to pass a second test, under the
     noise that is left once it is in the model.
     """
+    rest_dof = fit.problem.rest_scatter.dof
     if fit.noise.declared:
         return noise_degrees(fit)
     if fit.noise.share == 0:
-        return float(fit.problem.n_residuals)
+        return float(min(fit.problem.n_residuals, max(LEAST_NOISE_DEGREES, rest_dof)))
     stretches = fit.model.cable.length / (np.sqrt(2 * np.pi) * fit.noise.length)
-    return float(max(LEAST_NOISE_DEGREES, len(fit.problem.used) * stretches))
+    return float(max(LEAST_NOISE_DEGREES, min(len(fit.problem.used) * stretches, rest_dof)))
 
 
 def structure_of(fit: Fit, noise_dof: float) -> Structure:
@@ -147,9 +148,7 @@ def _systematic(fit: Fit) -> float:
     """Probability of what poses that are alike have in common; 1 where the cable repeats."""
     if fit.problem.rest_scatter.std == 0:
         return 1.0
-    found = rest_scatter_of(
-        fit.problem, fit.point, fit.linearization, fit.noise, noise_known=True
-    )
+    found = rest_scatter_of(fit.problem, fit.point, fit.linearization, fit.noise, noise_known=True)
     return found.p_systematic
 
 

@@ -14,9 +14,10 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
-from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
+from dlo_casadi.estimation.hyperparameters import LEAST_POSES, SCATTER_FLOOR, SMOOTH_MODES, refine
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -34,6 +35,8 @@ POSES_OF_A_SEARCH = 40
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
 ROUGHNESS_START = 0.3
+# Turns per length, several times what heavy cables were measured to have, 0.1 to 0.3 1/m.
+FIRST_REST_TURNS = 0.05
 
 
 def starting_points(
@@ -120,11 +123,19 @@ def fit_model(
     if start is not None:
         return _continue(unknowns, measured, start, max_iterations)
     noise = NoiseModel(FIRST_STD) if std is None else NoiseModel(std, declared=True)
+    # Until it is estimated every hanging may have a rest curvature of its own: a fit that trusts
+    # each line to its noise would bend rest shape and stiffness to whatever is left.
+    rest_scatter = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
     scatter = tolerances.deviation(model.node)
-    if sum(item.readable and not item.held_out for item in measured) == 1:
+    count = sum(item.readable and not item.held_out for item in measured)
+    if count < LEAST_POSES:
+        rest_scatter = RestScatter()
+    if count == 1:
         # One pose does not deviate from others: what is wrong with it is wrong with the session.
         scatter = SCATTER_FLOOR * scatter
-    problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
+    problem = BatchProblem(
+        unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter, rest_scatter
+    )
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     best = None
     if len(problem.used) > POSES_OF_A_SEARCH and not model.has_state:

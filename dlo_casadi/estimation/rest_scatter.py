@@ -154,7 +154,8 @@ class RestLikelihood:
         self.cross = np.array([z.T @ x for z, x in zip(random, fixed, strict=True)])
         self.distances = distances
         square = (distances**2).sum() / max(self.m * (self.m - 1), 1)
-        self.apart = float(np.sqrt(square))
+        # Poses taken again and again are alike at any range.
+        self.apart = max(float(np.sqrt(square)), 1e-9)
 
     def deviance(
         self, noise: float, std: float, systematic: float, smoothness: float, range_: float
@@ -239,7 +240,6 @@ class RestLikelihood:
         )
         return Variances(*sizes(found.x), float(found.fun))
 
-
     def degrees(self, found: Variances, smoothness: float, range_: float | None) -> float:
         """Degrees of freedom with which the random part's variance is known.
 
@@ -278,16 +278,16 @@ def estimate_rest_scatter(likelihood: RestLikelihood) -> ScatterEstimate:
     """Sizes of maximal restricted likelihood: only what differs between poses alike is random."""
     alone = {s: likelihood.best(s, None) for s in SMOOTHNESS}
     smoothness = min(alone, key=lambda s: alone[s].deviance)
-    chosen, range_ = alone[smoothness], None
+    chosen, range_, guess = alone[smoothness], None, alone[smoothness].std
     ranges = [r * likelihood.apart for r in RANGES] if likelihood.m > 2 else []
-    both = {r: likelihood.best(smoothness, r, guess=chosen.std) for r in ranges}
+    both = {r: likelihood.best(smoothness, r, guess=guess) for r in ranges}
     joint = min(both, key=lambda r: both[r].deviance, default=None)
     gain = 0.0 if joint is None else max(chosen.deviance - both[joint].deviance, 0.0)
     # The best of the ranges; at a bound of zero half of chi-square's probability.
     p_systematic = float(min(1.0, 0.5 * len(RANGES) * chi2.sf(gain, 1)))
     if joint is not None and gain > TELLING:
         chosen, range_ = both[joint], joint
-    without = likelihood.best(smoothness, range_, std=False, guess=chosen.std)
+    without = likelihood.best(smoothness, range_, std=False, guess=guess)
     if without.deviance - chosen.deviance < TELLING:
         return ScatterEstimate(RestScatter(), without.noise, p_systematic)
     dof = likelihood.degrees(chosen, smoothness, range_)

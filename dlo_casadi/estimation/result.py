@@ -119,6 +119,35 @@ class Fit:
         ]
         return float(np.sqrt(np.concatenate(moved).mean()))
 
+    @cached_property
+    def hanging_error(self) -> float:
+        """RMS displacement of points [m] by the rest curvature of each hanging's own."""
+        problem = self.problem
+        if problem.rest_scatter.std == 0:
+            return 0.0
+        moved = problem.moved_by_rest(self.point.theta, self.point.shapes, self.point.feet)
+        square = 0.0
+        for way in moved:
+            sizes = np.tile(
+                problem.rest_scatter.sizes, way.shape[1] // len(problem.rest_scatter.sizes)
+            )
+            square += float(((way * sizes) ** 2).sum())
+        return float(np.sqrt(square / self._n_points))
+
+    @property
+    def _n_points(self) -> int:
+        return sum(len(self.problem.measured[j].points) for j in self.problem.used)
+
+    @cached_property
+    def expected_error(self) -> float:
+        """RMS distance [m] of the points of a pose that is only predicted, if nothing is missing.
+
+        Noise of the points, scatter of the fixtures, and how the cable repeats.
+        """
+        per_point = self.problem.n_residuals / self._n_points
+        square = per_point * (self.noise.std**2 + self.fixture_error**2) + self.hanging_error**2
+        return float(np.sqrt(square))
+
     @property
     def inflation(self) -> float:
         """Factor on standard deviations where the residual exceeds the noise."""

@@ -43,6 +43,11 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
             "correlation_length_m": measurement.correlation_length,
         },
         "stages": [_stage(name, outcome) for name in names],
+        "repeatability": {
+            "rest_curvature_std": outcome.repeatability.rest_curvature_std,
+            "expected_spread_m": outcome.repeatability.expected_spread,
+            "source": outcome.repeatability.source,
+        },
         "discretization": {
             "n": outcome.discretization.n,
             "element": outcome.discretization.element,

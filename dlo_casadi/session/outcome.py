@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
 from dlo_casadi.equilibrium import PoseBranch
+from dlo_casadi.estimation.hyperparameters import LEAST_POSES
 from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
@@ -237,6 +238,36 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
+class Repeatability:
+    """How well the cable comes back to the same shape.
+
+    Parameters
+    ----------
+    rest_curvature_std : float [1/m]
+        Of the rest curvature that each hanging has of its own; 0 where none was found.
+    expected_spread : float [m]
+        RMS distance of two hangings of a pose, at the measured points.
+    source : "repeats", "poses" or None
+        Whether poses were taken more than once, or it is what differs between poses beyond all
+        that they have in common; None where it could not be estimated.
+    """
+
+    rest_curvature_std: float
+    expected_spread: float
+    source: Literal["repeats", "poses"] | None
+
+    @classmethod
+    def of(cls, fit: Fit) -> Self:
+        """What a fit has found."""
+        ends = [fit.problem.measured[j].pose.ends for j in fit.problem.used]
+        repeated = len(set(map(tuple, ends))) < len(ends)
+        source: Literal["repeats", "poses"] = "repeats" if repeated else "poses"
+        spread = float(np.sqrt(2) * fit.hanging_error)
+        known = len(ends) >= LEAST_POSES
+        return cls(fit.problem.rest_scatter.std, spread, source if known else None)
+
+
+@dataclass(frozen=True)
 class Discretization:
     """Mesh of the model and the largest shape error [m] it causes, from two meshes."""
 
@@ -268,6 +299,7 @@ class Outcome:
     measurement: MeasurementSummary
     stages: tuple[Stage, ...]
     discretization: Discretization
+    repeatability: Repeatability
     timing: dict[str, float]
     fit: Fit
     verdict: Verdict | None = None
