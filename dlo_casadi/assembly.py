@@ -94,7 +94,8 @@ class Directions:
     """Directions of all that shapes depend on, q of them, of m poses.
 
     `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q),
-    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q).
+    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q). `tangent`: the tangent matrices by
+    which the shapes' directions were found, if they were.
     """
 
     x: FloatArray
@@ -102,6 +103,7 @@ class Directions:
     p: FloatArray
     rest: FloatArray
     deviation: FloatArray
+    tangent: BandMatrix | None = None
 
 
 class _Mapped:
@@ -201,6 +203,12 @@ class Assembly:
         end_value, end_slope, end_bend = self._call_ends("at_ends", shapes, given)
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
         return total, self._added(slope, end_slope), self._band(bend, end_bend)
+
+    def imbalance(self, shapes: Shapes, given: Given) -> Vector:
+        """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""
+        (slope,) = self._call_slots("slot_slope", shapes, given)
+        _, end_slope, _ = self._call_ends("at_ends", shapes, given)
+        return self._added(slope, end_slope)
 
     def _band(self, bend: FloatArray, ends: FloatArray) -> BandMatrix:
         m, b, k, n = len(bend), self.b, self.k, self.n

@@ -224,6 +224,11 @@ class CableModel:
         """Qualified names of the parameters, in the order of the vector `p`."""
         return tuple(parameter.name for parameter in self.parameters)
 
+    @property
+    def stiffness_indices(self) -> list[int]:
+        """Where the stiffnesses stand in the vector `p`, bending first."""
+        return [k for k, name in enumerate(self.names) if name in STIFFNESSES]
+
     @cached_property
     def nominal(self) -> FloatArray:
         """Parameter vector `p` at the nominal values."""
@@ -706,6 +711,12 @@ class CableModel:
         by_nodes += ca.diagcat(bend, ca.SX(self.n_border, self.n_border))
         outputs = [value, self._to_local.T @ gradient, by_nodes]
         return self._here("slot", self._slot_arguments, outputs)
+
+    @cached_property
+    def slot_slope(self) -> ca.Function:
+        """As `slot` -> its gradient alone, for a small part of the operations."""
+        gradient = ca.gradient(self._terms.lagrangian, self._by_slot)
+        return self._here("slot_slope", self._slot_arguments, [self._to_local.T @ gradient])
 
     @cached_property
     def at_ends(self) -> ca.Function:

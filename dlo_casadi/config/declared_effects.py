@@ -26,6 +26,7 @@ def declared_setup(config: Config | File) -> Setup:
             bending_stiffness=cable.prior_bending_stiffness,
             name=cable.name,
             straight=cable.rest_shape == "straight",
+            torsional_stiffness=cable.prior_torsional_stiffness if experiment.in_space else None,
         ),
         start=experiment.boundary.start,
         end=experiment.boundary.end,

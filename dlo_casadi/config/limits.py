@@ -111,7 +111,7 @@ def implausible_sizes(
     return problems
 
 
-def implausible_gravity(gravity: tuple[float, float]) -> list[Problem]:
+def implausible_gravity(gravity: tuple[float, ...]) -> list[Problem]:
     """Find a gravity [m/s^2] that no laboratory has."""
     return GRAVITY.problems(("gravity",), math.hypot(*gravity))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import stat
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -110,6 +110,9 @@ _FINE = 160
 # Seconds of COBYLA for one pose: measured 1 for 10 links, 4 for 20; it grows with the square.
 _COBYLA_LINKS = 20
 
+# Rounding to three digits moves the length of a quaternion by so much at most.
+UNIT = 2.0e-3
+
 # A start needs no more than a full turn [rad]; an end is continuous along a cable that may turn
 # round several times.
 _LARGEST_HEADINGS = {"start": 6.3, "end": 25.0}
@@ -134,8 +137,8 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
                 "the file without its ending, give each its own"
             )
         names.setdefault(pose.name, i)
-        if held.start == "clamped" and pose.start_heading is None:
-            wrong("a clamped start needs a start_heading [rad]")
+        for message, key in _frame_problems(experiment, pose):
+            wrong(message, key=key)
         for key, most in _LARGEST_HEADINGS.items():
             heading = getattr(pose, f"{key}_heading")
             if heading is not None and getattr(held, key) == "clamped" and abs(heading) > most:
@@ -143,14 +146,12 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
                     f"{key}_heading: {heading:g} rad: in degrees? then {math.radians(heading):.4g}",
                     key=f"{key}_heading",
                 )
-        if held.end == "clamped" and pose.end_heading is None:
-            wrong("a clamped end needs an end_heading [rad], continuous along the cable")
         if held.end != "free" and pose.end is None:
-            wrong(f"a {held.end} end needs its position: end: [x, y]")
+            wrong(f"a {held.end} end needs its position: end: {_axes(experiment)}")
         if pose.branch == "previous" and i == 0:
             wrong("the first pose continues none; branch: ccw or cw?", key="branch")
         if held.end == "free":
-            for key in ("end", "end_heading"):
+            for key in ("end", "end_heading", "end_orientation"):
                 if getattr(pose, key) is not None:
                     wrong(f"a free end has no {key}; boundary.end: pinned or clamped?")
         ending = pose.file.suffix.lower()
@@ -162,6 +163,43 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
         at = ("experiment", "poses")
         problems.append(Problem(at, "no pose has role: fit, there is nothing to fit to"))
     return problems
+
+
+def _axes(experiment: Experiment) -> str:
+    return "[x, y, z]" if experiment.in_space else "[x, y]"
+
+
+def _frame_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
+    """What is wrong with the ends of a pose, in the plane or in space, and its key."""
+    held, space = experiment.boundary, experiment.in_space
+    numbers = "three numbers of gravity: the cable is in space" if space else "two of gravity"
+    for key in ("start", "end"):
+        place = getattr(pose, key)
+        if place is not None and len(place) != len(experiment.gravity):
+            yield f"{key}: {_axes(experiment)} belongs here ({numbers})", key
+        orientation, heading = getattr(pose, f"{key}_orientation"), getattr(pose, f"{key}_heading")
+        if orientation is not None:
+            size = math.hypot(*orientation)
+            if abs(size - 1) > UNIT:
+                text = f"{key}_orientation: a unit quaternion [qx, qy, qz, qw] belongs here, "
+                yield text + f"its length is {size:.4g}", f"{key}_orientation"
+            if not space:
+                text = "is for a cable in space; gravity has two numbers. Try: "
+                yield f"{key}_orientation {text}{key}_heading", f"{key}_orientation"
+        if heading is not None and space:
+            text = "is for a cable in a plane; gravity has three numbers. Try: "
+            yield f"{key}_heading {text}{key}_orientation", f"{key}_heading"
+        if getattr(held, key) != "clamped":
+            continue
+        if space and orientation is None:
+            yield f"a clamped {key} needs a {key}_orientation [qx, qy, qz, qw]", None
+        if not space and heading is None:
+            how = " [rad]" if key == "start" else " [rad], continuous along the cable"
+            yield f"a clamped {key} needs a{'n' * (key == 'end')} {key}_heading{how}", None
+    if pose.turns and not (space and held.start == held.end == "clamped"):
+        yield "turns are of a cable in space that is clamped at both ends", "turns"
+    if pose.branch in ("ccw", "cw") and space:
+        yield f"branch: {pose.branch} is of a cable in a plane", "branch"
 
 
 def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) -> dict[str, str]:
@@ -176,7 +214,8 @@ def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) ->
             meant = ", ".join(f"{x / 1e3:g}" for x in pose.end)
             hint = f" Did you mean ({meant})?" if 10 * cable.length < distance else ""
             reasons[pose.name] = (
-                f"end ({pose.end[0]:g}, {pose.end[1]:g}) m is {distance:.4g} m from the start; "
+                f"end ({', '.join(f'{x:g}' for x in pose.end)}) m is {distance:.4g} m from the "
+                "start; "
                 f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?{hint}"
             )
     return reasons

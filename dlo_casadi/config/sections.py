@@ -45,6 +45,20 @@ def _pair(value: object) -> object:
     return value
 
 
+def _place(value: object) -> object:
+    if not isinstance(value, list | tuple) or len(value) not in (2, 3):
+        raise ValueError(
+            f"two numbers [x, y] belong here, in space three [x, y, z], found {show(value)}"
+        )
+    return value
+
+
+def _quaternion(value: object) -> object:
+    if not isinstance(value, list | tuple) or len(value) != 4:
+        raise ValueError(f"a quaternion [qx, qy, qz, qw] belongs here, found {show(value)}")
+    return value
+
+
 def _empty_section(value: object) -> object:
     """Read `model:` with nothing behind it as an empty section."""
     return {} if value is None else value
@@ -59,6 +73,16 @@ Vector = Annotated[
     tuple[Number, Number], BeforeValidator(_pair, json_schema_input_type=tuple[Number, Number])
 ]
 Row = tuple[Number, Number, Number]
+Place = Annotated[
+    tuple[Number, ...],
+    BeforeValidator(
+        _place, json_schema_input_type=tuple[Number, Number] | tuple[Number, Number, Number]
+    ),
+]
+Quaternion = Annotated[
+    tuple[Number, ...],
+    BeforeValidator(_quaternion, json_schema_input_type=tuple[Number, Number, Number, Number]),
+]
 
 
 class Section(BaseModel):
@@ -82,6 +106,8 @@ class Cable(Section):
     """Young's modulus E of a solid round rod [Pa], a crude prior; or give bending_stiffness."""
     bending_stiffness: Positive | None = None
     """Bending stiffness EI [N m^2], a crude prior; or give youngs_modulus."""
+    torsional_stiffness: Positive | None = None
+    """Torsional stiffness GJ [N m^2] of a cable in space, a crude prior; EI / 1.3 when absent."""
     rest_shape: Literal["straight", "curved"] = "curved"
     """Shape without load: straight (no rest curvature is fitted) or curved."""
 
@@ -93,6 +119,11 @@ class Cable(Section):
         assert self.youngs_modulus is not None  # checked when the object was made
         return self.youngs_modulus * math.pi * self.diameter**4 / 64.0
 
+    @property
+    def prior_torsional_stiffness(self) -> float:
+        """First guess of GJ [N m^2]: as declared, or EI / 1.3, of a round rod of nu = 0.3."""
+        return self.torsional_stiffness or self.prior_bending_stiffness / 1.3
+
     @model_validator(mode="after")
     def _plausible(self) -> Cable:
         problems = implausible_sizes(self.length, self.mass, self.diameter, self.bending_stiffness)
@@ -101,6 +132,8 @@ class Cable(Section):
             problems += STIFFNESS.problems(
                 ("youngs_modulus",), stiffness, " for EI = E pi d^4 / 64"
             )
+        if self.torsional_stiffness is not None:
+            problems += STIFFNESS.problems(("torsional_stiffness",), self.torsional_stiffness)
         if self.youngs_modulus is None and self.bending_stiffness is None:
             problems.append(
                 Problem((), "give youngs_modulus [Pa] or bending_stiffness [N m^2], found neither")
@@ -274,7 +307,11 @@ class Tolerances(Section):
     end: Positive = 2.0e-4
     """Of a coordinate of a fixture [m]."""
     heading: Positive = 1.0e-2
-    """Of a clamp's heading [rad]."""
+    """Of a clamp's heading in a plane [rad]."""
+    rotation: Positive = 5.0e-3
+    """Of a clamp's orientation in space, about each of its axes [rad]."""
+    roll: Positive = 1.0
+    """Of the roll of a cable in its end clamp, about itself [rad]."""
     scale: Positive = 3.0e-4
     """Of the scale of the measurement, relative."""
 
@@ -284,14 +321,21 @@ class Pose(Section):
 
     file: Path
     """Photograph or CSV, found relative to the YAML; an absolute path once loaded."""
-    start: Vector
-    """Where the start is held [x, y] [m]."""
-    end: Vector | None = None
-    """Where the end is held [x, y] [m]; a free end has none."""
+    start: Place
+    """Where the start is held [x, y] [m], in space [x, y, z]."""
+    end: Place | None = None
+    """Where the end is held [m]; a free end has none."""
     start_heading: Number | None = None
     """Direction of the cable in a clamped start, counter-clockwise from +x [rad]."""
     end_heading: Number | None = None
     """Direction of the cable in a clamped end, continuous along the cable [rad]."""
+    start_orientation: Quaternion | None = None
+    """Frame of a clamped start in space, a quaternion [qx, qy, qz, qw]; x forward along the
+    cable."""
+    end_orientation: Quaternion | None = None
+    """Frame of a clamped end in space, a quaternion [qx, qy, qz, qw]; x forward along the cable."""
+    turns: Number = 0.0
+    """Full turns of twist at the end about its x axis, beside the roll nearest to none."""
     role: Literal["fit", "held_out"] = "fit"
     """fit, or held_out to check the prediction."""
     branch: Literal["ccw", "cw", "previous"] | None = None
@@ -314,8 +358,9 @@ class Pose(Section):
 class Experiment(Section):
     """What was measured, and under which conditions."""
 
-    gravity: Vector
-    """Gravity in the board frame, such as [0.0, -9.81] [m/s^2]."""
+    gravity: Place
+    """Gravity in the board frame, such as [0.0, -9.81] [m/s^2]; three numbers put the cable in
+    space."""
     boundary: Boundary
     """How the two ends are held: {start: pinned | clamped, end: pinned | clamped | free}."""
     measurement: Annotated[Images | Centerlines, Field(discriminator="kind")]
@@ -324,6 +369,11 @@ class Experiment(Section):
     """How well the declared values are known."""
     poses: tuple[Pose, ...]
     """The poses, in the order in which they were taken."""
+
+    @property
+    def in_space(self) -> bool:
+        """Whether the cable may leave the plane."""
+        return len(self.gravity) == 3
 
 
 class EffectParameter(Section):
@@ -364,8 +414,8 @@ class ModelOptions(Section):
     n: Annotated[Count, Field(ge=MESH.least, le=MESH.most)] | None = None
     """Number of elements; chosen from the data when absent."""
     element: Literal["quadratic", "arc", "link"] = "quadratic"
-    """quadratic (the heading bows in an element: fourth order), arc (it varies linearly: second
-    order, five times cheaper) or link (straight, as in the paper)."""
+    """quadratic (curvature changes in an element: fourth order), arc (it is constant: second
+    order, five times cheaper) or link (straight, as in the paper; in a plane only)."""
     effects: tuple[
         Annotated[
             DeclaredEffect,

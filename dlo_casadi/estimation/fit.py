@@ -32,6 +32,9 @@ DECADES = (0, -1, 1, -2, 2, -3, 3)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
 # Of many poses only so many, evenly picked, are searched for where to start with all.
 POSES_OF_A_SEARCH = 40
+# Iterations in which a start that is not the first has to come below the best minimum: those that
+# have nearly always had converged by then, others creep along valleys in which weight hardly tells.
+STEPS_OF_A_RIVAL = 10
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
 ROUGHNESS_START = 0.3
@@ -160,7 +163,8 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
     )
     best: Point | None = None
     for point in points[:3]:
-        candidate, _ = problem.descend(point, tolerance=1e-2)
+        steps = STEPS_OF_A_RIVAL if best else 40
+        candidate, _ = problem.descend(point, steps, tolerance=1e-2)
         if best is None or candidate.objective < best.objective - 0.5:
             best = candidate
         elif abs(candidate.objective - best.objective) < 1.0:

@@ -42,6 +42,8 @@ LONGEST_MOVE = 1.5
 NO_REST_SCATTER = RestScatter()
 # A descent creeps where so many steps together gain no more than the last one may.
 CREEPING = 4
+# Steps that may follow one uphill before it is taken back, and how far up it may lead.
+WATCHED, WORSE = 2, 3.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Tolerances:
     heading: float = 1e-2
     scale: float = 3e-4
     rotation: float = 5e-3
+    roll: float = 1.0
 
     def deviation(self, node: type[Node]) -> FloatArray:
         """Standard deviations of a pose's deviations, see `deviation_names`; pulls are free."""
@@ -76,6 +79,8 @@ class Point:
         Half the sum of squares, priors included.
     data : float
         Sum of squares of the whitened residuals alone.
+    residuals : list of (R_j,)
+        These, whitened, of the fitted poses.
     """
 
     theta: FloatArray
@@ -83,6 +88,7 @@ class Point:
     feet: list[FloatArray]
     objective: float
     data: float
+    residuals: list[FloatArray]
 
 
 @dataclass(frozen=True)
@@ -253,17 +259,18 @@ class BatchProblem:
     def evaluate(self, theta: FloatArray, shapes: Shapes, feet: list[FloatArray]) -> Point:
         """Objective at given unknowns and equilibria."""
         seen = self.observed(theta, shapes)
-        moved, data = [], 0.0
+        moved: list[FloatArray] = []
+        residuals: list[FloatArray] = []
         for j, guess in zip(self.used, feet, strict=True):
             item = self.measured[j]
             s = item.located(seen[j], guess)
-            white = self.whitening(j) @ item.residual(seen[j], s)
             moved.append(s)
-            data += float(white @ white)
+            residuals.append(self.whitening(j) @ item.residual(seen[j], s))
+        data = float(sum(white @ white for white in residuals))
         gap = theta - self.mean
         used = shapes.deviation[np.ix_(self.used, self.sweep.used_deviations)]
         prior = float(gap @ self.precision @ gap + ((used / self.deviation_std) ** 2).sum())
-        return Point(theta, shapes, moved, (data + prior) / 2, data)
+        return Point(theta, shapes, moved, (data + prior) / 2, data, residuals)
 
     def linearize(self, point: Point) -> Linearization:
         """Whitened residuals and their exact first derivatives."""
@@ -370,19 +377,16 @@ class BatchProblem:
         damping, gains = 0.0, [np.inf] * CREEPING
         lin = self.linearize(point)
         for _ in range(max_iterations):
-            normal = self.normal_equations(point, lin)
-            while True:
-                step, deviation = self._step(point, normal, damping)
-                trial = self._try(point, lin, step, deviation)
-                if trial is not None and trial.objective <= point.objective + 1e-9 * abs(
-                    point.objective
-                ):
-                    break
+            limit = point.objective + 1e-9 * abs(point.objective)
+            before, trial = damping, self._ahead(point, lin, damping, limit, WATCHED)
+            while trial is None:
                 damping = max(10 * damping, 1e-4)
                 if damping > 1e8:
                     return point, False
+                trial = self._ahead(point, lin, damping, limit, WATCHED)
             gains = [*gains[1:], point.objective - trial.objective]
-            damping = damping / 10 if damping > 1e-6 else 0.0
+            if damping == before:
+                damping = damping / 10 if damping > 1e-6 else 0.0
             point = trial
             lin = self.linearize(point)
             # Where the residual exceeds the noise, so does a standard deviation's decrease.
@@ -392,6 +396,26 @@ class BatchProblem:
             if sum(gains) < tolerance * excess:
                 return point, False
         return point, False
+
+    def _ahead(
+        self, point: Point, lin: Linearization, damping: float, limit: float, more: int
+    ) -> Point | None:
+        """A point below a limit, in one step or with some more beyond one above it; else None.
+
+        The valley of stiffness against rest curvature, whose product is what shapes know, is
+        curved: a full step along it leads up its side, the next one back to its bottom.
+
+        References
+        ----------
+        The watchdog technique: Chamberlain et al., Math. Programming Study 16 (1982).
+        """
+        normal = self.normal_equations(point, lin)
+        trial = self._try(point, lin, *self._step(point, normal, damping))
+        if trial is None or trial.objective <= limit:
+            return trial
+        if not more or trial.objective > WORSE * limit:
+            return None
+        return self._ahead(trial, self.linearize(trial), damping, limit, more - 1)
 
     def _try(
         self, point: Point, lin: Linearization, step: FloatArray, deviation: FloatArray

@@ -32,7 +32,7 @@ class MomentCurve:
 
 
 def measured_moment_curve(
-    points: FloatArray, length: float, weight: float, gravity: tuple[float, float]
+    points: FloatArray, length: float, weight: float, gravity: tuple[float, ...]
 ) -> MomentCurve:
     """Moment against curvature of a cable with a free end, without any law of its section.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi.estimation.gauss_newton import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model import BENDING_STIFFNESS, STIFFNESSES
 from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, SYSTEMATIC_SHARE
 
 FloatArray = NDArray[np.floating]
@@ -50,23 +51,34 @@ def threshold(fit: Fit) -> float:
     return (NORMAL_95 + np.sqrt(square)) ** 2 * fit.inflation**2
 
 
-def stiffness_interval(fit: Fit) -> Interval:
-    """Profile-likelihood interval of the bending stiffness [N m^2].
+def stiffness_intervals(fit: Fit) -> dict[str, Interval]:
+    """Intervals of the stiffnesses that are estimated, see `stiffness_interval`."""
+    free = [name for name in STIFFNESSES if name in fit.problem.unknowns.names]
+    return {name: stiffness_interval(fit, name) for name in free}
+
+
+def stiffness_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
+    """Profile-likelihood interval of a stiffness [N m^2].
 
     The stiffness is held, everything else refitted; the prior of the stiffness itself does not
     count.
+
+    Parameters
+    ----------
+    name : str
+        Of STIFFNESSES: bending by default.
     """
-    log_ei = float(np.log(fit.p[0]))
-    k = fit.problem.unknowns.names.index("bending_stiffness")
+    log_ei = float(np.log(fit.value(name)))
+    k = fit.problem.unknowns.names.index(name)
     log_std = float(np.sqrt(max(fit.covariance[k, k], 0.0))) * fit.inflation
     limit = threshold(fit)
 
     def held(log_value: float, near: Point) -> tuple[Point, float] | None:
-        tried = _held(fit, log_value, near)
+        tried = _held(fit, log_value, near, name)
         return None if tried is None else (tried[0], tried[1] - limit)
 
     def end(direction: int) -> float | None:
-        near = _others(fit)
+        near = _others(fit, name)
         low, f_low = 0.0, -limit
         step = min(max(np.sqrt(limit) * log_std, 1e-4), 0.7)
         while low < LARGEST_LOG_STEP:
@@ -107,29 +119,29 @@ def stiffness_profile(fit: Fit, stiffness: FloatArray) -> FloatArray:
     order = np.argsort(wanted)
     # Outwards from the estimate, each refit from its neighbour's.
     for side in (order[wanted[order] >= here], order[wanted[order] < here][::-1]):
-        near = _others(fit)
+        near = _others(fit, BENDING_STIFFNESS)
         for k in side:
-            tried = _held(fit, float(wanted[k]), near)
+            tried = _held(fit, float(wanted[k]), near, BENDING_STIFFNESS)
             if tried is not None:
                 near, rises[k] = tried
     return rises
 
 
-def _others(fit: Fit) -> Point:
+def _others(fit: Fit, name: str) -> Point:
     """The fit's minimum without the stiffness among its unknowns."""
     names = np.array(fit.problem.unknowns.names)
-    return replace(fit.point, theta=fit.point.theta[names != "bending_stiffness"])
+    return replace(fit.point, theta=fit.point.theta[names != name])
 
 
-def _held(fit: Fit, log_value: float, near: Point) -> tuple[Point, float] | None:
+def _held(fit: Fit, log_value: float, near: Point, name: str) -> tuple[Point, float] | None:
     """Refit with the stiffness held, from a neighbour; the rise of twice the objective."""
     model, found = fit.model, fit.problem.unknowns
-    k = found.names.index("bending_stiffness")
+    k = found.names.index(name)
     gap = fit.point.theta[k] - fit.problem.mean[k]
     base = 2 * fit.point.objective - fit.problem.precision[k, k] * gap**2
-    others = np.array([name != "bending_stiffness" for name in model.names]) & found.free
+    others = np.array([other != name for other in model.names]) & found.free
     p = fit.p.copy()
-    p[0] = np.exp(log_value)
+    p[model.names.index(name)] = np.exp(log_value)
     unknowns = Unknowns(model, others, p, found.rest_free)
     problem = fit.problem.of(unknowns, sweep=fit.problem.sweep)
     problem.share_metric(fit.problem)

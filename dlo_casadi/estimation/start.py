@@ -74,7 +74,8 @@ def _each_node(sweep: Sweep) -> Directions:
     x = np.broadcast_to(np.eye(q).reshape((a.n, a.b, q)), (m, a.n, a.b, q))
     model = sweep.model
     counts = (a.k, len(model.parameters), model.chain.n_rests, len(model.deviation_names))
-    return Directions(x, *(np.zeros((m, count, q)) for count in counts))
+    lam, p, rest, deviation = (np.zeros((m, count, q)) for count in counts)
+    return Directions(x, lam, p, rest, deviation)
 
 
 def _kinematic_step(
@@ -189,6 +190,5 @@ def all_at_once(
 
 def _only(along: Directions, step: Vector) -> Directions:
     """A step of the shapes as one direction, all else still."""
-    return Directions(
-        step.x, step.y, *(0 * part[..., :1] for part in (along.p, along.rest, along.deviation))
-    )
+    p, rest, deviation = (0 * part[..., :1] for part in (along.p, along.rest, along.deviation))
+    return Directions(step.x, step.y, p, rest, deviation)

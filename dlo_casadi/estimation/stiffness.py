@@ -42,9 +42,12 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     rest = np.zeros(model.chain.n_rests)
     n_points = sum(len(item.points) for item in used)
 
+    stiff = model.stiffness_indices
+
     def at(log_ei: float) -> FloatArray:
+        # Torsion follows bending.
         p = model.nominal.copy()
-        p[0] = np.exp(log_ei)
+        p[stiff] *= np.exp(log_ei) / p[0]
         return p
 
     def follow(shapes: Shapes, from_log_ei: float, log_ei: float) -> tuple[Shapes, float]:
@@ -72,7 +75,8 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     grid: dict[float, tuple[Shapes, float]] = {}
     first = _cold(model, at(prior), rest, used)
     if first is None:
-        first = sweep.start_shapes(np.zeros((len(used), model.chain.n_nodes, 1)))
+        straight = np.tile(model.node.identity, (len(used), model.chain.n_nodes, 1))
+        first = sweep.start_shapes(straight)
     step = np.log(10) / _PER_DECADE
     for direction in (1, -1):
         shapes = first

@@ -24,6 +24,10 @@ FloatArray = NDArray[np.floating]
 # started [rad].
 LONGEST_STEP = 0.5
 REACH = 1.5
+# Steps by a matrix that is kept shrink by this factor at least, or it is evaluated anew: five
+# gradients cost less than one matrix. Steps longer than NEAR [rad] change the matrix too much.
+CONTRACTION = 0.2
+NEAR = 0.1
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,11 @@ class Sweep:
         max_iterations: int = 25,
         tolerance: float = 1e-10,
         reach: float = REACH,
+        tangent: BandMatrix | None = None,
     ) -> tuple[Shapes, NDArray[np.bool_]]:
         """Newton's method from nearby shapes, for each pose until it has converged or is lost.
+
+        A pose's tangent matrix is kept while its steps shrink fivefold; see `CONTRACTION`.
 
         Parameters
         ----------
@@ -124,6 +131,8 @@ class Sweep:
             Largest step at convergence.
         reach : float [rad]
             A pose whose nodes move farther is lost: it runs for another equilibrium, or none.
+        tangent : BandMatrix, optional
+            Tangent matrices of equilibria close by, to begin with.
 
         Returns
         -------
@@ -135,12 +144,15 @@ class Sweep:
         converged = np.zeros(self.m, dtype=bool)
         coupled = self.model.has_state and rest.ndim == 1
         active, last = np.arange(self.m), np.full(self.m, np.inf)
+        matrix = None if coupled else tangent
+        stale = np.full(self.m, matrix is None)
         for _ in range(max_iterations):
             given = self._given(now, p, rest).subset(active)
             here = now.subset(active)
-            _, force, matrix = self.assembly.balance(here, given)
+            fresh = stale[active] | coupled
+            force, matrix = self._linearized(here, given, active, fresh, matrix)
             try:
-                step = self._newton(here, given, force, matrix, coupled)
+                step = self._newton(here, given, force, matrix.subset(active), coupled)
             except np.linalg.LinAlgError:
                 break
             size = np.abs(step.x).max(axis=(1, 2, 3))
@@ -149,7 +161,9 @@ class Sweep:
             share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
             there = self.moved(here, step, share)
             now.x[active], now.lam[active] = there.x, there.lam
-            done = _settled(size, last[active], tolerance)
+            done = _settled(size, last[active], tolerance, fresh)
+            stale[active] = ~(size < CONTRACTION * last[active]) & np.isfinite(last[active])
+            stale[active] |= size > NEAR
             way = self.node.difference(shapes.x[active], there.x)
             lost = ~(np.abs(way).max(axis=(1, 2)) <= reach)
             converged[active[done & ~lost]] = True
@@ -161,6 +175,27 @@ class Sweep:
                 break
         now.x[~converged], now.lam[~converged] = shapes.x[~converged], shapes.lam[~converged]
         return now, converged
+
+    def _linearized(
+        self,
+        here: Shapes,
+        given: Given,
+        active: NDArray[np.intp],
+        fresh: NDArray[np.bool_],
+        matrix: BandMatrix | None,
+    ) -> tuple[Vector, BandMatrix]:
+        """Imbalance of the active poses, and all poses' matrices, of some of them evaluated."""
+        if fresh.all():
+            _, force, new = self.assembly.balance(here, given)
+            if len(active) == self.m or matrix is None:
+                return force, new
+            return force, matrix.replaced(active, new)
+        assert matrix is not None
+        force = self.assembly.imbalance(here, given)
+        if fresh.any():
+            _, _, new = self.assembly.balance(here.subset(fresh), given.subset(fresh))
+            matrix = matrix.replaced(active[fresh], new)
+        return force, matrix
 
     def _newton(
         self, here: Shapes, given: Given, force: Vector, matrix: BandMatrix, coupled: bool
@@ -261,7 +296,7 @@ class Sweep:
     ) -> Directions:
         load = self.assembly.imbalance_by(shapes, given, still)
         found = matrix.factor().solve(load)
-        return replace(still, x=-found.x, lam=-found.y)
+        return replace(still, x=-found.x, lam=-found.y, tangent=matrix)
 
     def _carried(
         self,
@@ -322,12 +357,15 @@ def _still(a: Assembly, m: int, rest: FloatArray, p: FloatArray) -> Directions:
     )
 
 
-def _settled(size: FloatArray, last: FloatArray, tolerance: float) -> NDArray[np.bool_]:
+def _settled(
+    size: FloatArray, last: FloatArray, tolerance: float, fresh: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Whether Newton's method has converged with steps of this size after the last ones.
 
-    Steps that shrink quadratically need no further one to show that it would be too small, and
-    steps at rounding no longer shrink.
+    Steps that shrink quadratically, by fresh matrices, or linearly, by those kept, need no
+    further one to show that it would be too small; steps at rounding no longer shrink.
     """
-    ahead = size * (size / last) ** 2
+    rate = size / last
+    ahead = size * np.where(fresh, rate**2, rate)
     quadratic = np.isfinite(last) & (size < 1e-4) & (ahead < tolerance / 100)
     return (size < tolerance) | quadratic | ((size < 1e-7) & (size > 0.5 * last))

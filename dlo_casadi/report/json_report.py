@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.errors import well_formed
-from dlo_casadi.session.outcome import Outcome, ParameterEstimate, StageName
+from dlo_casadi.session.outcome import Outcome, ParameterEstimate, RestCurvatureEstimate, StageName
 
 SCHEMA = "dlo-report/1"
 # In every report, in this order; `closed` only where an effect was added.
@@ -130,8 +130,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
     parameters: dict[str, Any] = {
         key: _estimate(estimate) for key, estimate in stage.parameters.items()
     }
-    rest = stage.rest_curvature
-    parameters["rest_curvature"] = {"s": rest.s, "value": rest.value, "std": rest.std}
+    parameters["rest_curvature"] = _rest_curvature(stage.rest_curvature)
     return {
         "name": name,
         "rmse_fit": stage.rmse_fit,
@@ -150,6 +149,14 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
         "chi2_per_dof": stage.chi2_per_dof,
         "parameters": parameters,
     }
+
+
+def _rest_curvature(rest: RestCurvatureEstimate) -> dict[str, Any]:
+    """Value and standard deviation along the cable, in space about each material axis."""
+    if rest.value.ndim == 1:
+        return {"s": rest.s, "value": rest.value, "std": rest.std}
+    about = zip(("k_y", "k_z"), rest.value, rest.std, strict=True)
+    return {"s": rest.s, **{name: {"value": value, "std": std} for name, value, std in about}}
 
 
 def _estimate(estimate: ParameterEstimate) -> dict[str, Any]:

@@ -185,7 +185,7 @@ def rest_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     if outcome.config.cable.rest_shape == "straight":
         return [("rest curvature", "0 1/m", "", "fixed: declared straight")]
     rest = outcome.stages[-1].rest_curvature
-    if not len(rest.value):
+    if not rest.value.size:
         return []
     low, high = rest.value.min(), rest.value.max()
     text = f"{low:.3g} to {high:.3g} 1/m"

@@ -108,6 +108,20 @@ class BandMatrix:
             self.diagonal[index], self.upper[index], self.border[index], self.corner[index]
         )
 
+    def replaced(self, index: NDArray[np.intp], other: BandMatrix) -> BandMatrix:
+        """Matrices of all poses, those of some taken from `other`."""
+        parts = []
+        for mine, new in (
+            (self.diagonal, other.diagonal),
+            (self.upper, other.upper),
+            (self.border, other.border),
+            (self.corner, other.corner),
+        ):
+            part = mine.copy()
+            part[index] = new
+            parts.append(part)
+        return BandMatrix(*parts)
+
     def with_border(self, columns: FloatArray) -> BandMatrix:
         """Return the matrices with more conditions, columns (m, n, b, k'), in the border."""
         m, _, _, k = self.border.shape

@@ -12,7 +12,7 @@ from dlo_casadi.diagnosis.candidates import setup_of
 from dlo_casadi.effects import EFFECTS, NUISANCES
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.gauss_newton import Tolerances
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import END_ROLL, CableModel
 
 # Elements of the declared model's mesh; refined from the data.
 MESH = 40
@@ -94,9 +94,11 @@ def declared_model(
         element=options.element,
         start=experiment.boundary.start,
         end=experiment.boundary.end,
-        gravity=(float(experiment.gravity[0]), float(experiment.gravity[1])),
+        gravity=experiment.gravity,
         n_rest=REST_COEFFICIENTS if coefficients is None else coefficients,
     )
+    if END_ROLL in model.names:
+        model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
     values: dict[str, float] = {}
     fixed: list[str] = []
     for item in options.effects:

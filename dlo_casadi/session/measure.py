@@ -104,10 +104,13 @@ def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
 def conditions(pose: DeclaredPose) -> Pose:
     """End conditions of a configured pose."""
     return Pose(
-        start=(pose.start[0], pose.start[1]),
-        end=None if pose.end is None else (pose.end[0], pose.end[1]),
+        start=pose.start,
+        end=pose.end,
         start_heading=pose.start_heading,
         end_heading=pose.end_heading,
+        start_orientation=pose.start_orientation,
+        end_orientation=pose.end_orientation,
+        turns=pose.turns,
         branch=pose.branch,
         name=pose.name,
     )

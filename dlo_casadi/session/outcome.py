@@ -46,7 +46,10 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class RestCurvatureEstimate:
-    """Rest curvature along the cable: s [m], value and standard deviation [1/m]."""
+    """Rest curvature along the cable: s (M,) [m], value and standard deviation [1/m].
+
+    (M,) in a plane; (2, M) in space, about the material axes y and z.
+    """
 
     s: FloatArray
     value: FloatArray

@@ -133,9 +133,11 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
 def _scatter(fit: Fit) -> str:
     """How far the poses' fixtures are from their declared places, one standard deviation."""
     scatter = dict(zip(fit.model.deviation_names, fit.problem.scatter, strict=True))
+    # All components of a position, or of a turn, share one scatter.
+    place, turn = fit.model.node.axes[0], fit.model.node.turns[0]
     parts = {
-        "end_x": f"{1e3 * scatter['end_x']:.2g} mm at the end",
-        "start_heading": f"{scatter['start_heading']:.2g} rad at the start clamp",
-        "end_heading": f"{scatter['end_heading']:.2g} rad at the end clamp",
+        f"end_{place}": f"{1e3 * scatter[f'end_{place}']:.2g} mm at the end",
+        f"start_{turn}": f"{scatter[f'start_{turn}']:.2g} rad at the start clamp",
+        f"end_{turn}": f"{scatter[f'end_{turn}']:.2g} rad at the end clamp",
     }
     return ", ".join(parts[axis] for axis in fit.model.deviations if axis in parts)

@@ -17,7 +17,7 @@ from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SETTLED_MODES
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.profile import stiffness_interval
+from dlo_casadi.estimation.profile import stiffness_intervals
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model import CableModel
@@ -115,7 +115,7 @@ def fit_session(
 
     stages = before_stages(config, declared, inputs, measured, fit.model.n, clock, progress)
     reported = _declared_names(config, fit.model)
-    stages.append(fit_stage("batch", fit, measured, stiffness_interval(fit), reported))
+    stages.append(fit_stage("batch", fit, measured, stiffness_intervals(fit), reported))
     clock.lap("fit")
     outcome = Outcome(
         config=config,
@@ -173,14 +173,14 @@ def close_the_loop(
         fit = solved_by_ipopt(fit)
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
-    interval = stiffness_interval(fit)
+    intervals = stiffness_intervals(fit)
     if diagnosis.added:
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [name for name in fit.model.names if name.split(".")[0] in labels]
-        stages.append(fit_stage("closed", fit, measured, interval, [*reported, *names]))
+        stages.append(fit_stage("closed", fit, measured, intervals, [*reported, *names]))
     elif not diagnosis.unexplained:
         # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
-        stages[-1] = fit_stage("batch", fit, measured, interval, reported)
+        stages[-1] = fit_stage("batch", fit, measured, intervals, reported)
     clock.lap("diagnosis")
     return replace(
         outcome,
@@ -217,15 +217,14 @@ def before_stages(
     stages.append(stiffness_stage(plain, measured, fit_stiffness(plain, measured)))
     progress.step("stiffness alone", 1, 1)
     clock.lap("fit")
-    length = config.cable.length
     if not config.estimation.algorithm1:
-        stages.append(algorithm1_stage(None, measured, length, "switched off"))
+        stages.append(algorithm1_stage(None, measured, plain, "switched off"))
     elif not applies(declared.model):
         note = "the paper's loop needs two pinned ends"
-        stages.append(algorithm1_stage(None, measured, length, note))
+        stages.append(algorithm1_stage(None, measured, plain, note))
     elif any(item.s is not None for item in inputs):
         note = "the paper's loop needs lines along the cable, not single markers"
-        stages.append(algorithm1_stage(None, measured, length, note))
+        stages.append(algorithm1_stage(None, measured, plain, note))
     else:
         progress.step("the paper's loop", 0, 1)
         result = run_algorithm1(
@@ -236,7 +235,7 @@ def before_stages(
             inner=config.estimation.algorithm1_inner,
         )
         clock.lap("algorithm1")
-        stages.append(algorithm1_stage(result, measured, length))
+        stages.append(algorithm1_stage(result, measured, plain))
         progress.step("the paper's loop", 1, 1)
     clock.lap("fit")
     return stages

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from dlo_casadi.estimation.prediction import (
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import END_ROLL, CableModel
 from dlo_casadi.session.outcome import (
     BranchShape,
     ParameterEstimate,
@@ -106,14 +106,18 @@ def _stage(
     )
 
 
-def _no_rest(length: float) -> RestCurvatureEstimate:
-    s = np.linspace(0.0, length, _REST_POINTS)
-    return RestCurvatureEstimate(s, np.zeros_like(s), np.zeros_like(s))
+def _no_rest(model: CableModel) -> RestCurvatureEstimate:
+    s = np.linspace(0.0, model.cable.length, _REST_POINTS)
+    none = np.zeros((2, len(s))) if model.in_space else np.zeros(len(s))
+    return RestCurvatureEstimate(s, none, none)
 
 
 def initial_stage(model: CableModel, measured: Sequence[MeasuredPose]) -> Stage:
     """Prior stiffness, straight at rest: the paper's alpha^0."""
-    stiffness = ParameterEstimate(float(model.nominal[0]), 0.0, "N m^2")
+    stiffness = {
+        model.names[k]: ParameterEstimate(float(model.nominal[k]), 0.0, "N m^2")
+        for k in model.stiffness_indices
+    }
     rest = np.zeros(model.chain.n_rests)
     return _stage(
         "initial",
@@ -121,8 +125,8 @@ def initial_stage(model: CableModel, measured: Sequence[MeasuredPose]) -> Stage:
         model.nominal,
         rest,
         measured,
-        {"bending_stiffness": stiffness},
-        _no_rest(model.cable.length),
+        stiffness,
+        _no_rest(model),
         None,
     )
 
@@ -132,7 +136,7 @@ def stiffness_stage(
 ) -> Stage:
     """Stiffness fitted, straight at rest."""
     p = model.nominal.copy()
-    p[0] = found.EI
+    p[model.stiffness_indices] *= found.EI / p[0]
     half = NORMAL_95 * found.log_std
     known = 2 * half < np.log(IDENTIFIABLE)
     interval = tuple(float(found.EI * np.exp(x)) if known else None for x in (-half, half))
@@ -147,7 +151,7 @@ def stiffness_stage(
         np.zeros(model.chain.n_rests),
         measured,
         {"bending_stiffness": stiffness},
-        _no_rest(model.cable.length),
+        _no_rest(model),
         None,
     )
 
@@ -155,13 +159,13 @@ def stiffness_stage(
 def algorithm1_stage(
     result: Algorithm1Result | None,
     measured: Sequence[MeasuredPose],
-    length: float,
+    model: CableModel,
     note: str = "",
 ) -> Stage:
     """The paper's loop; empty where it cannot apply."""
     if result is None:
-        return Stage("algorithm1", None, None, None, {}, _no_rest(length), {}, note)
-    h = length / (len(result.theta_0) + 1)
+        return Stage("algorithm1", None, None, None, {}, _no_rest(model), {}, note)
+    h = model.cable.length / (len(result.theta_0) + 1)
     s = (np.arange(len(result.theta_0)) + 1) * h
     value = np.asarray(result.theta_0) / h
     return _stage(
@@ -181,26 +185,31 @@ def fit_stage(
     name: StageName,
     fit: Fit,
     measured: Sequence[MeasuredPose],
-    interval: Interval,
+    intervals: Mapping[str, Interval],
     reported: Sequence[str] = (),
 ) -> Stage:
     """A fit of the batch problem.
 
     Parameters
     ----------
+    intervals : mapping
+        Of the stiffnesses, by name.
     reported : sequence of str
         Qualified names of the parameters that are effects, not nuisances.
     """
     model = fit.model
-    stiffness = ParameterEstimate(
-        float(fit.p[0]),
-        fit.std("bending_stiffness"),
-        "N m^2",
-        (interval.low, interval.high),
-        interval.identifiable,
-    )
-    parameters = {"bending_stiffness": stiffness}
-    for qualified in reported:
+    parameters = {
+        name: ParameterEstimate(
+            fit.value(name),
+            fit.std(name),
+            "N m^2",
+            (interval.low, interval.high),
+            interval.identifiable,
+        )
+        for name, interval in intervals.items()
+    }
+    roll = [END_ROLL] if END_ROLL in model.names else []
+    for qualified in (*roll, *reported):
         q = model.parameters[model.names.index(qualified)]
         value = fit.value(qualified)
         at_bound = min(value - q.lower, q.upper - value) < 1e-9 * q.scale
@@ -224,9 +233,13 @@ def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
     model, unknowns = fit.model, fit.problem.unknowns
     s = np.linspace(0.0, model.cable.length, _REST_POINTS)
     if unknowns.n_rest == 0:
-        return _no_rest(model.cable.length)
-    basis = model.rest.basis(s)
+        return _no_rest(model)
+    axes = len(model.node.curvatures)
+    basis = np.kron(np.eye(axes), model.rest.basis(s))
     tail = slice(unknowns.n_parameters, unknowns.size)
     scaled = basis * model.cable.curvature_scale * fit.inflation
     variance = np.einsum("ik,kl,il->i", scaled, fit.covariance[tail, tail], scaled)
-    return RestCurvatureEstimate(s, basis @ fit.coefficients, np.sqrt(np.maximum(variance, 0)))
+    std = np.sqrt(np.maximum(variance, 0))
+    value = basis @ fit.coefficients
+    shape = (axes, len(s)) if model.in_space else (len(s),)
+    return RestCurvatureEstimate(s, value.reshape(shape), std.reshape(shape))

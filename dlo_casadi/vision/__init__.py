@@ -1,8 +1,11 @@
 """Photographs to centre-lines: arrays in, arrays out."""
 
 from dlo_casadi.vision.board import Board, locate_board, locate_camera
+from dlo_casadi.vision.calibration import Calibration, calibrate_camera
 from dlo_casadi.vision.centerline import Centerline, extract_centerline
+from dlo_casadi.vision.correspondence import places_along
 from dlo_casadi.vision.image import read_image
+from dlo_casadi.vision.outline import Outline, compare_pixels, project_outline
 from dlo_casadi.vision.pictures import draw_steps, write_picture
 from dlo_casadi.vision.sight import Sight, see_cable
 from dlo_casadi.vision.space_line import SpaceLine, Views, measure_views
@@ -12,8 +15,10 @@ from dlo_casadi.vision.workings import Workings
 
 __all__ = [
     "Board",
+    "Calibration",
     "Camera",
     "Centerline",
+    "Outline",
     "Reference",
     "Sight",
     "SpaceLine",
@@ -21,12 +26,16 @@ __all__ = [
     "Viewpoint",
     "Views",
     "Workings",
+    "calibrate_camera",
+    "compare_pixels",
     "draw_steps",
     "extract_centerline",
     "from_reference",
     "locate_board",
     "locate_camera",
     "measure_views",
+    "places_along",
+    "project_outline",
     "read_image",
     "see_cable",
     "write_picture",

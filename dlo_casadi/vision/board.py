@@ -13,12 +13,12 @@ from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.view import Array, Camera, View
 from dlo_casadi.vision.viewpoint import Viewpoint
 
-_MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
-_LEAST_MARKERS = 3  # for the pose of a camera: fewer span no more than a line of the board
+MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
+LEAST_MARKERS = 3  # for the pose of a camera: fewer span no more than a line of the board
 _BEST_CORNER_PX = 0.05  # what sampling and rounding to grey levels leave of a corner at least
 _WHITE, _MUCH_WHITE = 250, 0.3  # grey level, and share of a picture that is overexposed
 _BLURRED_PX = 2.5  # standard deviation of edges from which markers of some 30 px are not read
-_SHARED = 4  # corners that share light, blur and print: those of a marker count as one
+CORNERS_THAT_SHARE = 4  # corners that share light, blur and print: those of a marker count as one
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None =
             f"a standoff of {board.standoff:g} m needs a camera: without one only the board's own "
             "plane can be measured. Try: give camera.matrix, or standoff: 0."
         )
-    seen, repeated = _detect(image, board)
+    seen, repeated = detect_markers(image, board)
     found, plane, rms = _agreeing(seen, image.shape, board, camera)
     normal = np.cross(plane[:, 0], plane[:, 1])
     raised = plane + board.standoff * np.outer(normal, [0.0, 0.0, 1.0])
@@ -113,14 +113,14 @@ def locate_camera(image: NDArray[np.uint8], board: Board, camera: Camera) -> Vie
     VisionError
         If fewer than three of the board's markers are seen where they are declared.
     """
-    seen, repeated = _detect(image, board)
+    seen, repeated = detect_markers(image, board)
     messages = [
         f"marker {n} is seen more than once and not used. Try: cover or remove the copy."
         for n in sorted(repeated)
     ]
-    if len(seen) < _LEAST_MARKERS:
+    if len(seen) < LEAST_MARKERS:
         raise VisionError(
-            f"the camera's place needs {_LEAST_MARKERS} markers of the board, and "
+            f"the camera's place needs {LEAST_MARKERS} markers of the board, and "
             f"{'only ' if seen else ''}{sorted(seen)} of {sorted(board.marker_centers)} are seen. "
             "Try: a photograph with the whole board in it, sharp and not covered."
             + _spoilt(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
@@ -130,9 +130,9 @@ def locate_camera(image: NDArray[np.uint8], board: Board, camera: Camera) -> Vie
     for n in sorted(set(board.marker_centers) - set(found) - repeated):
         why = "is not where it is declared" if n in seen else "is not found"
         messages.append(f"marker {n} {why}; {len(found)} of {len(board.marker_centers)} are used")
-    if len(found) < _LEAST_MARKERS:
+    if len(found) < LEAST_MARKERS:
         raise VisionError(
-            f"the camera's place needs {_LEAST_MARKERS} markers of the board where they are "
+            f"the camera's place needs {LEAST_MARKERS} markers of the board where they are "
             f"declared, and only {sorted(found)} of {sorted(seen)} are. Try: marker_centers?"
         )
     rotation = np.column_stack([plane[:, :2], np.cross(plane[:, 0], plane[:, 1])])
@@ -168,10 +168,10 @@ def _agreeing(
     places = {marker: board.corners(marker) for marker in found}
     plane, errors = _fit(found, places, camera)
     majority = len(found) // 2 + 1
-    while max(errors.values()) > _MAX_ERROR_PX and len(found) > majority:
+    while max(errors.values()) > MAX_ERROR_PX and len(found) > majority:
         found, plane, errors = _without_worst(found, places, camera)
     rms = float(np.sqrt(np.mean(np.square(list(errors.values())))))
-    if rms > _MAX_ERROR_PX:
+    if rms > MAX_ERROR_PX:
         raise VisionError(
             f"the markers {sorted(found)} are {rms:.1f} px RMS off their declared places. "
             "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
@@ -195,7 +195,7 @@ def _pose_covariance(at: Array, rms: float, camera: Camera) -> Array:
     J = np.concatenate([by_turn, by_shift], axis=2).reshape(-1, 6)
     free = 2 * len(at) - 6
     scatter = max(rms**2 * len(at) / free, _BEST_CORNER_PX**2)
-    return np.asarray(np.linalg.inv(J.T @ J) * scatter * _SHARED)
+    return np.asarray(np.linalg.inv(J.T @ J) * scatter * CORNERS_THAT_SHARE)
 
 
 # Mistakes in marker_centers: what was written -> the board's axes, x right and y up.
@@ -215,12 +215,12 @@ def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) ->
         centers = {n: axes @ np.asarray(board.marker_centers[n], float) for n in found}
         turned = replace(board, marker_centers=centers)
         _, errors = _fit(found, {n: turned.corners(n) for n in found}, camera)
-        if len(found) > 1 and max(errors.values()) < _MAX_ERROR_PX:
+        if len(found) > 1 and max(errors.values()) < MAX_ERROR_PX:
             return f" With {what} in marker_centers they fit."
     return ""
 
 
-def _detect(image: NDArray[np.uint8], board: Board) -> tuple[dict[int, Array], set[int]]:
+def detect_markers(image: NDArray[np.uint8], board: Board) -> tuple[dict[int, Array], set[int]]:
     """Corners (4, 2) [px] of the board's markers, and the numbers that are seen more than once."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:

@@ -12,6 +12,7 @@ from dlo_casadi.vision.view import Array
 _CAP = 4.0  # standard deviations: how much a pair off its epipolar line may cost
 _SKIP = 1.0  # cost of a pixel at either end that the other photograph does not show
 _STEP = 0.05  # cost of a pair: of equal ways, along an epipolar line, the shortest is taken
+_NEAR_PX = 2.0  # how far off a curve may be seen; pixels four times as far are not of it
 _POSE_PX = 0.5  # px: what the cameras' places add to the error of an epipolar line
 
 
@@ -57,6 +58,31 @@ def match_lines(one: Sight, other: Sight) -> Match:
     first, second = first[good], second[good]
     found = len(np.unique(first)) + len(np.unique(second))
     return Match(first, second, found / (len(one.pixels) + len(other.pixels)))
+
+
+def places_along(sight: Sight, points: Array) -> Array:
+    """Where along a curve the pixels of a photograph lie, in order.
+
+    Parameters
+    ----------
+    sight : Sight
+        What is seen.
+    points : (M, 3) [m]
+        Along the curve, evenly and closely spaced.
+
+    Returns
+    -------
+    (K,) share of the way along the curve, 0 to 1, of the point that is seen nearest to each pixel;
+    nan where none is near.
+    """
+    seen = sight.viewpoint.to_pixels(points)
+    away = np.linalg.norm(sight.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX
+    first, second = cheapest_way(away)
+    off = away[first, second]
+    order = np.argsort(-off, kind="stable")  # of several points the nearest is written last
+    places = np.full(len(sight.pixels), np.nan)
+    places[first[order]] = np.where(off[order] < _CAP, second[order] / (len(points) - 1), np.nan)
+    return places
 
 
 def triangulate(one: Sight, other: Sight, match: Match) -> Array:

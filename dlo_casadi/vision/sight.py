@@ -43,6 +43,8 @@ class Sight:
         Distance of the two edges, the median along the line.
     width_std : scalar [px]
         Its scatter along the line.
+    diameter : scalar [m]
+        Of the cable, as declared.
     distance : scalar [m]
         Depth at which the picture was searched: between the fixtures.
     correlation : scalar [px]
@@ -62,6 +64,7 @@ class Sight:
     whole: NDArray[np.bool_]
     width: float
     width_std: float
+    diameter: float
     distance: float
     correlation: float
     confidence: float
@@ -152,6 +155,7 @@ def see_cable(
         ~hidden[kept],
         width / pixel,
         trace.width_std / pixel,
+        diameter,
         distance,
         FINE * np.sqrt(np.pi) * diameter / pixel,
         line.confidence,

@@ -11,14 +11,14 @@ from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.vision.correspondence import cheapest_way
+from dlo_casadi.vision.correspondence import places_along
+from dlo_casadi.vision.outline import compare_pixels
 from dlo_casadi.vision.sight import Sight
 from dlo_casadi.vision.view import Array
 from dlo_casadi.vision.viewpoint import Viewpoint
 
 _DEGREE = 3
 _GRID = 401  # places along the curve among which the nearest to a pixel is looked for
-_NEAR_PX = 2.0  # px: how far off the first curve may be seen; pixels four times as far do not count
 _TANGENTIAL = 1e-5  # m: a curve does not change by moving along itself
 _HUBER = 3.0  # standard deviations, from where on a pixel counts less
 # Spectral densities q of the third derivative that are tried, in L^2, where a curve of length L has
@@ -149,7 +149,8 @@ def fit_curve_to_sights(
     """
     curve = first
     n = len(curve.coefficients)
-    params = list(params or [_assign(curve, sight) for sight in sights])
+    grid = np.linspace(0.0, 1.0, _GRID)
+    params = list(params or [places_along(sight, curve.position(grid)) for sight in sights])
     motions = [np.zeros(6) for _ in sights]
     whitened = [_independent_std(sight) for sight in sights]
     rigid = [np.linalg.inv(sight.viewpoint.covariance) for sight in sights]
@@ -233,12 +234,10 @@ def _linearise(curve: SpaceCurve, sight: Sight, motion: Array, t: Array) -> tupl
     used = np.isfinite(t)
     camera = moved_camera(sight.viewpoint, motion)
     basis, points = curve.design(t[used]), curve.position(t[used])
-    pixels, slopes = camera.project(points)
-    tangent = np.einsum("kij,kj->ki", slopes, curve.tangent(t[used]))
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
-    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    error[used] = np.sum((sight.pixels[used] - pixels) * normal, axis=1)
-    by_point = np.einsum("ki,kij->kj", normal, slopes)
+    error[used], slopes = compare_pixels(
+        camera, sight.pixels[used], points, curve.tangent(t[used]), sight.diameter
+    )
+    by_point = -slopes
     by_shift = by_point @ camera.rotation.T
     turned = points @ camera.rotation.T + camera.translation - motion[3:]
     J[used] = np.hstack(
@@ -259,21 +258,6 @@ def moved_camera(viewpoint: Viewpoint, motion: Array) -> Viewpoint:
         rotation=turn @ viewpoint.rotation,
         translation=turn @ viewpoint.translation + motion[3:],
     )
-
-
-def _assign(curve: SpaceCurve, sight: Sight) -> Array:
-    """Parameters (K,) of the pixels, in order along the curve; nan for those far off."""
-    t = np.linspace(0.0, 1.0, _GRID)
-    seen = sight.viewpoint.to_pixels(curve.position(t))
-    away = np.linalg.norm(sight.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX
-    first, second = cheapest_way(away)
-    params = np.full(len(sight.pixels), np.nan)
-    order = np.argsort(-away[first, second], kind="stable")
-    params[first[order]] = t[second[order]]
-    near = np.full(len(params), np.inf)
-    near[first[order]] = away[first[order], second[order]]
-    params[near > 4.0] = np.nan
-    return params
 
 
 def _nearest(curve: SpaceCurve, sight: Sight, motion: Array, t: Array) -> Array:

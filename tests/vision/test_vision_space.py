@@ -1,5 +1,7 @@
 """A cable in space, photographed from several places, against the curve that was drawn."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,15 @@ from scene import BOARD, CAMERA, DIAMETER, PLACES, bow, length_of, loop, photogr
 from scipy.spatial import cKDTree
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision import locate_camera, measure_views, see_cable
+from dlo_casadi.vision import (
+    Camera,
+    compare_pixels,
+    locate_camera,
+    measure_views,
+    places_along,
+    project_outline,
+    see_cable,
+)
 
 CURVES = {"bow": bow(), "loop": loop()}
 
@@ -68,6 +78,36 @@ def test_slopes_of_a_projection_are_its_differences(pictures):
         assert slopes[:, :, axis] == pytest.approx(differences, rel=1e-5, abs=1e-3)
 
 
+def test_the_middle_of_an_outline_is_that_of_the_cylinders_surface(pictures):
+    """A thick cable near the camera: its outline by brute force over its surface.
+
+    Without a lens, which would bend the profile across so wide an outline.
+    """
+    straight = Camera(np.array([[810.0, 0.0, 470.0], [0.0, 810.0, 366.0], [0.0, 0.0, 1.0]]), [])
+    view = replace(locate_camera(pictures["bow"]["right"], BOARD, CAMERA), camera=straight)
+    diameter = 0.06
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        axis = view.center + view.rotation.T @ [*rng.uniform(-0.2, 0.2, 2), 0.5]
+        tangent = rng.standard_normal(3)
+        tangent /= np.linalg.norm(tangent)
+        seen = project_outline(view, axis, tangent, diameter)
+        one = np.cross(tangent, [0.3, 0.5, 0.8])
+        one /= np.linalg.norm(one)
+        angle, s = np.meshgrid(np.linspace(0, 2 * np.pi, 1441), np.linspace(-0.02, 0.02, 801))
+        ring = np.multiply.outer(np.cos(angle), one)
+        ring += np.multiply.outer(np.sin(angle), np.cross(tangent, one))
+        surface = axis + 0.5 * diameter * ring + s[..., None] * tangent
+        shape = (*angle.shape, 2)
+        off = view.to_pixels(surface.reshape(-1, 3)).reshape(shape) - view.to_pixels(axis)
+        across = off @ seen.normals[0]
+        profile = across[np.abs(off @ [seen.normals[0, 1], -seen.normals[0, 0]]) < 0.1]
+        edges = profile.min(), profile.max()
+        middle = (seen.pixels - view.to_pixels(axis))[0] @ seen.normals[0]
+        assert middle == pytest.approx(np.mean(edges), abs=0.03)
+        assert seen.half_widths[0] == pytest.approx(0.5 * (edges[1] - edges[0]), abs=0.03)
+
+
 @pytest.mark.parametrize("name", CURVES)
 @pytest.mark.parametrize("where", PLACES)
 def test_the_line_in_a_photograph(pictures, name, where):
@@ -106,6 +146,28 @@ def test_the_line_in_space(pictures, name, places):
     assert np.mean(cKDTree(found.line.points).query(curve)[0] < 2.5e-3) > 0.95
     assert rms(away / found.line.std) < 2.0
     assert set(found.sights) == set(places)
+
+
+def test_pixels_are_compared_with_a_curve_across_it(pictures):
+    """Moved by 1 mm, the true curve is where the slopes say that it is seen."""
+    curve = CURVES["loop"]
+    sight = measured(pictures["loop"], curve).sights["ahead"]
+    places = places_along(sight, curve[::5])
+    assert np.isfinite(places).mean() > 0.98
+    used = np.isfinite(places)
+    u = np.linspace(0.0, 1.0, len(curve))
+
+    def compared(moved):
+        at = np.stack([np.interp(places[used], u, moved[:, i]) for i in range(3)], axis=1)
+        steps = np.gradient(moved, axis=0)
+        steps = np.stack([np.interp(places[used], u, steps[:, i]) for i in range(3)], axis=1)
+        tangents = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+        return compare_pixels(sight.viewpoint, sight.pixels[used], at, tangents, DIAMETER)
+
+    distance, slopes = compared(curve)
+    assert rms(distance[sight.whole[used]]) < 0.2
+    move = np.array([3e-4, -8e-4, 5e-4])
+    assert compared(curve + move)[0] == pytest.approx(distance + slopes @ move, abs=0.01)
 
 
 def test_one_photograph_is_no_line_but_pixels(pictures):
