@@ -29,6 +29,7 @@ from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.hyperparameters import errors_of, settle
+from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
@@ -251,9 +252,10 @@ class _Search:
     @property
     def doubt(self) -> float | None:
         """What a gain has to be held against where a pose or two were taken again and again."""
-        used = self.declared.problem.used
-        poses = {tuple(self.declared.problem.measured[j].pose.ends) for j in used}
-        return self.significance if len(poses) < min(DIFFERENT, len(used)) else None
+        count = different_poses(self.declared.problem.history)
+        return (
+            self.significance if count < min(DIFFERENT, len(self.declared.problem.used)) else None
+        )
 
     @cached_property
     def first(self) -> list[Screened]:
@@ -335,11 +337,13 @@ class _Search:
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> _Found:
         """What has been found, and whether it explains the data."""
-        if not added and not fit.noise.declared:
+        if not added and not fit.noise.known:
             fit = settle(fit)
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
-        limit = max(UNSEEN * fit.expected_error, UNSEEN_LEFT * self.error)
-        unpredicted = bool(added) and validation.rmse > limit
+        limit = UNSEEN * fit.expected_error
+        if added:
+            limit = max(limit, UNSEEN_LEFT * self.error)
+        unpredicted = (bool(added) or self.several) and validation.rmse > limit
         unexplained = structure.p_noise < self.significance or unpredicted
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
 

@@ -1,14 +1,25 @@
-"""Which declared values the shapes of a session cannot tell apart."""
+"""How well the same pose repeats, and which declared values its shapes cannot tell apart."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.thresholds import ALIKE
+from dlo_casadi.thresholds import ALIKE, DIFFERENT, REPEATS
 
 FloatArray = NDArray[np.floating]
+
+
+def limiting_spread(fit: Fit) -> float | None:
+    """How badly the same pose repeats [m], where that is what limits a prediction, else None."""
+    if different_poses(fit.problem.history) >= DIFFERENT:
+        return None
+    spread = repeatability(fit.problem.history, fit.model.cable.length)
+    if spread is None or fit.noise.source == "repeats":
+        return spread
+    return spread if spread > REPEATS * fit.noise.std else None
 
 
 def alike(fit: Fit) -> list[tuple[str, ...]]:

@@ -82,7 +82,7 @@ def screening_degrees(fit: Fit) -> float:
     noise that is left once it is in the model.
     """
     rest_dof = fit.problem.rest_scatter.dof
-    if fit.noise.declared:
+    if fit.noise.known:
         return noise_degrees(fit)
     if fit.noise.share == 0:
         return float(min(fit.problem.n_residuals, max(LEAST_NOISE_DEGREES, rest_dof)))
@@ -148,7 +148,7 @@ def _systematic(fit: Fit) -> float:
     """Probability of what poses that are alike have in common; 1 where the cable repeats."""
     if fit.problem.rest_scatter.std == 0:
         return 1.0
-    found = rest_scatter_of(fit.problem, fit.point, fit.linearization, fit.noise, noise_known=True)
+    found = rest_scatter_of(fit.problem, fit.point, fit.linearization, fit.noise)
     return found.p_systematic
 
 

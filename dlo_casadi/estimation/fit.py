@@ -14,9 +14,10 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
-from dlo_casadi.estimation.hyperparameters import LEAST_POSES, SCATTER_FLOOR, SMOOTH_MODES, refine
+from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import all_at_once, measured_shapes
@@ -24,6 +25,7 @@ from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import STIFFNESSES, CableModel
 from dlo_casadi.parallel import map_in_order
+from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
 
@@ -125,21 +127,34 @@ def fit_model(
     unknowns = Unknowns(model, chosen, begin)
     if start is not None:
         return _continue(unknowns, measured, start, max_iterations)
-    noise = NoiseModel(FIRST_STD) if std is None else NoiseModel(std, declared=True)
-    # Until it is estimated every hanging may have a rest curvature of its own: a fit that trusts
-    # each line to its noise would bend rest shape and stiffness to whatever is left.
-    rest_scatter = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
+    noise = NoiseModel(FIRST_STD)
+    if std is not None:
+        declared = NoiseModel(std, source="declared")
+        noise = with_repeats(declared, measured, model.cable.length)
     scatter = tolerances.deviation(model.node)
     count = sum(item.readable and not item.held_out for item in measured)
-    if count < LEAST_POSES:
-        rest_scatter = RestScatter()
     if count == 1:
         # One pose does not deviate from others: what is wrong with it is wrong with the session.
         scatter = SCATTER_FLOOR * scatter
-    problem = BatchProblem(
-        unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter, rest_scatter
-    )
+    problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
+    fit = _searched(problem, theta, decades)
+    if different_poses(measured) >= DIFFERENT and fit.beyond_noise:
+        # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
+        # left: search once more as if every hanging had a rest curvature of its own.
+        first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
+        loose = problem.changed(noise, ROUGHNESS_START, scatter, first)
+        try:
+            other = _searched(loose, theta, decades)
+        except EstimationError:
+            return fit
+        return max(fit, other, key=lambda found: found.log_evidence)
+    return fit
+
+
+def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Fit:
+    """The best minimum from starts over decades of stiffness, noise and scatters estimated."""
+    model = problem.unknowns.model
     best = None
     if len(problem.used) > POSES_OF_A_SEARCH and not model.has_state:
         rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)
@@ -152,7 +167,7 @@ def fit_model(
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )
-    problem, point, converged = refine(problem, best, estimate=std is None)
+    problem, point, converged = refine(problem, best, estimate=not problem.noise.known)
     return Fit(problem, point, converged)
 
 
@@ -264,10 +279,10 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     except EstimationError:
         # The coarse mesh was too far off to be followed: start again from the measured shapes.
         names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]
-        std = fit.noise.std if fit.noise.declared else None
+        std = fit.noise.std if fit.noise.source == "declared" else None
         return fit_model(model, problem.history, problem.tolerances, std, free=names, values=fit.p)
     problem, point, converged = refine(
-        moved.problem, moved.point, estimate=not fit.noise.declared, rounds=2, modes=modes
+        moved.problem, moved.point, estimate=not fit.noise.known, rounds=2, modes=modes
     )
     return Fit(problem, point, converged)
 

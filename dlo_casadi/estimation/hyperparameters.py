@@ -16,6 +16,7 @@ from dlo_casadi.estimation.noise import (
     smooth_modes,
     tell_of_noise,
 )
+from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import (
     MOST_POSES,
     RestLikelihood,
@@ -25,6 +26,7 @@ from dlo_casadi.estimation.rest_scatter import (
     estimate_rest_scatter,
 )
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
 
@@ -32,8 +34,6 @@ FloatArray = NDArray[np.floating]
 # be missing, few once the model is taken as complete, because noise is slow, too.
 SMOOTH_MODES = 5
 SETTLED_MODES = 2
-# Poses from which what is random in each can be told from what is common to all.
-LEAST_POSES = 3
 # Degrees of freedom from which the size of the noise can be estimated.
 LEAST_SPARE = 3.0
 ROUGHNESS_FLOOR = 1e-3
@@ -46,7 +46,7 @@ def settle(fit: Fit) -> Fit:
     problem, point, converged = refine(
         fit.problem,
         fit.point,
-        estimate=not fit.noise.declared,
+        estimate=not fit.noise.known,
         rounds=2,
         modes=SETTLED_MODES,
     )
@@ -127,24 +127,19 @@ def errors_of(
         for count in range(modes, -1, -1):
             samples = _noise_samples(problem, point, lin, count)
             if tell_of_noise(samples):
-                noise = estimate_noise(samples, length)
+                noise = with_repeats(estimate_noise(samples, length), problem.history, length)
                 break
         else:
             noise, together = _white_noise(problem, point), True
-    found = rest_scatter_of(problem, point, lin, noise, noise_known=not together)
-    return replace(noise, std=found.noise * noise.std), found.rest
+    found = rest_scatter_of(problem, point, lin, noise)
+    return replace(noise, std=found.noise * noise.std) if together else noise, found.rest
 
 
 def rest_scatter_of(
-    problem: BatchProblem,
-    point: Point,
-    lin: Linearization,
-    noise: NoiseModel,
-    *,
-    noise_known: bool,
+    problem: BatchProblem, point: Point, lin: Linearization, noise: NoiseModel
 ) -> ScatterEstimate:
     """Rest curvature of each hanging's own; see `estimate_rest_scatter`."""
-    if len(problem.used) < LEAST_POSES:
+    if different_poses(problem.history) < DIFFERENT:
         return ScatterEstimate(RestScatter(), 1.0, 1.0)
     size, std = problem.unknowns.size, problem.deviation_std
     moved = problem.moved_by_rest(point.theta, point.shapes, point.feet)
@@ -161,7 +156,7 @@ def rest_scatter_of(
     shapes = shapes - shapes[:, :1]
     gap = shapes[:, None] - shapes[None]
     distances = np.sqrt((gap**2).sum(axis=3).mean(axis=2))
-    return estimate_rest_scatter(RestLikelihood(samples, distances, noise_known))
+    return estimate_rest_scatter(RestLikelihood(samples, distances))
 
 
 def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:

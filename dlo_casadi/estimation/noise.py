@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 
 FloatArray = NDArray[np.floating]
 Kernel = Literal["exponential", "matern", "gaussian"]
+Source = Literal["declared", "repeats", "estimated"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 # Slow sines per pose in which a missing effect would show.
 SLOW_MODES = 6
@@ -50,8 +51,9 @@ class NoiseModel:
     length : float [m]
         Correlation length.
     kernel : "exponential", "matern" or "gaussian"
-    declared : bool
-        Whether the standard deviation was declared instead of estimated.
+    source : "declared", "repeats" or "estimated"
+        Whether it was declared, is how poses repeat that were taken more than once, or was
+        estimated from the residual.
     slow_dof : float
         Degrees of freedom of chi-square with which the variance of slow modes is known.
     """
@@ -60,8 +62,13 @@ class NoiseModel:
     share: float = 0.0
     length: float = 0.0
     kernel: Kernel = "matern"
-    declared: bool = False
+    source: Source = "estimated"
     slow_dof: float = np.inf
+
+    @property
+    def known(self) -> bool:
+        """Whether it does not depend on the model that is fitted."""
+        return self.source != "estimated"
 
     def covariance(self, s: FloatArray, weight: FloatArray) -> FloatArray:
         """Covariance matrix (K, K) [m^2] at arc lengths s."""

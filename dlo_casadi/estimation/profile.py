@@ -43,7 +43,7 @@ def threshold(fit: Fit) -> float:
     """
     square = 0.0
     for j in fit.problem.used:
-        if not fit.noise.declared:
+        if fit.noise.source != "declared":
             break
         item = fit.problem.measured[j]
         constant = SYSTEMATIC_SHARE * fit.noise.std * item.relative_std[item.point_of]

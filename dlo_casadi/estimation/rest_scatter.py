@@ -110,7 +110,8 @@ class Variances:
     Parameters
     ----------
     noise : float
-        Factor on the standard deviation of the noise; 1 where it is known.
+        Factor on the standard deviation of the noise: where that is known, for what points are
+        off beyond it, which is no rest curvature either.
     std, systematic : float [1/m]
     deviance : float
         -2 log restricted likelihood, up to a constant.
@@ -130,14 +131,9 @@ class RestLikelihood:
     samples : sequence of ScatterSample
     distances : (m, m) [m]
         Between the poses' shapes, root mean square.
-    noise_known : bool
-        Whether the noise that whitens the samples is taken as it is.
     """
 
-    def __init__(
-        self, samples: Sequence[ScatterSample], distances: FloatArray, noise_known: bool
-    ) -> None:
-        self.noise_known = noise_known
+    def __init__(self, samples: Sequence[ScatterSample], distances: FloatArray) -> None:
         self.m, self.modes = len(samples), samples[0].rest.shape[1]
         self.count = sum(len(sample.e) for sample in samples)
         shared = np.concatenate([sample.shared for sample in samples])
@@ -214,7 +210,7 @@ class RestLikelihood:
         guess : float [1/m]
             Where to start.
         """
-        free = [not self.noise_known, std, range_ is not None]
+        free = [True, std, range_ is not None]
         low = guess * np.exp(_LOWEST)
 
         def sizes(q: FloatArray) -> tuple[float, float, float]:
@@ -228,8 +224,6 @@ class RestLikelihood:
             return self.deviance(*sizes(q), smoothness, range_ or 1.0)[0] + outside
 
         count = sum(free)
-        if not count:
-            return Variances(1.0, low, 0.0, deviance(np.zeros(0)))
         start = np.zeros(count)
         simplex = np.vstack([start, start - 1.5 * np.eye(count)])
         found = minimize(

@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
+from dlo_casadi.estimation.band import EDGE
 from dlo_casadi.estimation.moment import LEAST_POINTS, law_of, measured_moment_curve
 from dlo_casadi.report.canvas import (
     BLACK,
@@ -28,7 +29,7 @@ from dlo_casadi.report.canvas import (
     label_of,
     millimetres,
 )
-from dlo_casadi.report.geometry import magnified, measured_line
+from dlo_casadi.report.geometry import band_outline, magnified, measured_line
 from dlo_casadi.report.overlay import write_overlays
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 
@@ -158,6 +159,8 @@ def _draw_pose(
         shape = stage.shapes.get(pose.name)
         if shape is not None:
             axes.plot(*magnified(pose, shape, factor).T, color=color, ls=style)
+            if factor == 1 and shape.spread is not None and stage is lines[-1][0]:
+                axes.fill(*band_outline(shape.curve, EDGE * shape.spread).T, color=color, alpha=0.2)
     if len(pose.points):
         axes.plot(*pose.points[:: max(1, len(pose.points) // 60)].T, ".", color=BLACK, ms=2.5)
     axes.set_aspect("equal")

@@ -47,6 +47,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
             "rest_curvature_std": outcome.repeatability.rest_curvature_std,
             "expected_spread_m": outcome.repeatability.expected_spread,
             "source": outcome.repeatability.source,
+            "held_out_inside_90": outcome.inside_band,
         },
         "discretization": {
             "n": outcome.discretization.n,

@@ -32,6 +32,8 @@ from dlo_casadi.config import (
 )
 from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
 from dlo_casadi.errors import ConfigError, DloError
+from dlo_casadi.estimation.band import Uncertainty
+from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
 from dlo_casadi.parameters import Parameter
@@ -63,6 +65,8 @@ class Metadata:
         Fitted parameters, in the order of `covariance`.
     covariance : (N, N)
         In the products of the parameters' units.
+    uncertainty : Uncertainty
+        The same with what differs from pose to pose.
     std : dict
         Standard deviation of each parameter by name [SI]; 0 where it was not fitted.
     coefficients : (n_rest,) [1/m]
@@ -87,6 +91,7 @@ class Metadata:
     path: Path
     names: tuple[str, ...]
     covariance: FloatArray
+    uncertainty: Uncertainty
     std: dict[str, float]
     coefficients: FloatArray
     fixtures: dict[str, Any]
@@ -172,7 +177,8 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
 def fit_dict(fit: Fit) -> dict[str, Any]:
     """What a fit alone tells: the model, its parameters, covariance and state."""
     model = fit.model
-    names, covariance = covariance_si(fit)
+    names, covariance = fit.named_covariance
+    uncertainty = Uncertainty.of(fit)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "cable": {
@@ -209,6 +215,11 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
         },
         "state": {"rest_curvature": final_rest(fit), "unit": "1/m", "of": "cells, last pose done"},
         "covariance": {"names": list(names), "values": covariance},
+        "scatter": {
+            "fixtures": dict(uncertainty.scatter),
+            "rest_curvature_std": uncertainty.rest_scatter.std,
+            "rest_curvature_smoothness": uncertainty.rest_scatter.smoothness,
+        },
     }
     plain: dict[str, Any] = finite(document)
     return plain
@@ -224,20 +235,6 @@ def parameters_hash(document: Mapping[str, Any]) -> str:
     content["coefficients"] = document["rest_curvature"]["coefficients"]
     text = json.dumps(_as_floats(content), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def covariance_si(fit: Fit) -> tuple[tuple[str, ...], FloatArray]:
-    """Names and covariance of all fitted parameters in SI units, the residual's excess included.
-
-    The fit's own unknowns are scaled or logarithmic: C = D C_theta D with D = dp/dtheta.
-    """
-    unknowns = fit.problem.unknowns
-    slopes = unknowns.scales.copy()
-    by_theta = unknowns.slopes(fit.point.theta)
-    for k, name in enumerate(unknowns.names[: unknowns.n_parameters]):
-        slopes[k] = by_theta[fit.model.names.index(name), k]
-    scaled = fit.covariance * np.outer(slopes, slopes) * fit.inflation**2
-    return unknowns.names, np.asarray((scaled + scaled.T) / 2)
 
 
 def final_rest(fit: Fit) -> FloatArray:
@@ -395,11 +392,19 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     rest = document["state"]["rest_curvature"]
     names = tuple(document["covariance"]["names"])
     covariance = np.array(document["covariance"]["values"], dtype=float)
+    covariance = covariance.reshape(len(names), len(names))
     interval = rows["bending_stiffness"].get("interval_95")
+    scatter = document.get("scatter") or {}
+    rest_scatter = RestScatter(
+        float(scatter.get("rest_curvature_std", 0.0)),
+        float(scatter.get("rest_curvature_smoothness", RestScatter().smoothness)),
+    )
+    fixtures = {name: float(std or 0.0) for name, std in scatter.get("fixtures", {}).items()}
     metadata = Metadata(
         path=source,
         names=names,
-        covariance=covariance.reshape(len(names), len(names)),
+        covariance=covariance,
+        uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter),
         std={name: float(row.get("std") or 0.0) for name, row in rows.items()},
         coefficients=_numbers(coefficients, model.n_coefficients, "rest_curvature"),
         fixtures=dict(document.get("fixtures") or {}),

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
 from dlo_casadi.equilibrium import PoseBranch
-from dlo_casadi.estimation.hyperparameters import LEAST_POSES
+from dlo_casadi.estimation.band import EDGE
+from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
@@ -90,6 +92,8 @@ class PoseShape:
         Distance of the measured points across the prediction; in the plane positive to its left.
     energy : float [J]
     stable : bool
+    spread : (M,) or None [m]
+        Standard deviation across the curve of the next hanging; None if it was not computed.
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
     tipping : float or None [rad]
@@ -105,6 +109,7 @@ class PoseShape:
     stable: bool
     measured_branch: BranchShape | None = None
     tipping: float | None = None
+    spread: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -251,8 +256,9 @@ class Repeatability:
     expected_spread : float [m]
         RMS distance of two hangings of a pose, at the measured points.
     source : "repeats", "poses" or None
-        Whether poses were taken more than once, or it is what differs between poses beyond all
-        that they have in common; None where it could not be estimated.
+        Whether a pose or two were taken again and again, so that it is how far one hanging is
+        from the mean of the others, or it is what differs between poses beyond all that they have
+        in common; None where it could not be estimated.
     """
 
     rest_curvature_std: float
@@ -262,12 +268,11 @@ class Repeatability:
     @classmethod
     def of(cls, fit: Fit) -> Self:
         """What a fit has found."""
-        ends = [fit.problem.measured[j].pose.ends for j in fit.problem.used]
-        repeated = len(set(map(tuple, ends))) < len(ends)
-        source: Literal["repeats", "poses"] = "repeats" if repeated else "poses"
-        spread = float(np.sqrt(2) * fit.hanging_error)
-        known = len(ends) >= LEAST_POSES
-        return cls(fit.problem.rest_scatter.std, spread, source if known else None)
+        rest = fit.problem.rest_scatter.std
+        if different_poses(fit.problem.history) >= DIFFERENT:
+            return cls(rest, float(np.sqrt(2) * fit.hanging_error), "poses")
+        spread = repeatability(fit.problem.history, fit.model.cable.length)
+        return cls(rest, spread or 0.0, None if spread is None else "repeats")
 
 
 @dataclass(frozen=True)
@@ -318,6 +323,22 @@ class Outcome:
     def stage(self, name: StageName) -> Stage | None:
         """Return the stage of that name, or None."""
         return next((stage for stage in self.stages if stage.name == name), None)
+
+    @property
+    def inside_band(self) -> float | None:
+        """Share of held-out points inside the last stage's 90 % band, noise of points included.
+
+        None without held-out points.
+        """
+        stage, inside = self.stages[-1], []
+        for pose in self.poses:
+            shape = stage.shapes.get(pose.name)
+            if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:
+                continue
+            places = np.linspace(0.0, self.fit.model.cable.length, len(shape.spread))
+            std = np.hypot(np.interp(shape.s, places, shape.spread), self.measurement.std)
+            inside.append(np.abs(shape.residual) <= EDGE * std)
+        return float(np.concatenate(inside).mean()) if inside else None
 
     def held_out(self, stage: Stage) -> HeldOut:
         """How many of the declared held-out poses a stage has predicted."""

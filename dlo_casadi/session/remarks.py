@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dlo_casadi.config import SkippedPose
-from dlo_casadi.diagnosis.repeatability import alike
+from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.fitting import allowed_mesh_error
 from dlo_casadi.session.outcome import PoseInput, Stage
@@ -89,6 +89,12 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
 def fit_warnings(fit: Fit, error: float) -> list[str]:
     """What a fit cannot promise; `error` is that of its mesh [m]."""
     lines = []
+    spread = limiting_spread(fit)
+    if spread is not None:
+        lines.append(
+            f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
+            f"others), {_beside(fit)}: repeatability limits any prediction"
+        )
     rest = fit.problem.rest_scatter
     if rest.std > 0:
         lines.append(
@@ -97,6 +103,7 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"of its own of {rest.std:.2g} 1/m; the noise is {1e3 * fit.noise.std:.2g} mm. A "
             "model predicts their mean"
         )
+    if spread is not None or rest.std > 0:
         lines += [
             f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
         ]
@@ -128,6 +135,14 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"{MESH_SHARE:.0%} of the noise: model.n larger?"
         )
     return lines
+
+
+def _beside(fit: Fit) -> str:
+    """What the noise is to the repeats of a pose."""
+    std, length = 1e3 * fit.noise.std, 1e3 * fit.noise.length
+    if fit.noise.source == "repeats":
+        return f"which counts as noise of {std:.2g} mm, correlated over {length:.2g} mm of cable"
+    return f"the noise is {std:.2g} mm, and intervals from this session are too narrow"
 
 
 def _scatter(fit: Fit) -> str:

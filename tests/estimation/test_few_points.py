@@ -30,7 +30,7 @@ def test_noise_of_few_points(points):
     """Five points leave some twenty degrees of freedom in all, good to a factor of two."""
     fit = fitted(points)
     assert STD / 2 < fit.noise.std < 2 * STD
-    assert not fit.noise.declared
+    assert fit.noise.source == "estimated"
     assert 3 <= fit.noise.slow_dof < 8 * points
     assert abs(fit.value("bending_stiffness") - EI) < 3 * fit.std("bending_stiffness")
     # Nothing is missing, so that it is uniform: one seed in two hundred falls below.

@@ -38,7 +38,7 @@ def test_deviance_against_the_full_covariance(systematic):
     """Woodbury, pose by pose, and the textbook form with all rows in one matrix."""
     samples, distances = session(0.1)
     noise, std, smoothness, range_ = 1.3, 0.15, 0.25, 0.3
-    likelihood = RestLikelihood(samples, distances, noise_known=False)
+    likelihood = RestLikelihood(samples, distances)
     found, quadratic = likelihood.deviance(noise, std, systematic, smoothness, range_)
     sizes = RestScatter(1.0, smoothness).sizes
     alike = np.exp(-((distances / range_) ** 2) / 2)
@@ -64,8 +64,7 @@ def test_deviance_against_the_full_covariance(systematic):
 def test_a_random_rest_curvature_is_found_beside_unknown_noise():
     """Nine poses of six numbers: within a third, on average over twenty sessions."""
     found = [
-        estimate_rest_scatter(RestLikelihood(*session(0.2, seed=k, rows=12), noise_known=False))
-        for k in range(20)
+        estimate_rest_scatter(RestLikelihood(*session(0.2, seed=k, rows=12))) for k in range(20)
     ]
     assert np.mean([x.rest.std for x in found]) == pytest.approx(0.2, rel=0.15)
     assert np.mean([x.noise for x in found]) == pytest.approx(1.0, rel=0.15)
@@ -75,8 +74,7 @@ def test_a_random_rest_curvature_is_found_beside_unknown_noise():
 def test_a_cable_that_repeats_has_none():
     """A threshold of one percent: at most one of twenty sessions."""
     found = [
-        estimate_rest_scatter(RestLikelihood(*session(0.0, seed=k), noise_known=True)).rest.std
-        for k in range(20)
+        estimate_rest_scatter(RestLikelihood(*session(0.0, seed=k))).rest.std for k in range(20)
     ]
     assert np.count_nonzero(found) <= 1
 
@@ -85,7 +83,7 @@ def test_what_poses_that_are_alike_have_in_common_is_not_random():
     """A function of the pose, as a missing effect leaves it."""
     for seed in range(5):
         samples, distances = session(0.0, 0.5, seed)
-        found = estimate_rest_scatter(RestLikelihood(samples, distances, noise_known=True))
+        found = estimate_rest_scatter(RestLikelihood(samples, distances))
         assert found.p_systematic < 1e-6
         assert found.rest.std < 0.1
 

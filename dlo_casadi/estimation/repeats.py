@@ -1,0 +1,97 @@
+"""Poses that were taken more than once: what differs between them no model can explain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE
+
+FloatArray = NDArray[np.floating]
+
+# Of the length: beside a fixture all repeats are where it holds them.
+_BESIDE_FIXTURES = 0.02
+# Of the mean of repeats, a polyline.
+_NODES = 201
+
+
+def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | None:
+    """RMS distance [m] of a fit pose from the mean of the others held in the same way.
+
+    The floor of any prediction of the next one; None where no pose was taken twice.
+    """
+    grid = np.linspace(_BESIDE_FIXTURES, 1 - _BESIDE_FIXTURES, 97) * length
+    squares = []
+    for group in _groups(measured):
+        curves = np.array([_line(item, grid, length) for item in group])
+        # From the mean of the others it is m / (m - 1) times as far as from the mean of all.
+        gaps = (curves - curves.mean(axis=0)) * len(group) / (len(group) - 1)
+        squares += list((gaps**2).sum(axis=2).mean(axis=1))
+    return float(np.sqrt(np.mean(squares))) if squares else None
+
+
+def different_poses(measured: Sequence[MeasuredPose]) -> int:
+    """Number of fit poses that are held differently."""
+    fitted = [item.pose for item in measured if item.readable and not item.held_out]
+    return len({tuple(pose.ends) for pose in fitted})
+
+
+def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: float) -> NoiseModel:
+    """Noise of one line, or of repeats of a pose or two where they differ by more than twice that.
+
+    Pure error: the distances of repeats from their mean, sqrt(m / (m - 1)) larger for
+    its loss of one degree of freedom in m, with their correlation along the cable. A fit that
+    trusts each line to the noise of its points bends the rest shape to whatever is left, and may
+    end in one whose lowest equilibrium is far from all that was measured.
+
+    References
+    ----------
+    Draper and Smith, Applied Regression Analysis, section 2.1.
+    """
+    if different_poses(measured) >= DIFFERENT:
+        return noise  # what differs between hangings has its own place there, see `rest_scatter`
+    spread = repeatability(measured, length)
+    if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
+        return noise
+    samples = []
+    nodes = np.linspace(0.0, length, _NODES)
+    for group in _groups(measured):
+        lines = [_line(other, nodes, length) for other in group]
+        mean = NodeCurve(length, np.mean(lines, axis=0), None)
+        for item in group:
+            places = item.places(length)
+            gap = np.sqrt(len(group) / (len(group) - 1)) * (item.points - mean.at(places))
+            residual = item.components(mean, places, gap[..., None])[:, 0]
+            inside = np.abs(places / length - 0.5) < 0.5 - _BESIDE_FIXTURES
+            for sensor, points, rows in item.slices:
+                kept = np.repeat(inside[points], sensor.per_point)
+                e, s = residual[rows][kept], places[points][inside[points]]
+                none = np.zeros((len(e), 0))
+                if len(s):
+                    weight = sensor.weight[inside[points]]
+                    samples.append(NoiseSample(e, s, weight, none, none))
+    if not tell_of_noise(samples):
+        return noise
+    found = estimate_noise(samples, length)
+    return replace(found, source="repeats") if found.std > REPEATS_ARE_NOISE * noise.std else noise
+
+
+def _groups(measured: Sequence[MeasuredPose]) -> list[list[MeasuredPose]]:
+    """Fit poses that were held in the same way, two or more each."""
+    groups: dict[tuple[float, ...], list[MeasuredPose]] = {}
+    for item in measured:
+        if item.readable and not item.held_out:
+            groups.setdefault(tuple(item.pose.ends), []).append(item)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def _line(item: MeasuredPose, s: FloatArray, length: float) -> FloatArray:
+    """Places (K, d) [m] of a measured line at arc lengths s (K,) [m]."""
+    places = np.maximum.accumulate(item.places(length))
+    return np.stack([np.interp(s, places, column) for column in item.points.T], axis=1)
