@@ -66,6 +66,9 @@ class Result(Outcome):
         start: Sequence[float] | None = None,
         start_heading: float | None = None,
         end_heading: float | None = None,
+        start_orientation: Sequence[float] | None = None,
+        end_orientation: Sequence[float] | None = None,
+        turns: float = 0.0,
         branch: Branch | None = None,
     ) -> PredictedShape:
         """Predict the fitted cable's shape in a new pose: `dlo_casadi.predict` without a file."""
@@ -75,6 +78,9 @@ class Result(Outcome):
             start=start,
             start_heading=start_heading,
             end_heading=end_heading,
+            start_orientation=start_orientation,
+            end_orientation=end_orientation,
+            turns=turns,
             branch=branch,
         )
 

@@ -149,8 +149,8 @@ class Assembly:
         self.chain, self.node = model.chain, model.chain.kind.node
         self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
         self._slots = self.chain.n_slots
-        # Numbers that tell the rest curvature inside a slot.
-        self.n_inside = 3 * len(self.node.curvatures)
+        # Numbers that tell the rest strains inside a slot.
+        self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._slots) + 1, self.n - 1)
         self._functions: dict[str, _Mapped] = {}
 
@@ -294,25 +294,20 @@ class Assembly:
     # ---- state and strain ------------------------------------------------------------------------
 
     def strain(self, shapes: Shapes, given: Given) -> FloatArray:
-        """Mean curvatures (m, n_rests) [1/m] of the cells, about the axes in turn."""
+        """Mean strains (m, n_rests) [1/m] of the cells, one strain after the other."""
         (rows,) = self._call_slots("slot_strain", shapes, given)
         return self._stacked(rows[..., 0][:, self.chain.layout.bends])
 
-    def twist(self, shapes: Shapes, given: Given) -> FloatArray:
-        """Mean twist (m, n_cells) [1/m] of the cells; zero in a plane."""
-        (rows,) = self._call_slots("slot_twist", shapes, given)
-        return rows[:, self.chain.layout.bends, 0, 0]
-
     @staticmethod
     def _stacked(cells: FloatArray) -> FloatArray:
-        """Values (m, n_cells, axes, ...) of cells as (m, n_rests, ...), axis after axis."""
-        by_axis = np.moveaxis(cells, 2, 1)
-        return by_axis.reshape((len(cells), -1, *cells.shape[3:]))
+        """Values (m, n_cells, strains, ...) of cells as (m, n_rests, ...), strain after strain."""
+        by_strain = np.moveaxis(cells, 2, 1)
+        return by_strain.reshape((len(cells), -1, *cells.shape[3:]))
 
     def state_after(self, shapes: Shapes, given: Given) -> tuple[FloatArray, ...]:
-        """Rest curvature (m, n_rests) that poses leave; its slopes by both nodes, rest and p.
+        """Rest strains (m, n_rests) that poses leave; their slopes by both nodes, rest and p.
 
-        The slopes are (m, n_rests, 2b), (m, n_rests, axes) by the cell's own rest curvatures, and
+        The slopes are (m, n_rests, 2b), (m, n_rests, strains) by the cell's own rest strains, and
         (m, n_rests, n_parameters).
         """
         bends = self.chain.layout.bends
@@ -322,19 +317,19 @@ class Assembly:
 
     def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
         """Whether poses hand on the rest curvature that they find, to first order."""
-        axes = len(self.node.curvatures)
-        return bool(np.all(slopes[2] == np.repeat(np.eye(axes), self.chain.n_cells, axis=0)))
+        same = np.repeat(np.eye(len(self.node.strains)), self.chain.n_cells, axis=0)
+        return bool(np.all(slopes[2] == same))
 
     def state_along(
         self, slopes: tuple[FloatArray, ...], x: FloatArray, rest: FloatArray, p: FloatArray
     ) -> FloatArray:
         """Change (m, n_rests, q) of what poses leave behind, along nodes, rest and p."""
-        bends, axes = self.chain.layout.bends, len(self.node.curvatures)
+        bends, strains = self.chain.layout.bends, len(self.node.strains)
         _, by_x, by_rest, by_p = slopes
         both = np.concatenate([x[:, bends], x[:, bends + 1]], axis=2)
-        own = np.stack(self.chain.by_axis(rest), axis=2)
-        moved = (by_x[:, :, None] @ np.tile(both, (1, axes, 1, 1)))[:, :, 0]
-        moved += (by_rest[:, :, None] @ np.tile(own, (1, axes, 1, 1)))[:, :, 0]
+        own = np.stack(self.chain.by_strain(rest), axis=2)
+        moved = (by_x[:, :, None] @ np.tile(both, (1, strains, 1, 1)))[:, :, 0]
+        moved += (by_rest[:, :, None] @ np.tile(own, (1, strains, 1, 1)))[:, :, 0]
         return np.asarray(moved + by_p @ p)
 
 

@@ -145,7 +145,7 @@ class Equilibrium:
         Of the end conditions, places and pulls of springs: in the order of `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
         Of the joint bounds; zero where a joint bends freely.
-    curvature : (n_rests,) [1/m]
+    curvature : (axes n_cells,) [1/m]
         Mean curvature of each bending cell, in space about the axis y, then about z.
     twist : (n_cells,) [1/m]
         Mean twist of each cell; zero in a plane.
@@ -382,7 +382,7 @@ def guessed_frames(
     chord = None if model.end == "free" else (end - start) / float(length)
     cells = model.chain.cells
     widths = np.diff(cells, axis=1).ravel()
-    bent = rest.reshape((2, -1)) * widths
+    bent = model.chain.curvatures(rest) * widths
     return guessed_frames_of(u, chord, clamps, down, bent, pose.turns)
 
 
@@ -612,7 +612,9 @@ def _equilibrium(
 ) -> Equilibrium:
     """What there is to say of one shape."""
     assembly = model.assembly
-    curvature = assembly.strain(shapes, given)[0]
+    strain = assembly.strain(shapes, given)[0]
+    n_cells = model.chain.n_cells
+    curvature = model.chain.curvatures(strain).ravel()
     end_force, moments = split_multipliers(model, shapes.x[0], shapes.lam[0])
     return Equilibrium(
         x=shapes.x[0],
@@ -624,7 +626,7 @@ def _equilibrium(
         multipliers=shapes.lam[0],
         bound_multipliers=bound_lam,
         curvature=curvature,
-        twist=assembly.twist(shapes, given)[0],
+        twist=strain[:n_cells] if model.in_space else np.zeros(n_cells),
         min_bend_radius=smallest_radius(curvature, model.chain.cells),
         residual=residual,
         status=status,

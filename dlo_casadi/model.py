@@ -186,10 +186,10 @@ class CableModel:
     def rest_basis(self) -> FloatArray:
         """Rest curvature per coefficient (n_rests, n_coefficients): kappa_0 = rest_basis @ c.
 
-        In space the coefficients about the axis z follow those about y.
+        In space the coefficients about the axis z follow those about y; the rest twist is none.
         """
-        means = self.rest.cell_means(self.chain.cells)
-        return np.kron(np.eye(len(self.node.curvatures)), means)
+        means, strains = self.rest.cell_means(self.chain.cells), len(self.node.strains)
+        return np.kron(np.eye(strains)[:, -len(self.node.curvatures) :], means)
 
     @property
     def roughness(self) -> FloatArray:
@@ -331,8 +331,8 @@ class CableModel:
 
     @cached_property
     def _rest(self) -> ca.SX:
-        """Rest curvature inside a slot, see `Chain.rest_stencils`."""
-        return ca.SX.sym("rest", 3 * len(self.node.curvatures))
+        """Rest strains inside a slot, see `Chain.rest_stencils`."""
+        return ca.SX.sym("rest", 3 * len(self.node.strains))
 
     @cached_property
     def _place(self) -> ca.SX:
@@ -537,14 +537,25 @@ class CableModel:
 
     def _slot_energy(self, slot: Slot) -> ca.SX:
         """Energy of bending and loads of one slot [J]: of the loads, minus their work along it."""
+        return self._bending_energy(slot) - self._work(slot, self._slot_forces(slot))
+
+    def _work(self, slot: Slot, forces: list[ca.SX]) -> ca.SX:
+        """Work of `_slot_forces` along a slot [J]."""
         kind = self.chain.kind
-        energy = self._bending_energy(slot)
-        for u, weight in zip(*kind.rule, strict=True):
-            resultant = self._resultant(slot.start + u * slot.length)
-            energy -= weight * slot.length * ca.dot(resultant, kind.tangent(slot, u))
-        for force, share in zip(self._forces, ca.vertsplit(self._shares), strict=False):
-            energy -= ca.dot(force.force, kind.advance(slot, share))
-        return energy
+        nodes, weights = kind.rule
+        shares = ca.vertsplit(self._shares)
+        work = ca.SX(0)
+        for force, u, weight in zip(forces, nodes, weights, strict=False):
+            work += weight * slot.length * ca.dot(force, kind.tangent(slot, u))
+        for force, share in zip(forces[len(nodes) :], shares, strict=False):
+            work += ca.dot(force, kind.advance(slot, share))
+        return work
+
+    def _slot_forces(self, slot: Slot) -> list[ca.SX]:
+        """Dead forces [N] that a slot carries: at the points of its rule, then those on places."""
+        nodes, _ = self.chain.kind.rule
+        spread = [self._resultant(slot.start + u * slot.length) for u in nodes]
+        return [*spread, *(force.force for force in self._forces)]
 
     @cached_property
     def _shares(self) -> ca.SX:
@@ -616,6 +627,40 @@ class CableModel:
         true = self._slot(stretched, condensed.inner, condensed.square)
         # The curve whose end the Lagrangian's derivative by the multipliers holds.
         return _SlotTerms(lagrangian, kind.advance(true), stretched)
+
+    @cached_property
+    def slot_forces(self) -> ca.Function:
+        """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `slot_in_frame`."""
+        forces = self._slot_forces(self._slot(self._stretch, self._inner, ca.SX(0)))
+        arguments = [self._p, self._place, self._deviation]
+        return ca.Function("slot_forces", arguments, [ca.horzcat(*forces)])
+
+    @cached_property
+    def slot_in_frame(self) -> ca.Function:
+        """(local, inner, forces, p, rest, place, deviation, shares) -> energy [J] of a slot.
+
+        Its minimum over the inner unknowns is that of `slot_by_share`. Forces are arguments, so
+        that a slot and the forces on it may be turned together: the energy stays. The multiplier
+        of the end's place is such a force, too, against those that are spread.
+        """
+        kind, h = self.chain.kind, self.chain.h
+        ratio, inner = ca.SX.sym("ratio"), self._inner
+        slot = self._slot(ratio, inner, inner**2)
+        count = len(self._slot_forces(slot))
+        forces = ca.SX.sym("force", self.node.dimension, count)
+        energy = self._bending_energy(slot) - self._work(slot, ca.horzsplit(forces))
+        tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
+        lagrangian = kind.expanded(slot, energy, self._bending_energy)
+        lagrangian -= self._compliance * h * tension**2 / 2
+        local, step = self._local
+        own = [self._p, self._rest, self._place, self._deviation, self._shares]
+        found = ca.substitute([lagrangian], [ratio, step], [self._stretch, ca.SX.zeros(step.shape)])
+        return ca.Function("slot_in_frame", [local, inner, forces, *own], found)
+
+    @cached_property
+    def _inner(self) -> ca.SX:
+        """Unknowns inside an element that are eliminated from it."""
+        return ca.SX.sym("inner", self.chain.kind.n_inner)
 
     @cached_property
     def _at_ends(self) -> ca.SX:
@@ -797,13 +842,8 @@ class CableModel:
 
     @cached_property
     def slot_strain(self) -> ca.Function:
-        """As `slot` -> mean curvatures (axes,) of the cell [1/m]."""
+        """As `slot` -> mean strains of the cell [1/m]."""
         return self._here("strain", self._slot_arguments, [self.chain.kind.strain(self._plain)])
-
-    @cached_property
-    def slot_twist(self) -> ca.Function:
-        """As `slot` -> mean twist of the cell [1/m]."""
-        return self._here("twist", self._slot_arguments, [self.chain.kind.twist(self._plain)])
 
     @property
     def _plain(self) -> Slot:
@@ -817,11 +857,11 @@ class CableModel:
 
     @cached_property
     def slot_state(self) -> ca.Function:
-        """As `slot` -> rest curvatures (axes,) of the cell after it; by increments, rest and p."""
+        """As `slot` -> rest strains of the cell after it; by increments, rest and p."""
         own = self._rest[::3]
-        curvature, mean = self.chain.kind.strain(self._plain), own
+        strain, mean = self.chain.kind.strain(self._plain), own
         for effect, local in self._filling(StateEffect):
-            mean = effect.next_rest(mean, curvature, self.cable, local)
+            mean = effect.next_rest(mean, strain, self.cable, local)
         rest = ca.SX.sym("mean", own.numel())
         mean = ca.substitute(mean, own, rest)
         slopes = [ca.jacobian(mean, symbols) for symbols in (self._local[1], rest, self._p)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.assembly import Given
+from dlo_casadi.config import implausible_quaternion
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium import Branch, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
@@ -34,7 +35,7 @@ class CableCurve(NodeCurve):
     """A cable from its start at s = 0 to its end at s = L = `length` [m]."""
 
     def at(self, s: ArrayLike, derivative: int = 0) -> FloatArray:
-        """Positions (K, 2) [m] at arc lengths s (K,) [m] in [0, L], or derivatives by s.
+        """Positions (K, d) [m] at arc lengths s (K,) [m] in [0, L], or derivatives by s.
 
         Raises
         ------
@@ -91,7 +92,7 @@ class PredictedShape:
         return np.asarray(EDGE * np.linalg.norm(std, axis=1))
 
     def points(self, count: int = 101) -> FloatArray:
-        """Points (count, 2) [m] evenly spaced along the cable, from start to end.
+        """Points (count, d) [m] evenly spaced along the cable, from start to end.
 
         Raises
         ------
@@ -117,27 +118,40 @@ class PredictedShape:
     def as_dict(self, count: int = 101) -> dict[str, Any]:
         """Everything a program may want to know, as plain data in SI units."""
         eq, pose = self.equilibrium, self.pose
+        directions: dict[str, Any] = {
+            "start_heading": pose.start_heading,
+            "end_heading": pose.end_heading,
+        }
+        if self.cable.model.in_space:
+            directions = {
+                "start_orientation": _listed(pose.start_orientation),
+                "end_orientation": _listed(pose.end_orientation),
+                "turns": pose.turns,
+            }
         return {
             "cable": self.cable.model.cable.name,
             "model_hash": self.cable.metadata.model_hash,
             "length": self.cable.model.cable.length,
             "start": list(pose.start),
-            "end": None if pose.end is None else list(pose.end),
-            "start_heading": pose.start_heading,
-            "end_heading": pose.end_heading,
+            "end": _listed(pose.end),
+            **directions,
             "branch": pose.branch,
             "status": eq.status.name.lower(),
             "stable": eq.stable,
             "energy": eq.energy,
             "force_on_start": eq.lam_start.tolist(),
             "force_on_end": eq.lam.tolist(),
-            "moment_on_start": float(eq.moments[0]),
-            "moment_on_end": float(eq.moments[1]),
+            "moment_on_start": eq.moments[0].tolist(),
+            "moment_on_end": eq.moments[1].tolist(),
             "min_bend_radius": eq.min_bend_radius,
             "tipping": eq.tipping,
             "points": self.points(count).tolist(),
             "band_90": self.band(count).tolist(),
         }
+
+
+def _listed(values: tuple[float, ...] | None) -> list[float] | None:
+    return None if values is None else list(values)
 
 
 def predict(
@@ -147,6 +161,9 @@ def predict(
     start: Sequence[float] | None = None,
     start_heading: float | None = None,
     end_heading: float | None = None,
+    start_orientation: Sequence[float] | None = None,
+    end_orientation: Sequence[float] | None = None,
+    turns: float = 0.0,
     branch: Branch | None = None,
 ) -> PredictedShape:
     """Predict the shape of a fitted cable.
@@ -157,15 +174,20 @@ def predict(
     ----------
     parameters : str, Path or Parameters
         A parameters.yaml, the folder of results that holds it, or what was read from it.
-    end : (2,) [m]
-        Where the end is held; None for a free end.
-    start : (2,) [m], optional
-        Where the start is held; where all poses of the session had it, or (0, 0), by default.
+    end : (d,) [m]
+        Where the end is held, d = 2 or 3 in space; None for a free end.
+    start : (d,) [m], optional
+        Where the start is held; where all poses of the session had it, or the origin, by default.
     start_heading, end_heading : float [rad], optional
-        Directions of clamped ends, continuous along the cable; those that all poses of the
-        session shared by default.
+        Directions of clamped ends in a plane, continuous along the cable; those that all poses of
+        the session shared by default.
+    start_orientation, end_orientation : (4,), optional
+        Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable;
+        those that all poses of the session shared by default.
+    turns : float
+        In space, full turns of twist at the end about its x axis, beside the roll nearest to none.
     branch : "ccw" or "cw", optional
-        Which way the cable turns from start to end.
+        In a plane, which way the cable turns from start to end.
 
     Raises
     ------
@@ -183,15 +205,28 @@ def predict(
             "  Try: the parameters.yaml or the results folder of a fit."
         )
     cable = parameters if isinstance(parameters, Parameters) else load_parameters(parameters)
-    pose = _pose(cable, end, start, start_heading, end_heading, branch)
+    pose = _pose(
+        cable,
+        end,
+        start,
+        {
+            "start_heading": start_heading,
+            "end_heading": end_heading,
+            "start_orientation": start_orientation,
+            "end_orientation": end_orientation,
+        },
+        turns,
+        branch,
+    )
     model, p, rest, _ = cable
     try:
         eq = solve_equilibrium(model, p, rest, pose)
     except EquilibriumError as error:
         # What the solver advises concerns a configuration; there is none here.
         happened = error.message.partition("\n  Try:")[0]
+        other = "orientations, fewer turns" if model.in_space else "headings or branch"
         raise EquilibriumError(
-            f"{happened}\n  Try: an end in metres, nearer to the start; other headings or branch.",
+            f"{happened}\n  Try: an end in metres, nearer to the start; other {other}.",
             p_des=error.p_des,
         ) from None
     return PredictedShape(
@@ -203,61 +238,100 @@ def _pose(
     cable: Parameters,
     end: Sequence[float] | None,
     start: Sequence[float] | None,
-    start_heading: float | None,
-    end_heading: float | None,
+    directions: Mapping[str, Any],
+    turns: float,
     branch: Branch | None,
 ) -> Pose:
     """End conditions, checked against the boundary; what is not given is as in the session."""
     model, shared = cable.model, cable.metadata.fixtures
+    name, size = model.cable.name, model.node.dimension
     if branch is not None and branch not in get_args(Branch):
         raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
+    if branch is not None and model.in_space:
+        raise DloError(f"{name!r} is in space: a branch has no meaning")
     if model.end == "free" and end is not None:
-        raise DloError(f"the end of {model.cable.name!r} is free: it cannot be held at {end} m")
+        raise DloError(f"the end of {name!r} is free: it cannot be held at {end} m")
     if model.end != "free" and end is None:
-        raise DloError(f"the end of {model.cable.name!r} is {model.end}: where is it? (end)")
-    headings = {"start": start_heading, "end": end_heading}
-    for side, held in (("start", model.start), ("end", model.end)):
-        if held == "clamped" and headings[side] is None:
-            headings[side] = shared.get(f"{side}_heading")
-            if headings[side] is None:
-                raise DloError(
-                    f"the {side} of {model.cable.name!r} is clamped, and its heading differed "
-                    f"from pose to pose: give {side}_heading [rad]"
-                )
-        if held != "clamped" and headings[side] is not None:
-            raise DloError(
-                f"the {side} of {model.cable.name!r} is {held}: a {side}_heading has no meaning"
-            )
-        if headings[side] is not None:
-            headings[side] = _heading(headings[side], side)
+        raise DloError(f"the end of {name!r} is {model.end}: where is it? (end)")
+    turns = _number(turns, "turns", "full turns")
+    if turns and not (model.in_space and model.start == model.end == "clamped"):
+        raise DloError(f"{name!r} has no turns: it is not in space and clamped at both ends")
+    if start is None:
+        start = shared.get("start") or (0.0,) * size
     return Pose(
-        start=_point(start if start is not None else shared.get("start") or (0.0, 0.0), "start"),
-        end=None if end is None else _point(end, "end"),
-        start_heading=headings["start"],
-        end_heading=headings["end"],
+        start=_point(start, "start", size),
+        end=None if end is None else _point(end, "end", size),
+        turns=turns,
         branch=branch,
-        name=model.cable.name or "cable",
+        name=name or "cable",
+        **_held(cable, directions),
     )
 
 
-def _point(values: Sequence[float], what: str) -> tuple[float, float]:
-    try:
-        point = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        point = np.zeros(0)
-    if point.shape != (2,) or not np.all(np.isfinite(point)):
-        raise DloError(f"{what}: two finite numbers (x, y) in metres belong here, found {values!r}")
-    return float(point[0]), float(point[1])
+def _held(cable: Parameters, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Directions of the clamps, by their key; none of pins."""
+    model, shared = cable.model, cable.metadata.fixtures
+    kind, other, unit = "heading", "orientation", " [rad]"
+    where = ("a plane", "two numbers of gravity")
+    if model.in_space:
+        kind, other, unit = other, kind, " [qx, qy, qz, qw]"
+        where = ("space", "three numbers of gravity")
+    found: dict[str, Any] = {}
+    for side, held in (("start", model.start), ("end", model.end)):
+        key, value = f"{side}_{kind}", given[f"{side}_{kind}"]
+        if given[f"{side}_{other}"] is not None:
+            raise DloError(
+                f"{side}_{other}: {model.cable.name!r} is in {where[0]} ({where[1]}).\n  Try: {key}"
+                f"{unit}"
+            )
+        if held != "clamped" and value is not None:
+            raise DloError(f"the {side} of {model.cable.name!r} is {held}: a {key} has no meaning")
+        if held != "clamped":
+            continue
+        value = shared.get(key) if value is None else value
+        if value is None:
+            raise DloError(
+                f"the {side} of {model.cable.name!r} is clamped, and its {kind} differed "
+                f"from pose to pose: give {key}{unit}"
+            )
+        found[key] = _orientation(value, key) if model.in_space else _number(value, key, "rad")
+    return found
 
 
-def _heading(value: Any, side: str) -> float:
+_WORDS = {2: "two finite numbers (x, y)", 3: "three finite numbers (x, y, z)"}
+
+
+def _point(values: Sequence[float], what: str, size: int) -> tuple[float, ...]:
+    point = _finite(values)
+    if len(point) != size:
+        raise DloError(f"{what}: {_WORDS[size]} in metres belong here, found {values!r}")
+    return point
+
+
+def _orientation(values: Sequence[float], what: str) -> tuple[float, ...]:
+    quaternion = _finite(values)
+    if wrong := implausible_quaternion(quaternion):
+        raise DloError(f"{what}: {wrong}, found {values!r}")
+    return quaternion
+
+
+def _finite(values: Any) -> tuple[float, ...]:
+    """Finite numbers, or nothing."""
     try:
-        heading = float(value)
+        array = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
-        heading = np.nan
-    if not np.isfinite(heading):
-        raise DloError(f"{side}_heading: a finite number [rad] belongs here, found {value!r}")
-    return heading
+        return ()
+    return tuple(array.tolist()) if array.ndim == 1 and np.all(np.isfinite(array)) else ()
+
+
+def _number(value: Any, what: str, unit: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise DloError(f"{what}: a finite number [{unit}] belongs here, found {value!r}")
+    return number
 
 
 def _curve(

@@ -21,12 +21,15 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks import fleet, memory, peers, random_cables, speed
+from benchmarks import fleet, memory, peers, random_cables, space_speed, speed
 
 from dlo_casadi.durable import make_folder, write_file
-from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 
-PARTS = ("speed", "growth", "throughput", "random", "starts", "ipopt", "memory", "peers", "fleet")
+PARTS = (
+    *("speed", "growth", "throughput", "random", "starts", "ipopt", "memory", "peers", "fleet"),
+    *("space", "space_random"),
+)
 # Parts that need more than the package: the extras, and what of them is imported.
 EXTRAS = {"fleet": ("table,dask", ("pyarrow", "distributed"))}
 
@@ -118,6 +121,49 @@ def run_ipopt(problems: int) -> dict[str, Any]:
     return {**counts, "same_or_lower_share": good / compared}
 
 
+def run_space() -> dict[str, Any]:
+    """Time and error in space: fine meshes against each other, cold and warm, and growth with n."""
+    out: dict[str, Any] = {}
+    for element, sizes in (("arc", (12, 24, 48, 96)), ("quadratic", (6, 12, 24, 48))):
+        out[element] = {n: space_speed.timed(n, element) for n in sizes}
+    per_element = [
+        (n, space_speed.timed(n, "arc", repeats=max(1, 100 // n))["cold"]["best"] / n)
+        for n in (10, 30, 100, 300, 1000)
+    ]
+    times = [seconds for _, seconds in per_element]
+    out["growth"] = {"per_element": per_element, "spread": max(times) / min(times)}
+    return out
+
+
+def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
+    """Random clamped cables in space: statuses, checks by the Python model, energies."""
+    out: dict[str, Any] = {}
+    for element in ELEMENTS_IN_SPACE:
+        rng = np.random.default_rng(0)
+        solver = random_cables.AnyCable(random_cables.space_problem(rng, 1, 12, element))
+        counts = {"ok": 0, "wrong": 0, "same": 0, "lower": 0, "higher": 0, "python_failed": 0}
+        worst, total = 0.0, 0.0
+        for _ in range(cables):
+            problem = random_cables.space_problem(rng, poses, 12, element)
+            shapes, statuses, seconds = solver.solve(problem)
+            total += seconds
+            counts["ok"] += int(np.count_nonzero(statuses == 0))
+            for i in np.flatnonzero(statuses == 0)[: max(1, 2000 // cables)]:
+                right, error = random_cables.check_in_space(problem, shapes[i], i)
+                counts["wrong"] += not right
+                worst = max(worst, error)
+            for i in np.flatnonzero(statuses == 0)[: compared // cables]:
+                counts[random_cables.compare_in_space(problem, shapes[i], i)] += 1
+        out[element] = {
+            "problems": cables * poses,
+            **counts,
+            "worst_end_error": worst,
+            "mean_seconds": total / (cables * poses),
+        }
+        print(element, out[element], flush=True)
+    return out
+
+
 def draw(growth: dict[str, Any], path: Path) -> None:
     """Time against n."""
     figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
@@ -177,6 +223,8 @@ def main() -> int:
         "memory": memory.run,
         "peers": peers.run,
         "fleet": fleet.run,
+        "space": run_space,
+        "space_random": lambda: run_space_random(chosen.cables, 100, chosen.ipopt_problems),
     }
     result: dict[str, Any] = {"compiler": speed.compiler(), "flags": list(speed.FLAGS)}
     result["left_out"] = list(missing)

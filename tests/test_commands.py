@@ -164,6 +164,33 @@ def test_new_once_filled_in_is_a_configuration(tmp_path):
     jsonschema.validate(plain(config), config_schema())
 
 
+def test_new_in_space_once_filled_in_is_a_configuration(tmp_path, capsys):
+    config, folder = tmp_path / "loom.yaml", ROOT / "configs/space/markers"
+    assert main(["new", str(config), "--space", "--photographs", str(folder)]) == 2
+    assert "a pose has several photographs" in capsys.readouterr().err
+    assert main(["new", str(config), "--space", "--centerlines", str(folder)]) == 0
+    assert "10 poses, 44 places to fill in" in capsys.readouterr().out
+    assert main(["check", str(config)]) == 2
+    assert "start_orientation is still to be filled in: Frame of a" in capsys.readouterr().err
+
+    text = config.read_text()
+    for key, value in (
+        ("length", "0.6"),
+        ("mass", "0.03"),
+        ("diameter", "0.004"),
+        ("stiffness", "0.02 "),
+        ("start", "[0.4, -0.2, 0.3]"),
+        ("end", "[0.7, -0.3, 0.35]"),
+        ("orientation", "[0, 0, 0, 1]"),
+    ):
+        text = text.replace(f"{key}: FILL_IN", f"{key}: {value}")
+    config.write_text(text)
+    loaded = load_config(config)
+    assert loaded.experiment.in_space
+    assert len(loaded.measured_poses) == 10
+    jsonschema.validate(plain(config), config_schema())
+
+
 def test_new_says_what_it_cannot_find(tmp_path, capsys):
     assert main(["new", str(tmp_path / "a.yaml"), "--photographs", str(tmp_path / "no")]) == 2
     assert "cannot be read: No such file" in capsys.readouterr().err
@@ -201,7 +228,7 @@ def test_the_configurations_follow_the_schema(path):
     [
         ("length", "lenght", "'lenght' was unexpected"),
         ("start: pinned", "start: free", "'free' is not one of"),
-        ("[0.0, -9.81]", "[0.0, -9.81, 0.0]", "is too long"),
+        ("[0.0, -9.81]", "[0.0, -9.81, 0.0, 0.0]", "is not valid under any"),
         ("mass: 0.23", "mass: heavy", "'heavy' is not of type 'number'"),
     ],
 )

@@ -522,19 +522,21 @@ def test_drift_moves_the_rest_curvature_towards_the_bend():
     np.testing.assert_allclose(number(after), [1.5, -1.0], rtol=1e-14)
 
 
-@pytest.mark.parametrize("axes", [1, 2])
-def test_a_plastic_set_is_what_a_bend_exceeds_the_yield_by(axes):
-    """In its direction; of a vector, by its size."""
+@pytest.mark.parametrize("space", [False, True])
+def test_a_plastic_set_is_what_a_bend_exceeds_the_yield_by(space):
+    """In its direction, by its size; in space whatever the twist."""
     bend = np.array([-7.0, -3.0, -1.0, 0.0, 1.0, 3.0, 7.0])
-    direction = np.array([[1.0], [0.6, 0.8]][axes - 1])
+    direction = np.array([0.0, 0.6, 0.8] if space else [1.0])
+    twist = np.array([5.0, 0.0, 0.0] if space else [0.0])
 
     def left(limit):
         params = {"yield_curvature": ca.SX(limit), "share": ca.SX(0.25)}
-        rest = ca.SX(ca.DM([0.4, -0.7][:axes]))
+        rest = ca.SX(ca.DM([0.1, 0.4, -0.7][: len(twist)]))
         laws = (
-            PlasticSet().next_rest(rest, rest + ca.DM(k * direction), CABLE, params) for k in bend
+            PlasticSet().next_rest(rest, rest + ca.DM(k * direction + twist), CABLE, params)
+            for k in bend
         )
-        moved = np.array([number(law - rest) for law in laws]).reshape((len(bend), axes))
+        moved = np.array([number(law - rest) for law in laws]).reshape((len(bend), -1))
         along = moved @ direction
         np.testing.assert_allclose(moved, np.outer(along, direction), atol=1e-14)
         return along

@@ -19,6 +19,7 @@ from dlo_casadi.effects import (
     LumpedMass,
     MassError,
     PointForce,
+    RestCurvatureDrift,
     Setup,
     SideLoad,
     Sight,
@@ -100,7 +101,7 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
             p[model.names.index(f"{name}.{q.name}")] = PLANAR[name][q.name]
         models.append(model)
         ps.append(p)
-        rests.append(np.repeat([rest] if len(g) == 2 else [0.0, rest], model.chain.n_cells))
+        rests.append(np.repeat([rest] if len(g) == 2 else [0.0, 0.0, rest], model.chain.n_cells))
     pose = Pose((0.0, 0.0), (0.5, -0.1), *headings)
     first, last = (tuple(Rotation.from_rotvec([0, 0, a]).as_quat()) for a in headings)
     same = Pose((0.0, 0.0, 0.0), (0.5, -0.1, 0.0), start_orientation=first, end_orientation=last)
@@ -118,8 +119,8 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
     np.testing.assert_allclose(spatial[0], planar[0], atol=1e-12)
     np.testing.assert_allclose(spatial[1][..., [0, 1, 3, 4]], planar[1], atol=1e-12)
     np.testing.assert_allclose(spatial[1][..., [2, 5]], 0.0, atol=1e-12)
-    np.testing.assert_allclose(spatial[2][:, n:], planar[2], atol=1e-11)
-    np.testing.assert_allclose(spatial[2][:, :n], 0.0, atol=1e-12)
+    np.testing.assert_allclose(spatial[2][:, 2 * n :], planar[2], atol=1e-11)
+    np.testing.assert_allclose(spatial[2][:, : 2 * n], 0.0, atol=1e-12)
     assert np.abs(spatial[3]).max() < np.abs(planar[3]).max() + 1e-10
 
 
@@ -286,6 +287,31 @@ def test_a_matrix_that_is_no_stiffness_is_cut():
     found = BendingAnisotropy().of_linear(CABLE, {"difference": -1.0, "coupling": 0.8})
     assert found["ratio"] == pytest.approx(100.0)
     assert abs(found["angle"]) < np.pi / 4
+
+
+# ---- state -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("element", "order"), [("arc", 2), ("quadratic", 4)])
+def test_a_uniform_rest_twist_is_a_roll_of_the_end(element, order):
+    """Of a cable that is straight at rest, by minus the whole twist, as the mesh is refined."""
+    twist, gaps = 1.2, []  # 1/m, m
+    for n in (10, 20):
+        model = CableModel(CABLE, n, element, "clamped", "clamped", GRAVITY)
+        rest = np.repeat([twist, 0.0, 0.0], model.chain.n_cells)
+        found = solve_equilibrium(model, model.nominal, rest, HELD)
+        rolled = model.nominal.copy()
+        rolled[model.names.index("end_roll")] = -twist * CABLE.length
+        by_hand = solve_equilibrium(model, rolled, 0 * rest, HELD)
+        gaps.append(np.abs(found.points - by_hand.points).max())
+    assert np.log2(gaps[0] / gaps[1]) > order - 0.1
+    assert gaps[1] < 2e-3
+
+
+def test_a_drift_takes_the_twist_along():
+    rest, strain = (ca.SX(ca.DM(v)) for v in ([0.4, 1.0, -2.0], [2.4, 3.0, 2.0]))
+    after = RestCurvatureDrift().next_rest(rest, strain, CABLE, {"rate": ca.SX(0.25)})
+    np.testing.assert_allclose(np.array(ca.evalf(after))[:, 0], [0.9, 1.5, -1.0], rtol=1e-14)
 
 
 # ---- where they apply --------------------------------------------------------------------------

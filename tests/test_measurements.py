@@ -31,9 +31,10 @@ def test_centerlines_of_the_repository(path):
     if not isinstance(config.experiment.measurement, Centerlines):
         pytest.skip("photographs")
     for pose in config.experiment.poses:
-        points = read_points(pose.file, pose.start, pose.end).points
-        assert points.shape[1] == 2
-        assert np.linalg.norm(points[0] - pose.start) < 0.03 * config.cable.length
+        read = read_points(pose.file, pose.start, pose.end)
+        points, before = read.points, 0.0 if read.s is None else read.s[0]
+        assert points.shape[1] == len(pose.start)
+        assert np.linalg.norm(points[0] - pose.start) < before + 0.03 * config.cable.length
         along = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
         assert 0.5 * config.cable.length < along < 1.05 * config.cable.length
 

@@ -1,5 +1,6 @@
 """Predictions from a file of fitted parameters: physics, defaults, messages."""
 
+import json
 import re
 from io import BytesIO
 from pathlib import Path
@@ -7,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.text import Text
+from scipy.spatial.transform import Rotation
 
+from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
@@ -20,12 +23,12 @@ BENCH = Path(__file__).parent / "data" / "bench"
 ROOT = Path(__file__).parents[1]
 
 
-def results(name, folder):
+def results(path, folder, n=20):
     """A folder of results of a quick fit that holds parameters.yaml alone."""
-    config = load_config(BENCH / name / "session.yaml")
+    config = load_config(path)
     _, measured = read_poses(config, lambda *_: None)
     declared = declared_model(config)
-    model = declared.model.with_mesh(20)
+    model = declared.model.with_mesh(n)
     fit = fit_model(model, measured[:4], declared.tolerances, 3e-4, decades=(0,))
     document = parameters_file.fit_dict(fit)
     document["fixtures"] = parameters_file.shared_fixtures(config)
@@ -37,12 +40,20 @@ def results(name, folder):
 
 @pytest.fixture(scope="module")
 def pinned(tmp_path_factory):
-    return results("short_clean", tmp_path_factory.mktemp("pinned") / "results" / "cable")
+    path = BENCH / "short_clean/session.yaml"
+    return results(path, tmp_path_factory.mktemp("pinned") / "results" / "cable")
 
 
 @pytest.fixture(scope="module")
 def overhang(tmp_path_factory):
-    return results("overhang", tmp_path_factory.mktemp("free") / "results" / "cable")
+    path = BENCH / "overhang/session.yaml"
+    return results(path, tmp_path_factory.mktemp("free") / "results" / "cable")
+
+
+@pytest.fixture(scope="module")
+def loom(tmp_path_factory):
+    path = ROOT / "configs/markers_in_space.yaml"
+    return results(path, tmp_path_factory.mktemp("space") / "results" / "loom", n=8)
 
 
 def test_the_cable_spans_from_start_to_end(pinned):
@@ -174,9 +185,76 @@ def test_a_free_end_hangs(overhang):
     assert shape.points()[-1, 1] < 0
 
 
+IN_SPACE = {"end": (0.7, -0.3, 0.35), "end_orientation": (0.1, -0.1, 0.1, 0.98489)}
+
+
+def test_a_cable_in_space_leaves_its_grippers_along_their_axes(loom):
+    shape = predict(loom, **IN_SPACE)
+    points = shape.points()
+
+    # Tolerances of 0.2 mm and 5 mrad, of which the fit takes up to two.
+    assert points[0] == pytest.approx([0.4, -0.2, 0.3], abs=1e-9)
+    assert points[-1] == pytest.approx(IN_SPACE["end"], abs=1e-3)
+    ends = shape.curve.at([0.0, shape.curve.length], 1)
+    frames = Rotation.from_quat([shape.pose.start_orientation, shape.pose.end_orientation])
+    assert ends == pytest.approx(frames.apply([1.0, 0.0, 0.0]), abs=2e-2)
+    eq = shape.equilibrium
+    assert eq.lam + eq.lam_start == pytest.approx([0.0, 0.0, -0.03 * 9.81], abs=1e-9)
+    said = str(shape)
+    assert "end: (0.7, -0.3, 0.35) m" in said
+    assert len(re.findall(r"moment of the cable on its \w+: \(.*, .*, .*\) N m", said)) == 2
+    assert shape.plot().axes[0].name == "3d"
+
+
+def test_the_reaction_in_space_is_the_slope_of_the_energy(loom):
+    """-lam = dV/d(end), by central differences of step h: error of order h^2."""
+    h, cable = 1e-4, parameters_file.load_parameters(loom)
+
+    def energy(step):
+        moved = np.add(IN_SPACE["end"], step)
+        return predict(cable, **(IN_SPACE | {"end": moved})).equilibrium.energy
+
+    slope = [(energy(step) - energy(-step)) / (2 * h) for step in h * np.eye(3)]
+    assert -predict(cable, **IN_SPACE).equilibrium.lam == pytest.approx(slope, rel=1e-4)
+
+
+def test_turns_twist_the_cable(loom):
+    """White's theorem: a turn of the end is twist and writhe, and the cable has some of each."""
+    twist = [predict(loom, **IN_SPACE, turns=turns).equilibrium.twist for turns in (-1, 0, 1)]
+    total = [values.mean() * 0.6 for values in twist]
+    assert total[0] < total[1] - 1 < total[1] + 1 < total[2]
+
+
+def test_the_command_takes_what_the_function_takes(loom, capsys):
+    asked = ["--end", "0.7", "-0.3", "0.35", "--end-orientation", "0.1", "-1e-1", "0.1", "0.98489"]
+    assert main(["predict", str(loom), *asked, "--turns", "1", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == predict(loom, **IN_SPACE, turns=1).as_dict()
+    assert printed["turns"] == 1.0
+    assert "end_heading" not in printed
+    assert main(["predict", str(loom), *asked]) == 0
+    assert "moment of the cable on its end" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("file", "ends", "message"),
     [
+        ("loom", {"end": (0.7, -0.3)}, "end: three finite numbers (x, y, z) in metres"),
+        ("loom", IN_SPACE | {"end_heading": 0.0}, "is in space (three numbers of gravity)"),
+        ("loom", IN_SPACE | {"branch": "cw"}, "is in space: a branch has no meaning"),
+        ("loom", IN_SPACE | {"turns": float("inf")}, "turns: a finite number [full turns]"),
+        (
+            "loom",
+            IN_SPACE | {"end_orientation": (0.1, 0.1, 0.1, 0.5)},
+            "end_orientation: a unit quaternion [qx, qy, qz, qw] belongs here, its length is 0.529",
+        ),
+        ("loom", {"end": (0.7, -0.3, 0.35)}, "give end_orientation [qx, qy, qz, qw]"),
+        ("pinned", {"end": (0.3, 0.0), "turns": 1}, "has no turns: it is not in space"),
+        (
+            "overhang",
+            {"start_orientation": (0, 0, 0, 1)},
+            "is in a plane (two numbers of gravity).\n  Try: start_heading [rad]",
+        ),
         ("pinned", {}, "the end of 'short_clean' is pinned: where is it?"),
         ("pinned", {"end": (0.3, float("nan"))}, "end: two finite numbers (x, y) in metres"),
         ("pinned", {"end": (0.3, 0.1, 0.0)}, "end: two finite numbers (x, y) in metres"),

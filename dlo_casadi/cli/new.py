@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, print_json
@@ -17,13 +18,14 @@ from dlo_casadi.errors import DloError
 EXAMPLES = """\
 dlo new rope.yaml
 dlo new rope.yaml --photographs photographs/
-dlo new rope.yaml --centerlines measured/"""
+dlo new rope.yaml --centerlines measured/
+dlo new loom.yaml --space --centerlines markers/"""
 
 _PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run `dlo new FILE [--photographs DIR | --centerlines DIR]`."""
+    """Run `dlo new FILE [--space] [--photographs DIR | --centerlines DIR]`."""
     parser = command(
         "new",
         "Write a commented configuration to start from: one pose for each file that is found,\n"
@@ -34,6 +36,9 @@ def main(argv: Sequence[str]) -> int:
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--photographs", type=Path, metavar="DIR", help="folder of photographs")
     source.add_argument("--centerlines", type=Path, metavar="DIR", help="folder of CSV files")
+    parser.add_argument(
+        "--space", action="store_true", help="a cable that leaves the plane, held by grippers"
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
     chosen = parser.parse_args(argv)
@@ -41,12 +46,20 @@ def main(argv: Sequence[str]) -> int:
     target: Path = chosen.file
     if target.suffix not in (".yaml", ".yml"):
         raise DloError(f"{target}: the name of a configuration ends in .yaml")
+    if chosen.space and chosen.photographs is not None:
+        raise DloError(
+            "--space: in space a pose has several photographs, and the folder does not tell which "
+            "belong together.\n  Try: --centerlines, or --space alone"
+        )
     files: list[str] = []
     if chosen.photographs is not None:
         files = _listed(chosen.photographs, _PHOTOGRAPHS, "photograph", target.parent)
     elif chosen.centerlines is not None:
         files = _listed(chosen.centerlines, (".csv",), "CSV file", target.parent)
-    text = template(target.stem, files, "images" if chosen.centerlines is None else "centerlines")
+    kind: Literal["images", "centerlines"] = "images"
+    if chosen.centerlines is not None:
+        kind = "centerlines"
+    text = template(target.stem, files, kind, chosen.space)
     schema = target.with_name("schema.json")
     written = [target]
     if os.path.lexists(target):

@@ -21,11 +21,12 @@ EXAMPLES = """\
 dlo predict results/cable --end 0.3 -0.1
 dlo predict results/cable --end 0.3 -0.1 --figure shape.png
 dlo predict results/cable --start 0.1 0 --end 0.3 -0.1 --branch cw --json
-dlo predict results/wire --end -0.12 0 --start-heading 0 --end-heading -6.2832"""
+dlo predict results/wire --end -0.12 0 --start-heading 0 --end-heading -6.2832
+dlo predict results/loom --end 0.6 0.1 0.3 --end-orientation 0 0 0 1 --turns 1"""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run `dlo predict PARAMETERS --end X Y [...]`."""
+    """Run `dlo predict PARAMETERS --end X Y [Z] [...]`."""
     parser = command(
         "predict",
         "Predict the shape of a fitted cable from where its ends are held.",
@@ -36,13 +37,24 @@ def main(argv: Sequence[str]) -> int:
     for side, remark in (("end", "; not for a free end"), ("start", "")):
         parser.add_argument(
             f"--{side}",
-            nargs=2,
+            nargs="+",
             type=float,
-            metavar=("X", "Y"),
-            help=f"where the {side} is held [m]{remark}",
+            metavar="X",
+            help=f"where the {side} is held, X Y or in space X Y Z [m]{remark}",
         )
     parser.add_argument("--start-heading", type=float, metavar="R", help="clamped start [rad]")
     parser.add_argument("--end-heading", type=float, metavar="R", help="clamped end [rad]")
+    for side in ("start", "end"):
+        parser.add_argument(
+            f"--{side}-orientation",
+            nargs=4,
+            type=float,
+            metavar=("QX", "QY", "QZ", "QW"),
+            help=f"frame of a {side} clamped in space, x forward along the cable",
+        )
+    parser.add_argument(
+        "--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"
+    )
     parser.add_argument("--branch", choices=("ccw", "cw"), help="which way the cable turns")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
@@ -58,6 +70,9 @@ def main(argv: Sequence[str]) -> int:
         start=chosen.start,
         start_heading=chosen.start_heading,
         end_heading=chosen.end_heading,
+        start_orientation=chosen.start_orientation,
+        end_orientation=chosen.end_orientation,
+        turns=chosen.turns,
         branch=chosen.branch,
     )
     if figure is not None:

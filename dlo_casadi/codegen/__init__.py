@@ -1,7 +1,25 @@
 """The C solver that planners embed."""
 
-from dlo_casadi.codegen.compiled import CompiledSolver
+from dlo_casadi.codegen.compiled import CompiledSolver, CompiledSpaceSolver
 from dlo_casadi.codegen.generate import Solver, generate
-from dlo_casadi.codegen.shapes import STATUSES, Path2D, Shape, Slope
+from dlo_casadi.codegen.shapes import (
+    STATUSES,
+    Shape,
+    ShapePath,
+    Slope,
+    SpaceShape,
+    SpaceSlope,
+)
 
-__all__ = ["STATUSES", "CompiledSolver", "Path2D", "Shape", "Slope", "Solver", "generate"]
+__all__ = [
+    "STATUSES",
+    "CompiledSolver",
+    "CompiledSpaceSolver",
+    "Shape",
+    "ShapePath",
+    "Slope",
+    "Solver",
+    "SpaceShape",
+    "SpaceSlope",
+    "generate",
+]

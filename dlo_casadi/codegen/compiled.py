@@ -8,41 +8,215 @@ import tempfile
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.library import compile_library
-from dlo_casadi.codegen.poses import branch_number, no_equilibrium, one_pose, pose_table
-from dlo_casadi.codegen.shapes import STATUSES, Path2D, Shape, Slope
+from dlo_casadi.codegen.poses import (
+    branch_number,
+    frame_poses,
+    no_equilibrium,
+    one_pose,
+    pose_table,
+)
+from dlo_casadi.codegen.shapes import (
+    STATUSES,
+    Shape,
+    ShapePath,
+    Slope,
+    SpaceShape,
+    SpaceSlope,
+)
+from dlo_casadi.equilibrium import Pose
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
+S = TypeVar("S", bound=Shape | SpaceShape)
 
 
 def shape_record(model: CableModel) -> np.dtype[Any]:
     """Layout of the C solver's dlo_shape."""
+    n, d = model.n, model.node.dimension
+    if model.in_space:
+        state: tuple[str, Any] = ("frames", (float, (n + 1, 4)))
+        extremes, last = ["min_bend_radius", "max_twist"], ["iterations"]
+    else:
+        state = ("headings", (float, (model.chain.n_nodes,)))
+        extremes, last = ["min_bend_radius"], ["iterations", "turn"]
+    fields: dict[str, Any] = {
+        "points": (float, (n + 1, d)),
+        state[0]: state[1],
+        "lam_start": (float, d),
+        "lam": (float, d),
+        "moments": (float, (2, model.node.increment) if model.in_space else 2),
+        "energy": float,
+        **dict.fromkeys([*extremes, "end_error", "imbalance"], float),
+        **dict.fromkeys(last, np.intc),
+    }
+    return np.dtype({"names": list(fields), "formats": list(fields.values())}, align=True)
+
+
+def slope_record(model: CableModel) -> np.dtype[Any]:
+    """Layout of the C solver's dlo_slope."""
     n, k = model.n, model.chain.n_nodes
+    if not model.in_space:
+        return np.dtype(
+            [("points", float, (n + 1, 2, 4)), ("headings", float, (k, 4)), ("lam", float, (2, 4))]
+        )
     return np.dtype(
-        {
-            "names": [
-                *("points", "headings", "lam_start", "lam", "moments", "energy"),
-                *("min_bend_radius", "end_error", "imbalance", "iterations", "turn"),
-            ],
-            "formats": [
-                *((float, (n + 1, 2)), (float, k), (float, 2), (float, 2), (float, 2)),
-                *(float, float, float, float, np.intc, np.intc),
-            ],
-        },
-        align=True,
+        [
+            ("points", float, (n + 1, 3, 12)),
+            ("turns", float, (n + 1, 3, 12)),
+            ("lam", float, (3, 12)),
+            ("moments", float, (2, 3, 12)),
+            ("min_bend_radius", float, 12),
+        ]
     )
 
 
-class CompiledSolver:
+class _Compiled(Generic[S]):
+    """The generated C of a model, compiled; see `CompiledSolver` and `CompiledSpaceSolver`."""
+
+    _shape: type[S]
+    _state: str  # name of what a shape is started from: headings or frames
+
+    def __init__(
+        self,
+        model: CableModel,
+        p: FloatArray,
+        rest: FloatArray,
+        *,
+        flags: Sequence[str] = ("-O2",),
+    ) -> None:
+        self.model = model
+        self.source = generate(model, p, rest)
+        folder = Path(tempfile.mkdtemp(prefix="dlo_solver_"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
+        self.record, self._slope = shape_record(model), slope_record(model)
+        self.workspace = self.source.workspace
+        size, pointer, integer = ctypes.c_size_t, ctypes.c_void_p, ctypes.c_int
+        tail: list[Any] = [pointer, size]
+        self._c.dlo_solve.argtypes = [pointer, integer, pointer, pointer, *tail]
+        self._c.dlo_step.argtypes = [pointer, pointer, integer, pointer, *tail]
+        self._c.dlo_sensitivity.argtypes = [pointer, pointer, pointer, *tail]
+        self._c.dlo_batch.argtypes = [pointer, size, integer, pointer, pointer, *tail]
+        self._c.dlo_path.argtypes = [
+            *(pointer, size, integer, pointer, pointer, pointer, pointer),
+            *tail,
+        ]
+
+    def _read(self, record: Any, status: int) -> S:
+        values = {name: record[name] for name in self.record.names or ()}
+        scalars = {name: values[name].item() for name in values if values[name].ndim == 0}
+        arrays = {name: values[name].copy() for name in values if values[name].ndim}
+        return self._shape(**arrays, **scalars, status=STATUSES[status])
+
+    def _warm(self, warm: S | None) -> tuple[Any, int | None]:
+        """Record of a shape to start from, and its address."""
+        if warm is None:
+            return None, None
+        record = np.zeros(1, self.record)
+        nodes = record[self._state][0].shape
+        if not isinstance(warm, self._shape) or np.shape(getattr(warm, self._state)) != nodes:
+            count = f"with {nodes[0]} {self._state}"
+            raise DloError(f"warm: a shape of this solver, {count}, belongs here")
+        record[self._state], record["lam"] = getattr(warm, self._state), warm.lam
+        return record, record.ctypes.data
+
+    def _work(self) -> FloatArray:
+        return np.empty(self.workspace)
+
+    def _solved(self, pose: FloatArray, branch: object, warm: S | None, *, throw: bool) -> S:
+        out = np.zeros(1, self.record)
+        kept, address = self._warm(warm)
+        work = self._work()
+        status = self._c.dlo_solve(
+            pose.ctypes.data,
+            branch_number(branch),
+            address,
+            out.ctypes.data,
+            work.ctypes.data,
+            work.size,
+        )
+        del kept
+        if status and throw:
+            d = self.model.node.dimension
+            start, end = pose[0, :d], pose[0, d : 2 * d]
+            raise EquilibriumError(
+                no_equilibrium(STATUSES[status], start, end, self.model.cable.length),
+                p_des=tuple(map(float, end)),
+            )
+        return self._read(out[0], status)
+
+    def _stepped(self, pose: FloatArray, start: S, steps: int) -> S:
+        out = np.zeros(1, self.record)
+        kept, address = self._warm(start)
+        work = self._work()
+        status = self._c.dlo_step(
+            pose.ctypes.data, address, steps, out.ctypes.data, work.ctypes.data, work.size
+        )
+        del kept
+        return self._read(out[0], status)
+
+    def _batch(self, poses: FloatArray, branch: object) -> tuple[Any, NDArray[np.intc]]:
+        out = np.zeros(len(poses), self.record)
+        statuses = np.zeros(len(poses), np.intc)
+        work = self._work()
+        self._c.dlo_batch(
+            poses.ctypes.data,
+            len(poses),
+            branch_number(branch),
+            out.ctypes.data,
+            statuses.ctypes.data,
+            work.ctypes.data,
+            work.size,
+        )
+        return out, statuses
+
+    def _followed(self, poses: FloatArray, branch: object, warm: S | None) -> ShapePath[S]:
+        out = np.zeros(len(poses), self.record)
+        statuses = np.zeros(len(poses), np.intc)
+        jump = ctypes.c_size_t(0)
+        kept, address = self._warm(warm)
+        work = self._work()
+        self._c.dlo_path(
+            poses.ctypes.data,
+            len(poses),
+            branch_number(branch),
+            address,
+            out.ctypes.data,
+            statuses.ctypes.data,
+            ctypes.addressof(jump),
+            work.ctypes.data,
+            work.size,
+        )
+        del kept
+        shapes = tuple(self._read(record, int(k)) for record, k in zip(out, statuses, strict=True))
+        return ShapePath(shapes, jump.value if jump.value < len(poses) else None)
+
+    def _derived(self, shape: S, pose: FloatArray) -> Any:
+        record, address = self._warm(shape)
+        out = np.zeros(1, self._slope)
+        work = self._work()
+        status = self._c.dlo_sensitivity(
+            pose.ctypes.data, address, out.ctypes.data, work.ctypes.data, work.size
+        )
+        del record
+        if status:
+            raise EquilibriumError(
+                f"no derivatives ({STATUSES[status]}): is the shape a stable equilibrium of this "
+                "pose?"
+            )
+        return out[0]
+
+
+class CompiledSolver(_Compiled[Shape]):
     """Equilibria by compiled C: thousands of poses a second.
 
     Parameters
@@ -66,55 +240,7 @@ class CompiledSolver:
     >>> solver.solve(end=(0.5, 0.1)).points  # doctest: +SKIP
     """
 
-    def __init__(
-        self,
-        model: CableModel,
-        p: FloatArray,
-        rest: FloatArray,
-        *,
-        flags: Sequence[str] = ("-O2",),
-    ) -> None:
-        self.model = model
-        self.source = generate(model, p, rest)
-        folder = Path(tempfile.mkdtemp(prefix="dlo_solver_"))
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
-        n, k = model.n, model.chain.n_nodes
-        self.record = shape_record(model)
-        self._pose = np.dtype((float, 6))
-        self._slope = np.dtype(
-            [("points", float, (n + 1, 2, 4)), ("headings", float, (k, 4)), ("lam", float, (2, 4))]
-        )
-        self.workspace = self.source.workspace
-        size, pointer, integer = ctypes.c_size_t, ctypes.c_void_p, ctypes.c_int
-        tail: list[Any] = [pointer, size]
-        self._c.dlo_solve.argtypes = [pointer, integer, pointer, pointer, *tail]
-        self._c.dlo_sensitivity.argtypes = [pointer, pointer, pointer, *tail]
-        self._c.dlo_batch.argtypes = [pointer, size, integer, pointer, pointer, *tail]
-        self._c.dlo_path.argtypes = [
-            *(pointer, size, integer, pointer, pointer, pointer, pointer),
-            *tail,
-        ]
-
-    def _read(self, record: Any, status: int) -> Shape:
-        values = {name: record[name] for name in self.record.names or ()}
-        scalars = {name: values[name].item() for name in values if values[name].ndim == 0}
-        arrays = {name: values[name].copy() for name in values if values[name].ndim}
-        return Shape(**arrays, **scalars, status=STATUSES[status])
-
-    def _warm(self, warm: Shape | None) -> tuple[Any, int | None]:
-        """Record of a shape to start from, and its address."""
-        if warm is None:
-            return None, None
-        count = self.model.chain.n_nodes
-        if not isinstance(warm, Shape) or np.shape(warm.headings) != (count,):
-            raise DloError(f"warm: a shape of this solver, with {count} headings, belongs here")
-        record = np.zeros(1, self.record)
-        record["headings"], record["lam"] = warm.headings, warm.lam
-        return record, record.ctypes.data
-
-    def _work(self) -> FloatArray:
-        return np.empty(self.workspace)
+    _shape, _state = Shape, "headings"
 
     def solve(
         self,
@@ -149,24 +275,19 @@ class CompiledSolver:
             If end, start, headings, branch or warm cannot be used.
         """
         pose = one_pose(end, start, headings)
-        out = np.zeros(1, self.record)
-        kept, address = self._warm(warm)
-        work = self._work()
-        status = self._c.dlo_solve(
-            pose.ctypes.data,
-            branch_number(branch),
-            address,
-            out.ctypes.data,
-            work.ctypes.data,
-            work.size,
-        )
-        del kept
-        if status and throw:
-            raise EquilibriumError(
-                no_equilibrium(STATUSES[status], pose[0], self.model.cable.length),
-                p_des=(float(pose[0, 2]), float(pose[0, 3])),
-            )
-        return self._read(out[0], status)
+        return self._solved(pose, branch, warm, throw=throw)
+
+    def step(
+        self,
+        shape: Shape,
+        end: ArrayLike = (0.0, 0.0),
+        *,
+        start: ArrayLike = (0.0, 0.0),
+        headings: ArrayLike = (0.0, 0.0),
+        steps: int = 4,
+    ) -> Shape:
+        """Shape in a pose close by, in at most so many Newton steps; see its `status`."""
+        return self._stepped(one_pose(end, start, headings), shape, steps)
 
     def solve_many(
         self,
@@ -193,20 +314,7 @@ class CompiledSolver:
         DloError
             If ends, start and headings do not belong together, or there is no such branch.
         """
-        poses = pose_table(ends, start, headings)
-        out = np.zeros(len(poses), self.record)
-        statuses = np.zeros(len(poses), np.intc)
-        work = self._work()
-        self._c.dlo_batch(
-            poses.ctypes.data,
-            len(poses),
-            branch_number(branch),
-            out.ctypes.data,
-            statuses.ctypes.data,
-            work.ctypes.data,
-            work.size,
-        )
-        return out, statuses
+        return self._batch(pose_table(ends, start, headings), branch)
 
     def path(
         self,
@@ -216,7 +324,7 @@ class CompiledSolver:
         headings: ArrayLike = (0.0, 0.0),
         branch: Branch | None = None,
         warm: Shape | None = None,
-    ) -> Path2D:
+    ) -> ShapePath[Shape]:
         """Shapes along a path, each followed continuously from the one before.
 
         Parameters
@@ -233,26 +341,7 @@ class CompiledSolver:
         DloError
             As in `solve_many`.
         """
-        poses = pose_table(ends, start, headings)
-        out = np.zeros(len(poses), self.record)
-        statuses = np.zeros(len(poses), np.intc)
-        jump = ctypes.c_size_t(0)
-        kept, address = self._warm(warm)
-        work = self._work()
-        self._c.dlo_path(
-            poses.ctypes.data,
-            len(poses),
-            branch_number(branch),
-            address,
-            out.ctypes.data,
-            statuses.ctypes.data,
-            ctypes.addressof(jump),
-            work.ctypes.data,
-            work.size,
-        )
-        del kept
-        shapes = tuple(self._read(record, int(k)) for record, k in zip(out, statuses, strict=True))
-        return Path2D(shapes, jump.value if jump.value < len(poses) else None)
+        return self._followed(pose_table(ends, start, headings), branch, warm)
 
     def sensitivity(
         self,
@@ -270,16 +359,59 @@ class CompiledSolver:
             If the shape is no stable equilibrium of this pose.
         """
         pose = one_pose(end, start, headings)
-        record, address = self._warm(shape)
-        out = np.zeros(1, self._slope)
-        work = self._work()
-        status = self._c.dlo_sensitivity(
-            pose.ctypes.data, address, out.ctypes.data, work.ctypes.data, work.size
-        )
-        del record
-        if status:
-            raise EquilibriumError(
-                f"no derivatives ({STATUSES[status]}): is the shape a stable equilibrium of this "
-                "pose?"
-            )
-        return Slope(out[0]["points"], out[0]["headings"], out[0]["lam"])
+        found = self._derived(shape, pose)
+        return Slope(found["points"], found["headings"], found["lam"])
+
+
+class CompiledSpaceSolver(_Compiled[SpaceShape]):
+    """Equilibria in space by compiled C.
+
+    Parameters, flags and errors are those of `CompiledSolver`; poses are `equilibrium.Pose`, whose
+    branch is not used.
+
+    Examples
+    --------
+    >>> solver = CompiledSpaceSolver(model, p, rest)  # doctest: +SKIP
+    >>> solver.solve(pose).points  # doctest: +SKIP
+    """
+
+    _shape, _state = SpaceShape, "frames"
+
+    def solve(
+        self, pose: Pose, *, warm: SpaceShape | None = None, throw: bool = True
+    ) -> SpaceShape:
+        """Shape of the cable in one pose.
+
+        Raises
+        ------
+        EquilibriumError
+            If there is no stable equilibrium and `throw` is true.
+        DloError
+            If the warm start is no shape of this solver.
+        """
+        return self._solved(frame_poses([pose]), None, warm, throw=throw)
+
+    def step(self, shape: SpaceShape, pose: Pose, *, steps: int = 4) -> SpaceShape:
+        """Shape in a pose close by, in at most so many Newton steps; see its `status`."""
+        return self._stepped(frame_poses([pose]), shape, steps)
+
+    def solve_many(self, poses: Sequence[Pose]) -> tuple[Any, NDArray[np.intc]]:
+        """Records with the fields of SpaceShape, and statuses (index into STATUSES)."""
+        return self._batch(frame_poses(poses), None)
+
+    def path(
+        self, poses: Sequence[Pose], *, warm: SpaceShape | None = None
+    ) -> ShapePath[SpaceShape]:
+        """Shapes along a path, each followed continuously from the one before."""
+        return self._followed(frame_poses(poses), None, warm)
+
+    def sensitivity(self, shape: SpaceShape, pose: Pose) -> SpaceSlope:
+        """Derivatives of a shape by the pose it was solved for.
+
+        Raises
+        ------
+        EquilibriumError
+            If the shape is no stable equilibrium of this pose.
+        """
+        found = self._derived(shape, frame_poses([pose]))
+        return SpaceSlope(**{name: found[name] for name in self._slope.names or ()})

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import __version__
-from dlo_casadi.codegen.kernels import Kernels, c_number, kernels_of, table_to_c
+from dlo_casadi.codegen import plane, space
 from dlo_casadi.codegen.prefix import check_prefix
 from dlo_casadi.durable import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.effects import MeasurementEffect, StateEffect
-from dlo_casadi.equilibrium import resting_headings, total_dead_load
 from dlo_casadi.errors import DloError
 from dlo_casadi.model import CableModel
 
@@ -25,8 +24,6 @@ FloatArray = NDArray[np.floating]
 
 # By which a generated file is known, in all templates.
 MARK = "written by dlo-casadi"
-# Doubles of a workspace per slot; as in the template.
-_ARRAYS = 38
 
 
 @dataclass(frozen=True)
@@ -98,72 +95,29 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _extra(model: CableModel, p: FloatArray) -> list[float]:
-    """Numbers of the cable that no kernel holds, in the order of the template's macros."""
-    down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
-    offsets, length = model.held(p, 0, 0)
-    return [float(length), down, *total_dead_load(model, p), *np.array(offsets).ravel()[2:]]
+def _template(name: str) -> str:
+    return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
 
 
-def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray, kernels: Kernels) -> list[float]:
-    """The solver's table: numbers of the kernels, nodes, widths of the cells, rest, the others."""
-    stretch = float(model.held(p, 0, 0)[1]) / model.cable.length
-    return [
-        *kernels.table,
-        *(model.chain.places / model.cable.length),
-        *(1 / (np.diff(model.chain.cells, axis=1).ravel() * stretch)),
-        *resting_headings(model.chain, rest),
-        *_extra(model, p),
-    ]
-
-
-def _values(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    kernels: Kernels,
-    prefix: str,
-    digest: str,
-) -> dict[str, str]:
-    """What the templates' marks stand for."""
-    functions, loops = kernels.to_c(model.yields)
-    chain, rows = model.chain, len(kernels.table)
+def _values(model: CableModel, prefix: str, digest: str) -> dict[str, str]:
+    """What the templates' marks stand for, of any cable."""
     clamped = {side: int(getattr(model, side) == "clamped") for side in ("start", "end")}
     names = [effect.name for effect in model.effects]
-    count = chain.n_nodes
     return {
+        "PREFIX": prefix,
         "FILE": f"{prefix}_solver",
         "TITLE": comment(model.cable.name),
         "VERSION": __version__,
         "MODEL": f"{model.n} {model.element}s, start {model.start}, end {model.end}, effects: "
         + (comment(", ".join(names)) or "none"),
         "HASH": digest,
+        "DIMENSION": str(model.node.dimension),
         "N": str(model.n),
-        "N_HEADINGS": str(count),
-        "HEADINGS_ARE": chain.kind.nodes_are,
-        "LENGTH": c_number(float(model.held(p, 0, 0)[1])),
         "START_CLAMPED": str(clamped["start"]),
         "END_CLAMPED": str(clamped["end"]),
         "END_FREE": str(int(model.end == "free")),
-        "WORKSPACE": str(_ARRAYS * (count + 1)),
-        "ELEMENTS": str(chain.n_slots),
-        "FIRST": str(chain.layout.advancing[0]),
-        "LOW": str(clamped["start"]),
-        "HIGH": str(count - clamped["end"]),
-        "STRETCHES": str(int(model.extensible)),
         "ELASTIC": str(int(model.yields)),
-        "TABLE": table_to_c(numbers_of(model, p, rest, kernels)),
-        "PLACES": str(rows),
-        "WIDTHS": str(rows + count),
-        "RESTING": str(rows + 2 * count - 1),
-        "EXTRA": str(rows + 3 * count - 1),
-        "KERNELS": functions,
-        "LOOPS": loops,
     }
-
-
-def _template(name: str) -> str:
-    return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
 
 
 def comment(text: str) -> str:
@@ -177,11 +131,16 @@ def comment(text: str) -> str:
     return re.sub(r"(?<=/)(?=\*)|(?<=\*)(?=/)|(?<=\?)(?=\?)", " ", line)
 
 
+def marked(text: str, values: dict[str, str]) -> str:
+    """Replace those @MARKS@ that have a value; CMake's own stay."""
+    return re.sub(r"@([A-Z_]+)@", lambda match: values.get(match.group(1), match.group(0)), text)
+
+
 def fill(text: str, values: dict[str, str], prefix: str) -> str:
-    """Replace @MARKS@ and give public names their prefix; CMake's own marks stay."""
+    """Replace @MARKS@ and give public names their prefix."""
     text = re.sub(r"\bdlo_(?!casadi)", f"{prefix}_", text)
     text = re.sub(r"\bDLO_", f"{prefix.upper()}_", text)
-    return re.sub(r"@([A-Z_]+)@", lambda match: values.get(match.group(1), match.group(0)), text)
+    return marked(text, values)
 
 
 def generate(
@@ -200,7 +159,7 @@ def generate(
         Effects of the camera do not enter: the solver gives the true shape.
     p : (n_parameters,)
         In the order of `model.names`, SI units.
-    rest : (n_cells,) [1/m]
+    rest : (n_rests,) [1/m]
         Rest curvature of the bending cells; of a drifting cable the latest.
     prefix : str
         Begins all public names: `<prefix>_solve`.
@@ -215,10 +174,10 @@ def generate(
     """
     check_prefix(prefix)
     p, rest = np.asarray(p, float).ravel(), np.asarray(rest, float).ravel()
-    if len(p) != len(model.parameters) or len(rest) != model.chain.n_cells:
+    if len(p) != len(model.parameters) or len(rest) != model.chain.n_rests:
         raise DloError(
             f"p has {len(p)} and rest {len(rest)} entries; the model has "
-            f"{len(model.parameters)} parameters and {model.chain.n_cells} cells"
+            f"{len(model.parameters)} parameters and {model.chain.n_rests} rest curvatures"
         )
     if model.shape_dependent_loads:
         loads = " and ".join(model.shape_dependent_loads)
@@ -227,16 +186,19 @@ def generate(
             "and the generated solver knows dead loads only.\n"
             "  Try: dlo predict, or dlo_casadi.predict, which know it."
         )
-    kernels = kernels_of(model, p, rest, inline)
     digest = solver_hash(model, p, rest)
-    values = _values(model, p, rest, kernels, prefix, digest)
-    source = "".join(_template(name) for name in ("solver.c.in", "guesses.c.in", "interface.c.in"))
+    own, kind = (space, "space") if model.in_space else (plane, "plane")
+    values = _values(model, prefix, digest) | own.values(model, p, rest, inline)
+    texts = {**own.TEXTS, "TYPES": _template(f"{kind}_types.h.in").rstrip()}
+    parts = (f"{kind}.c.in", f"{kind}_guesses.c.in", f"{kind}_shape.c.in", "interface.c.in")
+    source = "".join(_template(name) for name in parts)
     names = {
         f"{prefix}_solver.h": "solver.h.in",
         "CMakeLists.txt": "CMakeLists.txt.in",
         f"{prefix}_solver.pc.in": "solver.pc.in",
         "example.c": "example.c.in",
     }
-    texts = {name: fill(_template(template), values, prefix) for name, template in names.items()}
-    texts[f"{prefix}_solver.c"] = fill(source, values, prefix)
-    return Solver(prefix, digest, texts, int(values["WORKSPACE"]))
+    found = {name: _template(template) for name, template in names.items()}
+    found[f"{prefix}_solver.c"] = source
+    filled = {name: fill(marked(text, texts), values, prefix) for name, text in found.items()}
+    return Solver(prefix, digest, filled, int(values["WORKSPACE"]))

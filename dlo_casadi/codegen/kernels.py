@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import pairwise
 from math import isfinite
 from typing import Any
@@ -13,6 +14,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.codegen.frames import SlotNumbers, slot_in_space
+from dlo_casadi.ends import EndConditions
 from dlo_casadi.errors import DloError
 from dlo_casadi.model import CableModel
 
@@ -55,13 +58,18 @@ class Kernel:
         Slots first <= j < last.
     rows : (last - first, k)
         Numbers that differ from slot to slot.
-    function : casadi.Function
-        (x (2,), lam (2,), row (k,), p) -> value, gradient (4,), upper triangle of the Hessian.
+    derive : callable
+        Makes the function.
     """
 
     members: tuple[int, int]
     rows: FloatArray
-    function: ca.Function
+    derive: Callable[[], ca.Function]
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """(x, lam, row (k,), p) -> value and derivatives."""
+        return self.derive()
 
 
 @dataclass(frozen=True)
@@ -88,24 +96,46 @@ class Kernels:
         rows = [kernel.rows.ravel() for kernel in self.slots]
         return [float(number) for number in np.concatenate([self.shared, *rows])]
 
-    def to_c(self, elastic: bool) -> tuple[str, str]:
-        """Kernel functions, and the statements that call them for all slots."""
-        functions, loops, offset = [], [], len(self.shared)
+    @property
+    def operations(self) -> int:
+        """Floating-point operations of all kernels."""
+        counts = (
+            (last - first) * kernel.function.n_nodes()
+            for kernel in self.slots
+            for first, last in [kernel.members]
+        )
+        return sum(counts)
+
+    def loops(self, call: str, table_at: int = 0) -> list[str]:
+        """Statements that call all kernels, `table_at` after the start of the solver's table.
+
+        `call` has the places {k}, the kernel's number, and {row}, its numbers.
+        """
+        found, offset = [], table_at + len(self.shared)
         for k, kernel in enumerate(self.slots):
             (first, last), width = kernel.members, kernel.rows.shape[1]
-            functions.append(_kernel_text(k, kernel, elastic))
             row = f"table + {offset} + (j - {first}) * {width}" if width else "table"
-            loops.append(
-                f"    for (j = {first}; j < {last}; ++j)\n"
-                f"        total += kernel_{k}(q, j, {row}, table);"
+            found.append(
+                f"    for (j = {first}; j < {last}; ++j)\n        {call.format(k=k, row=row)};"
             )
             offset += kernel.rows.size
+        return found
+
+    def to_c(self, elastic: bool) -> tuple[str, str]:
+        """Kernel functions of a planar cable, and the statements that call them for all slots."""
+        functions = [_kernel_text(k, kernel, elastic) for k, kernel in enumerate(self.slots)]
+        loops = self.loops("total += kernel_{k}(q, j, {row}, table)")
         if self.ends is not None:
             functions.append(_ends_text(self.ends))
             loops.append("    total += at_ends(q, table);")
-        text = "\n".join(functions)
-        helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
-        return "\n".join([*helpers, text]), "\n".join(loops)
+        return with_helpers(functions), "\n".join(loops)
+
+
+def with_helpers(functions: Sequence[str]) -> str:
+    """Text of functions, and ahead of it what they call."""
+    text = "\n".join(functions)
+    helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
+    return "\n".join([*helpers, text])
 
 
 def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True) -> Kernels:
@@ -145,40 +175,59 @@ def _kernel(
     members: tuple[int, int],
     inline: bool,
 ) -> Kernel:
-    x, lam = ca.SX.sym("x", 2), ca.SX.sym("lam", 2)
     varies = [
         not (inline and np.allclose(column, column[0], rtol=_ROUNDING, atol=0.0))
         for column in own.T
     ]
     row = ca.SX.sym("row", sum(varies))
     symbols = iter(ca.vertsplit(row)) if row.numel() else iter(())
-    numbers = [
+    values = [
         next(symbols) if varied else ca.SX(float(column[0]))
         for varied, column in zip(varies, own.T, strict=True)
     ]
-    start = numbers[0]
+    start = values[0]
     # The cell's start is counted from the slot's, so that slots of one kind differ in that alone.
     place = ca.vertcat(start, first[1], start + (first[2] - first[0]), *first[3:])
-    shares = model.shares(p, ca.DM(first) if inline else place)
-    still = ca.DM.zeros(len(model.deviation_names))
+    numbers = SlotNumbers(
+        p,
+        ca.vertcat(*values[1:]),
+        place,
+        ca.SX.zeros(len(model.deviation_names)),
+        model.shares(p, ca.DM(first) if inline else place),
+    )
+    derivatives = _in_space if model.in_space else _in_plane
+    return Kernel(members, own[:, varies], partial(derivatives, model, numbers, row))
+
+
+def _in_plane(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:
+    """(x (2,), lam (2,), row, p) -> value, gradient (4,), upper triangle of the Hessian."""
+    x, lam = ca.SX.sym("x", 2), ca.SX.sym("lam", 2)
     position = ca.SX.zeros(0) if model.end == "free" else lam
     multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
-    arguments = [x, multipliers, p, ca.vertcat(*numbers[1:]), place, still, shares]
-    both: Any = model.slot_by_share(*arguments)  # CasADi's stubs know of one kind of result
+    arguments = [x, multipliers, numbers.p, numbers.rest, numbers.place, numbers.deviation]
+    both: Any = model.slot_by_share(*arguments, numbers.shares)  # CasADi's stubs: one result
     value, advance = both
     if model.end == "free":
         # lam is zero there; its derivative is the way from slot to slot all the same.
         value += ca.dot(lam, advance)
-    function = _derivatives(value, [x, lam, row, _symbols(p)], ca.vertcat(x, lam))
-    return Kernel(members, own[:, varies], function)
+    return _derivatives(value, [x, lam, row, _symbols(numbers.p)], ca.vertcat(x, lam))
+
+
+def _in_space(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:
+    """(x (8,), lam (3,), row, p) -> what frames.slot_in_space tells, in one vector."""
+    x, lam = ca.SX.sym("x", 8), ca.SX.sym("lam", 3)
+    outputs = ca.vertcat(*slot_in_space(model, x, lam, numbers))
+    arguments = [x, lam, row, _symbols(numbers.p)]
+    return ca.Function("kernel", arguments, ca.cse([ca.densify(outputs)]))
 
 
 def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
     """Energy of the holders, without end conditions."""
-    x, lam = ca.SX.sym("x", 2), ca.SX.zeros(model.n_conditions)
-    value, _, _ = model.at_ends(
-        x, lam, p, ca.DM.zeros(model.n_pose), ca.DM.zeros(len(model.deviation_names))
-    )
+    node = model.node
+    x, lam = ca.SX.sym("x", 2 * node.coordinates), ca.SX.zeros(model.n_conditions)
+    pose = np.zeros(model.n_pose)
+    pose[2 * node.dimension : EndConditions.size(node)] = 2 * node.identity
+    value, _, _ = model.at_ends(x, lam, p, pose, ca.DM.zeros(len(model.deviation_names)))
     if not ca.depends_on(value, x):
         return None
     return _derivatives(value, [x, _symbols(p)], x)
@@ -196,12 +245,14 @@ def _derivatives(value: ca.SX, arguments: list[ca.SX], by: ca.SX) -> ca.Function
 
 # ---- text --------------------------------------------------------------------------------------
 
+Targets = dict[tuple[int, int], str]
+
 _BODY = re.compile(r"^static int casadi_f0\(.*?\{\n(.*?)^\}", re.MULTILINE | re.DOTALL)
 _INPUT = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
 _OUTPUT = re.compile(r"if \(res\[(\d+)\]!=0\) res\[\1\]\[(\d+)\]=(.*?);")
 
 
-def _statements(function: ca.Function, inputs: Sequence[str], targets: dict[tuple, str]) -> str:
+def statements(function: ca.Function, inputs: Sequence[str], targets: Targets) -> str:
     """What CasADi prints for a function, reading and writing our names.
 
     Parameters
@@ -209,18 +260,17 @@ def _statements(function: ca.Function, inputs: Sequence[str], targets: dict[tupl
     inputs : sequence of str
         C array of each input.
     targets : dict
-        ("value",), ("g", row) or ("h", row, column) -> the assignment's left side and operator.
+        (output, nonzero) -> the assignment's left side and operator.
     """
     generator = ca.CodeGenerator("kernel")
     generator.add(function)
     found = _BODY.search(generator.dump())
     if found is None:  # pragma: no cover: another version of CasADi prints in another way
         raise DloError("CasADi printed no function; try another version of CasADi")
-    names = dict(_places(function))
 
     def output(match: re.Match[str]) -> str:
-        place = names[int(match[1]), int(match[2])]
-        return f"{targets[place]} {match[3]};" if place in targets else ""
+        target = targets.get((int(match[1]), int(match[2])))
+        return f"{target} {match[3]};" if target else ""
 
     text = _INPUT.sub(lambda match: f"{inputs[int(match[1])]}[{match[2]}]", found[1])
     text = _OUTPUT.sub(output, text).replace("  return 0;\n", "")
@@ -228,6 +278,11 @@ def _statements(function: ca.Function, inputs: Sequence[str], targets: dict[tupl
         r"casadi_\w+", lambda match: _CALLS.get(match[0], match[0][len("casadi_") :]), text
     )
     return "\n".join("  " + line for line in text.splitlines() if line.strip())
+
+
+def _by_place(function: ca.Function, targets: dict[tuple, str]) -> Targets:
+    """Of ("value",), ("g", row), ("h", row, column) -> text, those of nonzero outputs."""
+    return {at: targets[place] for at, place in _places(function) if place in targets}
 
 
 def _places(function: ca.Function) -> Iterator[tuple[tuple[int, int], tuple]]:
@@ -270,7 +325,8 @@ def _kernel_text(k: int, kernel: Kernel, elastic: bool) -> str:
         if place not in there and not text.endswith("+=")
     ]
     targets["value",] = "value ="
-    body = _statements(kernel.function, ("x", "q->lam", "row", "table"), targets)
+    inputs = ("x", "q->lam", "row", "table")
+    body = statements(kernel.function, inputs, _by_place(kernel.function, targets))
     first, last = kernel.members
     return "\n".join(
         [
@@ -297,7 +353,7 @@ def _ends_text(function: ca.Function) -> str:
         ("h", 0, 0): "q->diagonal[0] +=",
         ("h", 1, 1): "q->diagonal[SLOTS - 1] +=",
     }
-    body = _statements(function, ("x", "table"), targets)
+    body = statements(function, ("x", "table"), _by_place(function, targets))
     return "\n".join(
         [
             "/* What holds the first and the last node beside their conditions. */",

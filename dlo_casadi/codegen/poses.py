@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dlo_casadi.equilibrium import Pose
 from dlo_casadi.errors import DloError
 
 FloatArray = NDArray[np.floating]
@@ -82,14 +84,18 @@ def one_pose(end: ArrayLike, start: ArrayLike, headings: ArrayLike) -> FloatArra
     return pose_table(end, start, headings)
 
 
-def no_equilibrium(status: str, pose: FloatArray, length: float) -> str:
-    """Message on a pose (6,) that ends in a status other than ok."""
-    x, y, end_x, end_y = pose[:4]
+def frame_poses(poses: Sequence[Pose]) -> FloatArray:
+    """Poses (m, 15) in space: start, end, orientations, turns."""
+    return np.array([[*pose.ends, pose.turns] for pose in poses], dtype=float).reshape(-1, 15)
+
+
+def no_equilibrium(status: str, start: FloatArray, end: FloatArray, length: float) -> str:
+    """Message on a pose that ends in a status other than ok."""
+    here, there = (", ".join(f"{x:.4f}" for x in place) for place in (start, end))
     hint = _HINTS.get(status)
     return (
-        f"no equilibrium: {status} with the end at ({end_x:.4f}, {end_y:.4f}) m, the start at "
-        f"({x:.4f}, {y:.4f}) m; the cable is {length:.4f} m long."
-        + (f"\n  Try: {hint}" if hint else "")
+        f"no equilibrium: {status} with the end at ({there}) m, the start at ({here}) m; the cable "
+        f"is {length:.4f} m long." + (f"\n  Try: {hint}" if hint else "")
     )
 
 

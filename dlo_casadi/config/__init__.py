@@ -11,6 +11,7 @@ from dlo_casadi.config.limits import (
     REST_COEFFICIENTS,
     Range,
     implausible_gravity,
+    implausible_quaternion,
     implausible_sizes,
 )
 from dlo_casadi.config.load import load_config
@@ -60,6 +61,7 @@ __all__ = [
     "declared_setup",
     "dump_yaml",
     "implausible_gravity",
+    "implausible_quaternion",
     "implausible_sizes",
     "load_config",
     "read_document",

@@ -42,6 +42,8 @@ class Range(NamedTuple):
 
 # Nothing shorter than a millimetre is held in two fixtures; 100 m hang between two masts.
 LENGTH = Range(1.0e-3, 100.0, "m")
+# Rounding to three digits moves the length of a quaternion by so much at most.
+_UNIT = 2.0e-3
 # Carbon fibres have 5e-6 m; the upper limit is the length itself.
 _THINNEST = 1.0e-6
 # A millimetre of the thinnest wire on sale (copper, 10 um): 9e3 pi (5e-6)^2 1e-3 = 7e-10 kg.
@@ -116,6 +118,14 @@ def implausible_gravity(gravity: tuple[float, ...]) -> list[Problem]:
     return GRAVITY.problems(("gravity",), math.hypot(*gravity))
 
 
+def implausible_quaternion(values: Sequence[float]) -> str:
+    """What is wrong with an orientation (x, y, z, w); empty if its length is one."""
+    size = math.hypot(*values)
+    if len(values) == 4 and abs(size - 1) <= _UNIT:
+        return ""
+    return f"a unit quaternion [qx, qy, qz, qw] belongs here, its length is {size:.4g}"
+
+
 def implausible_pixels(place: Place, values: Iterable[float]) -> list[Problem]:
     """Find pixels [px] that no picture has."""
     return [problem for value in values for problem in PIXELS.problems(place, value)]
@@ -143,8 +153,8 @@ def impossible_values(experiment: Experiment, length: float) -> Iterator[Problem
         ):
             yield Problem(place, f"std: {message}")
     # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
-    in_space = len(experiment.gravity) == 3
-    cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=1.0 if in_space else None)
+    torsional_stiffness = 1.0 if experiment.in_space else None
+    cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
     declared = experiment.tolerances.model_dump()
     taken_up = {
         kind.tolerances[q.name]: q

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from dlo_casadi.config.declared_effects import wrong_effects
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.explain import explain
-from dlo_casadi.config.limits import impossible_values
+from dlo_casadi.config.limits import implausible_quaternion, impossible_values
 from dlo_casadi.config.problems import Problem, kind_of, show
 from dlo_casadi.config.sections import (
     Cable,
@@ -110,9 +110,6 @@ _FINE = 160
 # Seconds of COBYLA for one pose: measured 1 for 10 links, 4 for 20; it grows with the square.
 _COBYLA_LINKS = 20
 
-# Rounding to three digits moves the length of a quaternion by so much at most.
-UNIT = 2.0e-3
-
 # A start needs no more than a full turn [rad]; an end is continuous along a cable that may turn
 # round several times.
 _LARGEST_HEADINGS = {"start": 6.3, "end": 25.0}
@@ -179,10 +176,8 @@ def _frame_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, s
             yield f"{key}: {_axes(experiment)} belongs here ({numbers})", key
         orientation, heading = getattr(pose, f"{key}_orientation"), getattr(pose, f"{key}_heading")
         if orientation is not None:
-            size = math.hypot(*orientation)
-            if abs(size - 1) > UNIT:
-                text = f"{key}_orientation: a unit quaternion [qx, qy, qz, qw] belongs here, "
-                yield text + f"its length is {size:.4g}", f"{key}_orientation"
+            if wrong := implausible_quaternion(orientation):
+                yield f"{key}_orientation: {wrong}", f"{key}_orientation"
             if not space:
                 text = "is for a cable in space; gravity has two numbers. Try: "
                 yield f"{key}_orientation {text}{key}_heading", f"{key}_orientation"

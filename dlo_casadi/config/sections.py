@@ -314,6 +314,10 @@ class Tolerances(Section):
     """Of the roll of a cable in its end clamp, about itself [rad]."""
     scale: Positive = 3.0e-4
     """Of the scale of the measurement, relative."""
+    camera_rotation: Positive = 2.0e-3
+    """Of the frame of a measurement in space against the fixtures, about each axis [rad]."""
+    camera_translation: Positive = 1.0e-3
+    """Of the frame of a measurement in space against the fixtures, along each axis [m]."""
 
 
 class Pose(Section):
@@ -324,7 +328,7 @@ class Pose(Section):
     start: Place
     """Where the start is held [x, y] [m], in space [x, y, z]."""
     end: Place | None = None
-    """Where the end is held [m]; a free end has none."""
+    """Where the end is held [x, y] [m], in space [x, y, z]; a free end has none."""
     start_heading: Number | None = None
     """Direction of the cable in a clamped start, counter-clockwise from +x [rad]."""
     end_heading: Number | None = None

@@ -394,7 +394,7 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
         center=center,
         camera=any(item.pose.camera_center is not None for item in problem.history),
         directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
-        largest_bend=float(np.abs(problem.sweep.bends(shapes, fit.p, fit.rest)).max()),
+        largest_bend=float(problem.sweep.bends(shapes, fit.p, fit.rest).max()),
     )
     listed = candidates(fit.model, setup, exclude)
     return Screen(fit, listed).run(screening_degrees(fit)) if listed else []

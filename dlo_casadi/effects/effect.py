@@ -382,10 +382,10 @@ class StateEffect(Effect):
 
     slot: ClassVar[str] = "state"
 
-    def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
-        """Rest curvature (axes,) [1/m] of a cell after a pose of this curvature has been held.
+    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Rest strain [1/m] of a cell after a pose of this strain has been held.
 
-        One number in a plane; in space curvatures about the material axes y and z.
+        The curvature in a plane; in space the twist, then curvatures about the axes y and z.
         """
         raise TypeError(f"{self.name} has no law of the state")
 

@@ -21,8 +21,9 @@ class PlasticSet(StateEffect):
         b = kappa - kappa_0
         kappa_0 <- kappa_0 + share max(|b| - y, 0) b / |b|
 
-    with the size |b| of the bend; in space it is a vector. At y = 0 it is a drift of the rest
-    curvature. The kink is rounded over a hundredth of a turn per length, smoothly and oddly in b.
+    with the size |b| of the bend; in space it is a vector, and twist leaves nothing behind. At
+    y = 0 it is a drift of the rest curvature. The kink is rounded over a hundredth of a turn per
+    length, smoothly and oddly in b.
 
     Parameters
     ----------
@@ -52,13 +53,15 @@ class PlasticSet(StateEffect):
         bend = setup.largest_bend or setup.cable.curvature_scale
         return tuple({"yield_curvature": share * bend} for share in YIELDS)
 
-    def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
-        """Rest curvature after the pose [1/m].
+    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Rest strain after the pose [1/m].
 
         With the kinks rounded, (ramp(|b| - y) - ramp(-|b| - y)) / |b| is 1 - 2 y / (S_- + S_+),
         S = sqrt((|b| -+ y)^2 + d^2): written in |b|^2, which is smooth at 0.
         """
-        bend, limit = curvature - rest, params["yield_curvature"]
+        bend, limit = strain - rest, params["yield_curvature"]
+        if bend.numel() > 1:
+            bend = ca.vertcat(0, bend[1:])
         square, level = ca.sumsqr(bend), limit**2
         rounding = (_ROUNDING * cable.curvature_scale) ** 2
         product = ca.sqrt((square - level) ** 2 + 2 * rounding * (square + level) + rounding**2)

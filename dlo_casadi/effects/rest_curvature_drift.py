@@ -13,6 +13,8 @@ class RestCurvatureDrift(StateEffect):
 
         kappa_0 <- kappa_0 + rate (kappa - kappa_0)
 
+    In space so has the rest twist.
+
     Parameters
     ----------
     rate : scalar, in [0, 1)
@@ -25,6 +27,6 @@ class RestCurvatureDrift(StateEffect):
         """Declare the rate."""
         return (Parameter("rate", scale=0.05, lower=0.0, upper=0.95),)
 
-    def next_rest(self, rest: ca.SX, curvature: ca.SX, cable: Cable, params: Params) -> ca.SX:
-        """Rest curvature after the pose [1/m]."""
-        return rest + params["rate"] * (curvature - rest)
+    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Rest strain after the pose [1/m]."""
+        return rest + params["rate"] * (strain - rest)

@@ -56,6 +56,8 @@ class Tolerances:
     scale: float = 3e-4
     rotation: float = 5e-3
     roll: float = 1.0
+    camera_rotation: float = 2e-3
+    camera_translation: float = 1e-3
 
     def deviation(self, node: type[Node]) -> FloatArray:
         """Standard deviations of a pose's deviations, see `deviation_names`; pulls are free."""

@@ -87,9 +87,10 @@ class Sweep:
         return self._after(self.m - 1, shapes, p, self.rests(shapes, p, rest))[0]
 
     def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Curvature minus the rest curvature that each pose finds (m, n_rests) [1/m]."""
+        """Size (m, n_cells) [1/m] of curvature minus the rest curvature that each pose finds."""
         given = self._given(shapes, p, rest)
-        return self.assembly.strain(shapes, given) - given.rest
+        bends = self.assembly.strain(shapes, given) - given.rest
+        return np.asarray(np.linalg.norm(self.assembly.chain.curvatures(bends), axis=1))
 
     def _given(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Given:
         return Given.of(p, self.rests(shapes, p, rest), self._ends)

@@ -27,10 +27,14 @@ COLUMNS: dict[str, str] = {
     "bending_stiffness_low_95": "number",
     "bending_stiffness_high_95": "number",
     "identifiable": "truth",
+    "torsional_stiffness": "number",
+    "torsional_stiffness_std": "number",
     "parameters": "parameters",
     "rest_curvature_s": "numbers",
     "rest_curvature": "numbers",
     "rest_curvature_std": "numbers",
+    "rest_curvature_z": "numbers",
+    "rest_curvature_z_std": "numbers",
     **{
         f"{stage}_{what}": "number"
         for stage in STAGES
@@ -38,6 +42,7 @@ COLUMNS: dict[str, str] = {
     },
     "unexplained_force_x": "number",
     "unexplained_force_y": "number",
+    "unexplained_force_z": "number",
     "unexplained_position": "number",
     "noise_std": "number",
     "noise_correlation_length": "number",
@@ -56,10 +61,10 @@ COLUMNS: dict[str, str] = {
 
 UNITS = {
     "bending_stiffness": "N m^2",
-    "rest_curvature": "1/m",
-    "rest_curvature_std": "1/m",
-    "unexplained_force_x": "N",
-    "unexplained_force_y": "N",
+    "torsional_stiffness": "N m^2",
+    "torsional_stiffness_std": "N m^2",
+    **dict.fromkeys((name for name in COLUMNS if name.startswith("rest_curvature")), "1/m"),
+    **dict.fromkeys((name for name in COLUMNS if name.startswith("unexplained_force")), "N"),
     **{
         name: "m"
         for name in COLUMNS
@@ -82,6 +87,8 @@ def empty_row(key: str, digest: str, status: str, message: str, seconds: float) 
         "rest_curvature_s": [],
         "rest_curvature": [],
         "rest_curvature_std": [],
+        "rest_curvature_z": [],
+        "rest_curvature_z_std": [],
         "warnings": [],
         "config_hash": digest,
         "package_version": __version__,
@@ -97,7 +104,8 @@ def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: f
     rest = last["parameters"]["rest_curvature"]
     measurement, mesh = report["measurement"], report["discretization"]
     pull = report["unexplained"] or {}
-    force = pull.get("force") or (None, None)
+    force = pull.get("force") or ()
+    torsion = last["parameters"].get("torsional_stiffness", {})
     row = empty_row(key, digest, "done", "", seconds) | {
         "cable": cable,
         "verdict": report["verdict"],
@@ -107,16 +115,16 @@ def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: f
         "bending_stiffness_low_95": low,
         "bending_stiffness_high_95": high,
         "identifiable": stiffness["identifiable"],
+        "torsional_stiffness": torsion.get("value"),
+        "torsional_stiffness_std": torsion.get("std"),
         "parameters": [
             {"name": name, "value": item["value"], "std": item["std"], "unit": item["unit"]}
             for name, item in last["parameters"].items()
             if name != "rest_curvature"
         ],
         "rest_curvature_s": rest["s"],
-        "rest_curvature": rest["value"],
-        "rest_curvature_std": rest["std"],
-        "unexplained_force_x": force[0],
-        "unexplained_force_y": force[1],
+        **_rest_columns(rest),
+        **{f"unexplained_force_{axis}": value for axis, value in zip("xyz", force, strict=False)},
         "unexplained_position": pull.get("position"),
         "noise_std": measurement["std"],
         "noise_correlation_length": measurement["correlation_length_m"],
@@ -134,6 +142,16 @@ def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: f
     for part in TIMES:
         row[f"{TIME}{part}_s"] = report["timing_s"].get(part)
     return row
+
+
+def _rest_columns(rest: dict[str, Any]) -> dict[str, Any]:
+    """Rest curvature in a plane, or in space about the material axis y, and then about z."""
+    about = {"": rest} if "value" in rest else {"": rest["k_y"], "_z": rest["k_z"]}
+    return {
+        f"rest_curvature{axis}{suffix}": item[key]
+        for axis, item in about.items()
+        for suffix, key in (("", "value"), ("_std", "std"))
+    }
 
 
 def _effect(effect: dict[str, Any]) -> dict[str, Any]:

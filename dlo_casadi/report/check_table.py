@@ -41,7 +41,7 @@ def pose_row(config: Config, item: PoseInput) -> dict[str, Any]:
     read = len(item.points) > 0
     length = float(np.linalg.norm(np.diff(item.points, axis=0), axis=1).sum()) if read else None
     away = [
-        float(np.hypot(*(item.points[k] - place)))
+        float(np.linalg.norm(item.points[k] - place))
         for k, place in ((0, declared.start), (-1, declared.end))
         if read and place is not None
     ]

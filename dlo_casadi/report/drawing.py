@@ -37,23 +37,30 @@ def prediction_figure(shape: dict[str, Any]) -> Figure:
 
 def _draw(drawing: Figure, shape: dict[str, Any]) -> None:
     points = np.array(shape["points"])
+    in_space = points.shape[1] == 3
     forces = {"start": np.array(shape["force_on_start"]), "end": np.array(shape["force_on_end"])}
-    largest = max(float(np.hypot(*force)) for force in forces.values())
+    largest = max(float(np.linalg.norm(force)) for force in forces.values())
     span = float(np.ptp(points, axis=0).max())
     reach = 0.25 * span / max(largest, 1e-12)
-    axes = drawing.subplots()
-    band = band_outline(points, np.array(shape["band_90"]))
-    axes.fill(*band.T, color=BLUE, alpha=0.15, lw=0, label="90 % of next hangings")
+    axes: Any = drawing.add_subplot(projection="3d" if in_space else None)
+    if not in_space:
+        band = band_outline(points, np.array(shape["band_90"]))
+        axes.fill(*band.T, color=BLUE, alpha=0.15, lw=0, label="90 % of next hangings")
     axes.plot(*points.T, color=BLUE, lw=2.5, label="cable")
     for at, (side, force) in zip((points[0], points[-1]), forces.items(), strict=True):
         held = side == "start" or shape["end"] is not None
         if not held:
             continue
-        axes.plot(*at, "s" if side == "start" else "o", color=BLACK, ms=7, label=side)
-        size = float(np.hypot(*force))
+        marker = "s" if side == "start" else "o"
+        axes.plot(*at[:, None], marker, color=BLACK, ms=7, label=side)
+        size = float(np.linalg.norm(force))
         if size <= 1e-3 * largest or largest == 0:
             continue
         tip = at + reach * force
+        if in_space:
+            axes.quiver(*at, *(tip - at), color=VERMILLION, lw=1.8, arrow_length_ratio=0.15)
+            axes.text(*tip, f"{size:.3g} N", color=VERMILLION)
+            continue
         arrow = {"arrowstyle": "-|>", "color": VERMILLION, "lw": 1.8}
         axes.annotate("", xy=(tip[0], tip[1]), xytext=(at[0], at[1]), arrowprops=arrow)
         axes.annotate(
@@ -71,7 +78,7 @@ def _draw(drawing: Figure, shape: dict[str, Any]) -> None:
         axes.plot(*np.transpose([tip, tip + room]), alpha=0)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.12)
-    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})
     axes.plot([], [], color=VERMILLION, label="force of the cable on its fixtures")
     drawing.legend(loc="outside lower center", ncols=4)
     state = "stable" if shape["stable"] else "NOT stable"

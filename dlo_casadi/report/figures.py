@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,17 @@ from dlo_casadi.report.canvas import (
     label_of,
     millimetres,
 )
-from dlo_casadi.report.geometry import band_outline, magnified, measured_line
+from dlo_casadi.report.figures_room import FORCE, draw_marks, frame_room
+from dlo_casadi.report.geometry import (
+    band_outline,
+    directions,
+    magnified,
+    measured_line,
+    residual_along,
+    rest_about,
+)
 from dlo_casadi.report.overlay import write_overlays
+from dlo_casadi.report.room import Room, around, rooms, seen
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 
 FloatArray = NDArray[np.floating]
@@ -81,28 +91,28 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
     lines = _shown_stages(outcome)
     rows, columns = _arranged(len(poses))
     factor = _magnification(outcome, outcome.config.cable.length)
+    in_space = outcome.config.experiment.in_space
+    standing = rooms(outcome.config, poses, [stage for stage, *_ in lines]) if in_space else []
     center, span = _common_frame(outcome, poses)
+    if standing:
+        span = standing[0].window
     width = max(3.1 * columns, 7.5)
     height = 0.82 * width / columns * float(span[1] / span[0])
     if rows == 1 and height > _TALLEST:
         width, height = max(width * _TALLEST / height, 7.5), _TALLEST
     with figure(path, (width, (height + 0.4) * rows + 1.3)) as drawing:
         grid = drawing.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-        for axes, pose in zip(grid.ravel(), poses, strict=False):
-            _draw_pose(axes, pose, lines, factor)
+        for axes, pose, room in zip_longest(grid.ravel()[: len(poses)], poses, standing):
+            if room is not None:
+                _draw_in_room(axes, outcome, pose, lines, factor, room)
+                continue
+            _draw_pose(axes, pose, lines, factor, np.asarray)
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
         for axes in grid.ravel()[len(poses) :]:
             axes.set_axis_off()
-        for axes in grid[-1]:
-            axes.set_xlabel("x [m]")
-        for axes in grid[:, 0]:
-            axes.set_ylabel("y [m]")
-        for column in range(columns):  # the lowest panel of a column that is not empty
-            lowest = max(k for k in range(len(poses)) if k % columns == column)
-            below = grid.ravel()[lowest]
-            below.set_xlabel("x [m]")
-            below.tick_params(labelbottom=True)
+        if not standing:
+            _label_grid(grid, len(poses))
         handles: list[Line2D | Patch] = [
             Line2D([], [], color=BLACK, marker=".", ls="none", ms=7, label="measured")
         ]
@@ -110,15 +120,33 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
             Line2D([], [], color=color, ls=style, label=label_of(stage, outcome))
             for stage, color, style in lines
         ]
+        if standing:
+            handles.append(Line2D([], [], color=FORCE, label="force on the ends"))
         if any(pose.role == "held_out" for pose in poses):
             handles.append(Patch(fc="white", ec=_HELD_OUT, lw=2, label="held out of the fit"))
         drawing.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         drawn = "" if factor == 1 else f"; deviations drawn {factor} times as large"
+        if standing:
+            drawn += f"; squares of {standing[0].square:g} mm"
         drawing.suptitle(
             f"{outcome.config.cable.name}: predicted from the end conditions alone\n"
             f"RMS distance to the measured points above each pose{drawn}",
             fontsize=12,
         )
+
+
+def _label_grid(grid: NDArray[np.object_], count: int) -> None:
+    """Name the axes at the left and below the lowest panels that are not empty."""
+    columns = grid.shape[1]
+    for axes in grid[-1]:
+        axes.set_xlabel("x [m]")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("y [m]")
+    for column in range(columns):
+        lowest = max(k for k in range(count) if k % columns == column)
+        below = grid.ravel()[lowest]
+        below.set_xlabel("x [m]")
+        below.tick_params(labelbottom=True)
 
 
 def _arranged(count: int) -> tuple[int, int]:
@@ -152,22 +180,47 @@ def _magnification(outcome: Outcome, size: float) -> int:
     return max(factor for factor in _FACTORS if factor == 1 or factor <= wanted)
 
 
+def _draw_in_room(
+    axes: Axes,
+    outcome: Outcome,
+    pose: PoseInput,
+    lines: Sequence[tuple[Stage, str, str]],
+    factor: int,
+    room: Room,
+) -> None:
+    declared = next(item for item in outcome.config.experiment.poses if item.name == pose.name)
+    shape = lines[-1][0].shapes.get(pose.name) if lines else None
+    under, over = around(room, declared, pose.points, shape)
+    draw_marks(axes, under)
+    _draw_pose(axes, pose, lines, factor, lambda points: seen(room.points(points)))
+    draw_marks(axes, over)
+    frame_room(axes, room)
+
+
 def _draw_pose(
-    axes: Axes, pose: PoseInput, lines: Sequence[tuple[Stage, str, str]], factor: int
+    axes: Axes,
+    pose: PoseInput,
+    lines: Sequence[tuple[Stage, str, str]],
+    factor: int,
+    place: Callable[[FloatArray], FloatArray],
 ) -> None:
     for stage, color, style in lines:
         shape = stage.shapes.get(pose.name)
         if shape is not None:
-            axes.plot(*magnified(pose, shape, factor).T, color=color, ls=style)
-            if factor == 1 and shape.spread is not None and stage is lines[-1][0]:
-                axes.fill(*band_outline(shape.curve, EDGE * shape.spread).T, color=color, alpha=0.2)
+            axes.plot(*place(magnified(pose, shape, factor)).T, color=color, ls=style)
+            spread = shape.spread if factor == 1 and stage is lines[-1][0] else None
+            if spread is not None and spread.ndim == 1:
+                outline = place(band_outline(shape.curve, EDGE * spread))
+                axes.fill(*outline.T, color=color, alpha=0.2)
     if len(pose.points):
-        axes.plot(*pose.points[:: max(1, len(pose.points) // 60)].T, ".", color=BLACK, ms=2.5)
+        shown = pose.points[:: max(1, len(pose.points) // 60)]
+        axes.plot(*place(shown).T, ".", color=BLACK, ms=2.5)
     axes.set_aspect("equal")
     last = lines[-1][0].shapes.get(pose.name) if lines else None
     if last is not None:
-        axes.plot(*last.curve[0], "s", color=BLACK, ms=4)
-        axes.plot(*last.curve[-1], "o", color=BLACK, ms=4)
+        ends = place(last.curve[[0, -1]])
+        axes.plot(*ends[0], "s", color=BLACK, ms=4)
+        axes.plot(*ends[1], "o", color=BLACK, ms=4)
     title = pose.name
     if not len(pose.points):
         title += ": not read"
@@ -206,9 +259,10 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
     """Normal distance of the measured points from the prediction along the arc, in noise units."""
     before, after = before_after(outcome)
     stages = [stage for stage in (before, after) if stage is not None]
-    with figure(path, (8.5, 0.9 + 2.7 * len(stages))) as drawing:
-        grid = drawing.subplots(len(stages), 1, squeeze=False, sharex=True)
-        for axes, stage in zip(grid[:, 0], stages, strict=True):
+    panels = [(stage, direction) for stage in stages for direction in directions(outcome)]
+    with figure(path, (8.5, 0.9 + 2.7 * len(panels))) as drawing:
+        grid = drawing.subplots(len(panels), 1, squeeze=False, sharex=True)
+        for axes, (stage, direction) in zip(grid[:, 0], panels, strict=True):
             axes.axhspan(-2, 2, color="#EDEDED", zorder=0)
             axes.axhline(0, color=GREY, lw=0.8)
             for pose in outcome.poses:
@@ -218,7 +272,7 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
                 held_out = pose.role == "held_out"
                 axes.plot(
                     shape.s,
-                    shape.residual / outcome.measurement.std,
+                    residual_along(shape, direction) / outcome.measurement.std,
                     color=_HELD_OUT if held_out else BLUE,
                     lw=1.1,
                     alpha=0.85 if held_out else 0.45,
@@ -226,7 +280,8 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
                 )
             chi2 = stage.chi2_per_dof
             quality = "" if chi2 is None else f" (chi-square per degree of freedom {chi2:.3g})"
-            axes.set_title(label_of(stage, outcome) + quality, loc="left")
+            along = direction and f", along {direction}"
+            axes.set_title(label_of(stage, outcome) + along + quality, loc="left")
             axes.set_ylabel("distance / noise")
         grid[-1, 0].set_xlabel("arc length from the start s [m]")
         grid[-1, 0].set_xlim(0, outcome.config.cable.length)
@@ -248,23 +303,27 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
 def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
     """Rest curvature of the last stage with its band, and of the fit that it improves on."""
     before, after = before_after(outcome)
-    with figure(path, (8.5, 3.8)) as drawing:
-        axes = drawing.subplots()
-        if before is not None and before.name == "batch":
-            rest = before.rest_curvature
-            axes.plot(rest.s, rest.value, "--", color=ORANGE, label=label_of(before, outcome))
-        if after is not None:
-            rest = after.rest_curvature
-            band = np.stack([rest.value - 2 * rest.std, rest.value + 2 * rest.std])
-            axes.plot(rest.s, rest.value, color=BLUE, label=label_of(after, outcome))
-            axes.fill_between(rest.s, *band, color=BLUE, alpha=0.2, lw=0, label="its 95 % band")
-        axes.axhline(0, color=GREY, lw=0.8)
-        axes.set(
-            xlim=(0, outcome.config.cable.length),
-            xlabel="arc length from the start s [m]",
-            ylabel="rest curvature [1/m]",
-        )
-        drawing.legend(loc="outside lower center", ncols=3)
+    shown = directions(outcome)
+    with figure(path, (8.5, 3.8 + 2.4 * (len(shown) - 1))) as drawing:
+        grid = drawing.subplots(len(shown), 1, squeeze=False, sharex=True)
+        for axes, direction in zip(grid[:, 0], shown, strict=True):
+            if before is not None and before.name == "batch":
+                rest = rest_about(before, direction)
+                axes.plot(rest.s, rest.value, "--", color=ORANGE, label=label_of(before, outcome))
+            if after is not None:
+                rest = rest_about(after, direction)
+                band = np.stack([rest.value - 2 * rest.std, rest.value + 2 * rest.std])
+                axes.plot(rest.s, rest.value, color=BLUE, label=label_of(after, outcome))
+                axes.fill_between(rest.s, *band, color=BLUE, alpha=0.2, lw=0, label="its 95 % band")
+            axes.axhline(0, color=GREY, lw=0.8)
+            about = direction and f" k_{direction}"
+            axes.set(
+                xlim=(0, outcome.config.cable.length),
+                xlabel="arc length from the start s [m]",
+                ylabel=f"rest curvature{about} [1/m]",
+            )
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        drawing.legend(handles, labels, loc="outside lower center", ncols=3)
         straight = outcome.config.cable.rest_shape == "straight"
         note = "declared straight, not fitted" if straight else "shape without load"
         drawing.suptitle(f"{outcome.config.cable.name}: rest curvature ({note})", fontsize=12)

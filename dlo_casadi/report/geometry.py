@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape
+from dlo_casadi.session.outcome import (
+    Outcome,
+    PoseInput,
+    PoseShape,
+    RestCurvatureEstimate,
+    Stage,
+)
 
 FloatArray = NDArray[np.floating]
 
@@ -30,6 +36,25 @@ def band_outline(curve: FloatArray, half_width: FloatArray) -> FloatArray:
     return np.concatenate([curve + side, (curve - side)[::-1]])
 
 
+def directions(outcome: Outcome) -> tuple[str, ...]:
+    """Names of the directions across a cable: in a plane there is one, which needs none."""
+    return ("y", "z") if outcome.config.experiment.in_space else ("",)
+
+
+def residual_along(shape: PoseShape, direction: str) -> FloatArray:
+    """Residual (K,) [m] in one of the `directions`."""
+    return shape.residual[:, "yz".index(direction)] if direction else shape.residual
+
+
+def rest_about(stage: Stage, direction: str) -> RestCurvatureEstimate:
+    """Rest curvature (M,) about one of the `directions`; in a plane that about its normal."""
+    rest = stage.rest_curvature
+    if not direction:
+        return rest
+    k = "yz".index(direction)
+    return RestCurvatureEstimate(rest.s, rest.value[k], rest.std[k])
+
+
 def measured_line(outcome: Outcome, name: str) -> tuple[FloatArray, FloatArray] | None:
     """Measured points of a pose between its fixtures with their places along the cable [m]."""
     measured = next((pose for pose in outcome.poses if pose.name == name), None)
@@ -40,7 +65,7 @@ def measured_line(outcome: Outcome, name: str) -> tuple[FloatArray, FloatArray] 
     if declared.end is not None:
         parts.append(np.array([declared.end]))
     points = np.concatenate(parts)
-    places = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    places = np.concatenate([[0.0], np.cumsum(np.hypot.reduce(np.diff(points, axis=0), axis=1))])
     if declared.end is not None:
         places *= outcome.config.cable.length / places[-1]
     return places, points

@@ -15,6 +15,8 @@ from markupsafe import Markup, escape
 from dlo_casadi.report.page_charts import charts
 from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.page_pictures import pictures
+from dlo_casadi.report.room import VIEWS
+from dlo_casadi.report.terminal import vector
 from dlo_casadi.session.outcome import Outcome
 
 # By which a page is known as written by this package.
@@ -25,19 +27,21 @@ def report_page(outcome: Outcome) -> str:
     """The text of report.html.
 
     All text of the session is escaped. The page's own policy forbids it to load anything, and to
-    run any script but those two that are written into it, known by their hashes.
+    run any script but those that are written into it, known by their hashes.
     """
-    scripts = [_script_library(), page_script()]
+    drawn = pictures(outcome)
     return render(
         "report.html",
-        scripts,
-        pictures=pictures(outcome),
+        [_script_library(), page_script()],
+        outcome.config.experiment.in_space,
+        pictures=drawn,
+        room=drawn[0].room,
         charts={name: as_data(text) for name, text in charts(outcome).items()},
         **page_data(outcome),
     )
 
 
-def render(template: str, scripts: list[str], **data: Any) -> str:
+def render(template: str, scripts: list[str], in_space: bool, **data: Any) -> str:
     """Fill a template with data.
 
     Parameters
@@ -46,11 +50,17 @@ def render(template: str, scripts: list[str], **data: Any) -> str:
         Name of a file in `templates/`.
     scripts : list of str
         Those that the page may run.
+    in_space : bool
+        Whether its pictures are rooms that can be turned.
     """
     page = _environment().get_template(template)
+    style = _text("page.css")
+    if in_space:
+        scripts, style = [*scripts, _text("room.js")], f"{style}\n{_text('room.css')}"
     return page.render(
         generator=Markup(GENERATOR),
-        style=Markup(_text("page.css")),
+        style=Markup(style),
+        views=VIEWS if in_space else None,
         scripts=[Markup(script) for script in scripts],
         policy=" ".join(f"'sha256-{_hash(script)}'" for script in scripts) or "'none'",
         **data,
@@ -90,7 +100,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"units": units, "breakable": breakable}
+    environment.filters |= {"units": units, "breakable": breakable, "vector": vector}
     return environment
 
 

@@ -1,4 +1,4 @@
-"""What lies under the lines of a picture: a photograph made smaller, or the board with its grid."""
+"""What lies under the lines of a picture: a photograph made smaller, the board, or a room."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from PIL import Image
 
 from dlo_casadi.config import Config
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.report.room import Room, rooms, seen
+from dlo_casadi.session.outcome import PoseInput, Stage
 from dlo_casadi.vision import read_image
 
 FloatArray = NDArray[np.floating]
@@ -34,26 +35,29 @@ _GRID = 100.0  # mm
 
 @dataclass(frozen=True)
 class Background:
-    """A photograph [px] or the board [mm, y down].
+    """A photograph [px], the board or a room [mm, y down].
 
     Parameters
     ----------
     whole : (left, top, width, height)
         All there is.
     place : callable or None
-        Maps points (K, 2) [m] of the board into it; None where the camera was not located.
+        Maps points (K, d) [m] of the world into it; None where the camera was not located.
     photograph : str
         As a data URI; empty for the board.
+    room : Room or None
+        In which a pose in space stands.
     """
 
     whole: Box
     place: Place | None
     photograph: str = ""
+    room: Room | None = None
 
     @property
     def grid(self) -> tuple[Box, ...]:
         """Lines (x1, y1, x2, y2) of the board, every 100 mm."""
-        if self.photograph:
+        if self.photograph or self.room is not None:
             return ()
         left, top, width, height = self.whole
         across = np.arange(np.ceil(left / _GRID), np.floor((left + width) / _GRID) + 1) * _GRID
@@ -64,7 +68,7 @@ class Background:
         )
 
     def points(self, points: FloatArray) -> FloatArray:
-        """Points (K, 2) [m] of the board in the picture; none where it was not located."""
+        """Points (K, d) [m] of the world in the picture; none where it was not located."""
         if self.place is None or not len(points):
             return np.zeros((0, 2))
         return np.asarray(self.place(points))
@@ -91,18 +95,21 @@ class Background:
 
 
 def backgrounds(
-    config: Config, poses: Sequence[PoseInput], predicted: Sequence[FloatArray]
+    config: Config, poses: Sequence[PoseInput], stages: Sequence[Stage]
 ) -> list[Background]:
-    """What lies under each pose, all boards on one scale.
+    """What lies under each pose, all boards and rooms on one scale.
 
     Parameters
     ----------
-    predicted : sequence of (K, 2) [m]
-        Lines that a board must hold beside the measured ones.
+    stages : sequence of Stage
+        Whose predictions a board or a room must hold beside the measured lines.
     """
+    if config.experiment.in_space:
+        return [_in_room(room) for room in rooms(config, poses, stages)]
     files = {pose.name: pose.file for pose in config.experiment.poses}
     photographed = config.experiment.measurement.kind == "images"
     budget = PHOTOGRAPHS // max(1, len(poses))
+    predicted = [shape.curve for stage in stages for shape in stage.shapes.values()]
     board = _board_box(config, [*(pose.points for pose in poses if len(pose.points)), *predicted])
     found = []
     for pose in poses:
@@ -152,6 +159,17 @@ def photograph_of(path: Path, budget: int) -> tuple[str, int, int] | None:
 
 def _to_millimetres(points: FloatArray) -> FloatArray:
     return np.asarray(points, dtype=float).reshape(-1, 2) * [_MM, -_MM]
+
+
+def flat(points: FloatArray) -> FloatArray:
+    """Points (K, 3) of a room in a picture of it (K, 2), y down."""
+    return seen(points) * [1.0, -1.0]
+
+
+def _in_room(room: Room) -> Background:
+    low, size = -room.window / 2, room.window
+    whole = (float(low[0]), float(low[1]), float(size[0]), float(size[1]))
+    return Background(whole, lambda points: flat(room.points(points)), room=room)
 
 
 def _board_box(config: Config, lines: Sequence[FloatArray]) -> Box:

@@ -22,6 +22,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from dlo_casadi.report.canvas import before_after, label_of
+from dlo_casadi.report.geometry import directions, residual_along, rest_about
 from dlo_casadi.report.page_boards import next_pose_chart, pull_chart
 from dlo_casadi.report.page_canvas import AFTER, BEFORE, FAINT, HELD_OUT, INK, empty_chart, hover
 from dlo_casadi.report.terminal import cross_validated
@@ -183,51 +184,59 @@ def residuals_chart(outcome: Outcome) -> Model:
     for kind, stage, color in (("before", before, BEFORE), ("after", after, AFTER)):
         if stage is None:
             continue
-        chart = empty_chart(
-            230 if kind == "before" else 260,
-            x_range=across,
-            y_range=DataRange1d(range_padding=0.08),
-            title=f"{kind}: {label_of(stage, outcome)}",
-            y_axis_label="residual [noise std]",
-        )
-        chart.title.text_color = INK
-        chart.title.text_font_size = "13px"
-        chart.add_layout(
-            BoxAnnotation(
-                bottom=-2,
-                top=2,
-                fill_color=_BAND,
-                fill_alpha=1.0,
-                level="underlay",
-                line_color=None,
+        own = DataRange1d(range_padding=0.08)
+        for direction in directions(outcome):
+            chart = empty_chart(
+                230 if kind == "before" else 260,
+                x_range=across,
+                y_range=own,
+                title=f"{kind}: {label_of(stage, outcome)}{direction and f', along {direction}'}",
+                y_axis_label="residual [noise std]",
             )
-        )
-        chart.add_layout(Span(location=0, dimension="width", line_color=FAINT))
-        _residual_lines(chart, kind, stage, outcome, color)
-        parts.append(chart)
+            chart.title.text_color = INK
+            chart.title.text_font_size = "13px"
+            chart.add_layout(
+                BoxAnnotation(
+                    bottom=-2,
+                    top=2,
+                    fill_color=_BAND,
+                    fill_alpha=1.0,
+                    level="underlay",
+                    line_color=None,
+                )
+            )
+            chart.add_layout(Span(location=0, dimension="width", line_color=FAINT))
+            _residual_lines(chart, kind, stage, outcome, color, direction)
+            parts.append(chart)
     if parts:
         parts[-1].xaxis.axis_label = "arc length from the start s [m]"
     return column(parts, sizing_mode="stretch_width")
 
 
-def _residual_lines(chart: figure, kind: str, stage: Stage, outcome: Outcome, color: str) -> None:
+def _residual_lines(
+    chart: figure, kind: str, stage: Stage, outcome: Outcome, color: str, direction: str
+) -> None:
     """All poses thin, and a source that the page fills with the chosen one."""
     shapes = [stage.shapes.get(pose.name) for pose in outcome.poses]
     empty, noise = np.zeros(0, dtype=np.float32), outcome.measurement.std
+    suffix = "-z" if direction == "z" else ""
     all_poses = ColumnDataSource(
         {
             "s": [empty if x is None else x.s.astype(np.float32) for x in shapes],
-            "r": [empty if x is None else (x.residual / noise).astype(np.float32) for x in shapes],
+            "r": [
+                empty if x is None else (residual_along(x, direction) / noise).astype(np.float32)
+                for x in shapes
+            ],
             "pose": [pose.name for pose in outcome.poses],
             "role": ["held out" if p.role == "held_out" else "fit" for p in outcome.poses],
             "dash": [[5, 3] if p.role == "held_out" else [] for p in outcome.poses],
         },
-        name=f"all-{kind}",
+        name=f"all-{kind}{suffix}",
     )
     thin = chart.multi_line(
         "s", "r", source=all_poses, line_color=FAINT, line_alpha=0.55, line_dash="dash"
     )
-    chosen = ColumnDataSource({"s": [], "r": []}, name=f"chosen-{kind}")
+    chosen = ColumnDataSource({"s": [], "r": []}, name=f"chosen-{kind}{suffix}")
     chart.line("s", "r", source=chosen, line_color="white", line_width=5)
     chart.line("s", "r", source=chosen, line_color=color, line_width=2.5)
     points = chart.scatter("s", "r", source=chosen, size=4, fill_color=color, line_color=None)
@@ -248,19 +257,26 @@ def _residual_lines(chart: figure, kind: str, stage: Stage, outcome: Outcome, co
 
 def rest_chart(outcome: Outcome) -> Model:
     """Rest curvature of the last stage with its band, and of the fit that it improves on."""
+    across = Range1d(0.0, outcome.config.cable.length)
+    parts = [_rest_chart(outcome, across, direction) for direction in directions(outcome)]
+    return parts[0] if len(parts) == 1 else column(parts, sizing_mode="stretch_width")
+
+
+def _rest_chart(outcome: Outcome, across: Range1d, direction: str) -> figure:
     before, after = before_after(outcome)
+    what = direction and f" k_{direction}"
     chart = empty_chart(
         280,
-        x_range=Range1d(0.0, outcome.config.cable.length),
+        x_range=across,
         x_axis_label="arc length from the start s [m]",
-        y_axis_label="rest curvature [1/m]",
+        y_axis_label=f"rest curvature{what} [1/m]",
     )
     chart.add_layout(Span(location=0, dimension="width", line_color=FAINT))
     if before is not None and before.name == "batch":
-        rest = before.rest_curvature
+        rest = rest_about(before, direction)
         chart.line(rest.s, rest.value, line_color=BEFORE, line_dash="dashed", line_width=2)
     if after is not None:
-        rest = after.rest_curvature
+        rest = rest_about(after, direction)
         source = ColumnDataSource(
             {
                 "s": rest.s,
@@ -274,7 +290,7 @@ def rest_chart(outcome: Outcome) -> Model:
         chart.add_tools(
             hover(
                 ("s", "@s{0.000} m"),
-                ("rest curvature", "@value{0.000} 1/m"),
+                (f"rest curvature{what}", "@value{0.000} 1/m"),
                 ("95 % band", "@low{0.000} to @high{0.000}"),
                 renderers=[drawn],
                 mode="vline",

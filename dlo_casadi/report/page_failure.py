@@ -52,6 +52,7 @@ def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = (
     return render(
         "failed.html",
         [page_script()],
+        config.experiment.in_space,
         title=config.cable.name,
         config_name=config.name,
         kind=type(error).__name__,

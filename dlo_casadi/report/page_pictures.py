@@ -2,7 +2,8 @@
 
 A picture is a photograph made smaller, or the board of a centre-line, under lines whose
 coordinates are those of the photograph [px] or of the board [mm, y down]. The lines stay sharp
-at any size and can be hidden one by one.
+at any size and can be hidden one by one. A cable in space stands in a room: its lines also carry
+their places there, and the page draws them anew as the room is turned.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
+from dlo_casadi.config.sections import Pose
 from dlo_casadi.report.canvas import before_after, label_of, millimetres
 from dlo_casadi.report.geometry import beside
-from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds
+from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds, flat
+from dlo_casadi.report.room import Mark, Room, around
 from dlo_casadi.report.terminal import branch_text
-from dlo_casadi.session.outcome import Outcome, PoseInput
+from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape
 
 FloatArray = NDArray[np.floating]
 
@@ -35,11 +38,25 @@ class Line:
     near : str
         Of a prediction: its points beside the measured ones, one for one; deviations are enlarged
         by moving them away from those.
+    solid, near_solid : str
+        The same points in a room, "x,y,z x,y,z ...".
     """
 
     kind: str
     points: str
     near: str = ""
+    solid: str = ""
+    near_solid: str = ""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A line beside the cable in a room, or a word there (see `room.Mark`), as the page has it."""
+
+    kind: str
+    points: str
+    solid: str
+    label: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,6 +77,10 @@ class Picture:
         The kind is that of the line that a fact is about.
     notes : tuple of str
         What the camera step noticed, or why the pose could not be read.
+    room : Room or None
+        In which the cable stands.
+    under, over : tuple of Solid
+        What stands there behind the cable, and in front of it.
     """
 
     name: str
@@ -75,17 +96,15 @@ class Picture:
     facts: tuple[tuple[str, str, str], ...] = ()
     problem: str = ""
     notes: tuple[str, ...] = field(default_factory=tuple)
+    room: Room | None = None
+    under: tuple[Solid, ...] = ()
+    over: tuple[Solid, ...] = ()
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """A picture of every pose of a run, in the order in which they were taken."""
-    predicted = [
-        shape.curve
-        for stage in before_after(outcome)
-        if stage is not None
-        for shape in stage.shapes.values()
-    ]
-    behind = backgrounds(outcome.config, outcome.poses, predicted)
+    stages = [stage for stage in before_after(outcome) if stage is not None]
+    behind = backgrounds(outcome.config, outcome.poses, stages)
     return [_picture(outcome, pose, b) for pose, b in zip(outcome.poses, behind, strict=True)]
 
 
@@ -96,8 +115,10 @@ def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Pict
     for pose, behind in zip(poses, backgrounds(config, poses, []), strict=True):
         measured = behind.points(pose.points)
         held = [declared[pose.name].start, declared[pose.name].end]
-        ends = [behind.points(np.array([[np.nan] * 2 if at is None else at])) for at in held]
+        nowhere = (np.nan,) * len(declared[pose.name].start)
+        ends = [behind.points(np.array([nowhere if at is None else at])) for at in held]
         found = len(measured) > 0
+        under, over = _around(declared[pose.name], pose, None, behind.room)
         drawn.append(
             Picture(
                 name=pose.name,
@@ -107,12 +128,15 @@ def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Pict
                 whole=behind.whole,
                 photograph=behind.photograph,
                 grid=behind.grid,
-                lines=(Line("measured", _svg(measured, 2)),) if found else (),
-                start=_point(ends[0]),
-                end=_point(ends[1]),
+                lines=(_measured(pose, behind),) if found else (),
+                start=None if behind.room else _point(ends[0]),
+                end=None if behind.room else _point(ends[1]),
                 facts=(("measured", "measured", _seen(pose)),) if found else (),
                 problem=pose.problem,
                 notes=pose.messages,
+                room=behind.room,
+                under=under,
+                over=over,
             )
         )
     return drawn
@@ -132,7 +156,15 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
             continue
         drawn.append(behind.points(shape.curve))
         near = beside(pose, shape) if len(measured) else measured
-        lines.append(Line(kind, _svg(drawn[-1], 1), _svg(behind.points(near), 2)))
+        lines.append(
+            Line(
+                kind,
+                _svg(drawn[-1], 1),
+                _svg(behind.points(near), 2),
+                _solid(behind.room, shape.curve, 1),
+                _solid(behind.room, near, 2),
+            )
+        )
         if shape.rmse is not None:
             facts.append((kind, label, millimetres(shape.rmse)))
         if not shape.stable:
@@ -140,8 +172,13 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
         if shape.measured_branch is not None:
             facts.append((kind, label, branch_text(shape.measured_branch)))
     if len(measured):
-        lines.append(Line("measured", _svg(measured, 2)))
+        lines.append(_measured(pose, behind))
         facts.append(("measured", "measured", _seen(pose)))
+    last = None if after is None else after.shapes.get(pose.name)
+    if behind.room is not None and last is not None:
+        facts.append(("force", "forces on start, end", _newtons(last.forces)))
+    declared = next(item for item in outcome.config.experiment.poses if item.name == pose.name)
+    under, over = _around(declared, pose, last, behind.room)
     return Picture(
         name=pose.name,
         role=pose.role,
@@ -151,12 +188,47 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
         photograph=behind.photograph,
         grid=behind.grid,
         lines=tuple(line for line in lines if line.points),
-        start=_point(drawn[-1][:1]),
-        end=_point(drawn[-1][-1:]),
+        start=None if behind.room else _point(drawn[-1][:1]),
+        end=None if behind.room else _point(drawn[-1][-1:]),
         facts=tuple(facts),
         problem=pose.problem,
         notes=pose.messages,
+        room=behind.room,
+        under=under,
+        over=over,
     )
+
+
+def _measured(pose: PoseInput, behind: Background) -> Line:
+    solid = _solid(behind.room, pose.points, 2)
+    return Line("measured", _svg(behind.points(pose.points), 2), solid=solid)
+
+
+def _around(
+    declared: Pose, pose: PoseInput, shape: PoseShape | None, room: Room | None
+) -> tuple[tuple[Solid, ...], tuple[Solid, ...]]:
+    """What stands in a room behind a cable and in front of it."""
+    if room is None:
+        return (), ()
+    under, over = around(room, declared, pose.points, shape)
+    return tuple(map(_drawn, under)), tuple(map(_drawn, over))
+
+
+def _drawn(mark: Mark) -> Solid:
+    return Solid(mark.kind, _svg(flat(mark.points), 1), _text(mark.points, 1), mark.label)
+
+
+def _solid(room: Room | None, points: FloatArray, decimals: int) -> str:
+    """Points [m] of the world as they stand in a room; nothing without one."""
+    return "" if room is None else _text(room.points(points), decimals)
+
+
+def _text(points: FloatArray, decimals: int) -> str:
+    return " ".join(",".join(f"{x:.{decimals}f}" for x in point) for point in points)
+
+
+def _newtons(forces: FloatArray) -> str:
+    return ", ".join(f"{np.linalg.norm(force):.3g}" for force in forces) + " N"
 
 
 def _seen(pose: PoseInput) -> str:
@@ -165,7 +237,8 @@ def _seen(pose: PoseInput) -> str:
 
 
 def _what(pose: PoseInput, behind: Background) -> str:
-    return f"{'Photograph' if behind.photograph else 'Drawing of the board'}, pose {pose.name}"
+    kind = "Photograph" if behind.photograph else "Drawing of the board"
+    return f"{'Drawing in space' if behind.room else kind}, pose {pose.name}"
 
 
 def _alt(outcome: Outcome, pose: PoseInput, behind: Background) -> str:

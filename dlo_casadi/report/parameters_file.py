@@ -11,12 +11,12 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.config import (
     MESH,
@@ -35,10 +35,11 @@ from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.band import Uncertainty
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import STIFFNESSES, CableModel
 from dlo_casadi.parameters import Parameter
 from dlo_casadi.report.json_report import finite
 from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.node import Frame
 from dlo_casadi.session.outcome import Outcome
 
 FloatArray = NDArray[np.floating]
@@ -69,10 +70,11 @@ class Metadata:
         The same with what differs from pose to pose.
     std : dict
         Standard deviation of each parameter by name [SI]; 0 where it was not fitted.
-    coefficients : (n_rest,) [1/m]
-        Of the rest curvature before the first pose.
+    coefficients : (n_coefficients,) [1/m]
+        Of the rest curvature before the first pose; in space about the axis y, then about z.
     fixtures : dict
-        What all poses of the session share of `start` [m], `start_heading`, `end_heading` [rad].
+        What all poses of the session share of `start` [m] and `start_heading`, `end_heading` [rad],
+        in space `start_orientation`, `end_orientation`.
     identifiable : bool or None
         Whether the shapes determine the bending stiffness.
     interval_95 : (float or None, float or None) or None [N m^2]
@@ -121,7 +123,8 @@ class Parameters(NamedTuple):
     p : (n_parameters,)
         In the order of `model.names` (SI).
     rest : (n_rests,) [1/m]
-        Rest curvature that the next pose finds.
+        Rest curvature that the next pose finds; in space the rest strains twist, k_y, k_z of all
+        cells in turn.
     metadata : Metadata
     """
 
@@ -158,12 +161,13 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
     """Everything that parameters.yaml holds, as plain data."""
     config = outcome.config
     document = fit_dict(outcome.fit)
-    stiffness = outcome.stages[-1].parameters.get("bending_stiffness")
-    if stiffness is not None:
-        document["parameters"]["bending_stiffness"] |= {
-            "interval_95": finite(stiffness.interval_95),
-            "identifiable": stiffness.identifiable,
-        }
+    for name in STIFFNESSES:
+        stiffness = outcome.stages[-1].parameters.get(name)
+        if stiffness is not None:
+            document["parameters"][name] |= {
+                "interval_95": finite(stiffness.interval_95),
+                "identifiable": stiffness.identifiable,
+            }
     if config.cable.youngs_modulus is not None:
         document["cable"]["youngs_modulus"] = config.cable.youngs_modulus
     document["fixtures"] = shared_fixtures(config)
@@ -187,6 +191,7 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
             "mass": model.cable.mass,
             "diameter": model.cable.diameter,
             "bending_stiffness": model.cable.bending_stiffness,
+            **({"torsional_stiffness": model.cable.torsional_stiffness} if model.in_space else {}),
             "rest_shape": "straight" if model.cable.straight else "curved",
         },
         "boundary": {"start": model.start, "end": model.end},
@@ -209,11 +214,15 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
             for q, value in zip(model.parameters, fit.p, strict=True)
         },
         "rest_curvature": {
-            "coefficients": fit.coefficients,
+            "coefficients": _by_name(fit.coefficients, model.node.curvatures),
             "unit": "1/m",
             "basis": "cubic B-splines on clamped uniform knots over [0, length]",
         },
-        "state": {"rest_curvature": final_rest(fit), "unit": "1/m", "of": "cells, last pose done"},
+        "state": {
+            "rest_curvature": _by_name(final_rest(fit), model.node.strains),
+            "unit": "1/m",
+            "of": "cells, last pose done",
+        },
         "covariance": {"names": list(names), "values": covariance},
         "scatter": {
             "fixtures": dict(uncertainty.scatter),
@@ -244,6 +253,13 @@ def final_rest(fit: Fit) -> FloatArray:
     return fit.problem.sweep.rest_after_last(fit.point.shapes, fit.p, fit.rest)
 
 
+def _by_name(values: FloatArray, names: Sequence[str]) -> Any:
+    """Curvatures as they are in a plane; in space components of the strain by their names."""
+    if len(names) == 1:
+        return values
+    return dict(zip(names, values.reshape(len(names), -1), strict=True))
+
+
 def _effect_row(effect: Effect) -> dict[str, Any]:
     """Name and label of an effect, and what else it was made with."""
     if known_effect(effect.name) is not type(effect):
@@ -255,9 +271,10 @@ def _effect_row(effect: Effect) -> dict[str, Any]:
 
 
 def shared_fixtures(config: Config) -> dict[str, Any]:
-    """What all poses share of their start and headings."""
+    """What all poses share of their start and of the directions of clamps."""
     shared: dict[str, Any] = {}
-    for key in ("start", "start_heading", "end_heading"):
+    direction = "orientation" if config.experiment.in_space else "heading"
+    for key in ("start", f"start_{direction}", f"end_{direction}"):
         values = {getattr(pose, key) for pose in config.experiment.poses}
         shared[key] = finite(values.pop()) if len(values) == 1 else None
     return shared
@@ -351,7 +368,8 @@ def _results_near(path: Path) -> str:
 
 def parameters_of(outcome: Outcome) -> Parameters:
     """The fitted cable of a run, as `load_parameters` would read it from the run's file."""
-    return _rebuild(parameters_dict(outcome), outcome.config.path)
+    fit, metadata = outcome.fit, _metadata(parameters_dict(outcome), outcome.config.path)
+    return Parameters(fit.model, fit.p, final_rest(fit), metadata)
 
 
 def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
@@ -368,8 +386,12 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         cable.length, cable.mass, cable.diameter, cable.bending_stiffness
     ):
         raise _DamagedError(("cable", *place), f": {message}")
-    gravity = _numbers(document["gravity"], 2, "gravity")
-    for place, message in implausible_gravity((float(gravity[0]), float(gravity[1]))):
+    in_space = len(document["gravity"]) == 3
+    if in_space:
+        torsional = _positive(declared, "cable", "torsional_stiffness")
+        cable = replace(cable, torsional_stiffness=torsional)
+    gravity = tuple(_numbers(document["gravity"], 3 if in_space else 2, "gravity").tolist())
+    for place, message in implausible_gravity(gravity):
         raise _DamagedError(place, f": {message}")
     boundary = document["boundary"]
     tolerances = {name: row.get("tolerance") for name, row in rows.items()}
@@ -379,7 +401,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         element=_one_of(document["element"], tuple(ELEMENTS), "element"),
         start=_one_of(boundary["start"], ("pinned", "clamped"), "boundary", "start"),
         end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary", "end"),
-        gravity=(float(gravity[0]), float(gravity[1])),
+        gravity=gravity,
         effects=tuple(_effect(row, k) for k, row in enumerate(document["effects"])),
         n_rest=_count(document, "n_rest", REST_COEFFICIENTS),
         priors={name: float(std) for name, std in tolerances.items() if std is not None},
@@ -388,8 +410,22 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         wrong = ", ".join(sorted(set(rows) ^ set(model.names)))
         raise DloError(f"parameters and effects do not belong together: {wrong}")
     values = [_within_bounds(q, rows[q.name]) for q in model.parameters]
-    coefficients = document["rest_curvature"]["coefficients"]
-    rest = document["state"]["rest_curvature"]
+    metadata = _metadata(document, source)
+    if len(metadata.coefficients) != model.n_coefficients:
+        found = f": {model.n_coefficients} numbers belong here, found {len(metadata.coefficients)}"
+        raise _DamagedError(("rest_curvature",), found)
+    rest = _stacked(document["state"]["rest_curvature"], Frame.strains, "state")
+    return Parameters(
+        model,
+        _numbers(values, len(values), "parameters"),
+        _numbers(rest, model.chain.n_rests, "state", "rest_curvature"),
+        metadata,
+    )
+
+
+def _metadata(document: dict[str, Any], source: Path) -> Metadata:
+    """What a document tells beside the model."""
+    rows = document["parameters"]
     names = tuple(document["covariance"]["names"])
     covariance = np.array(document["covariance"]["values"], dtype=float)
     covariance = covariance.reshape(len(names), len(names))
@@ -400,13 +436,15 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         float(scatter.get("rest_curvature_smoothness", RestScatter().smoothness)),
     )
     fixtures = {name: float(std or 0.0) for name, std in scatter.get("fixtures", {}).items()}
-    metadata = Metadata(
+    return Metadata(
         path=source,
         names=names,
         covariance=covariance,
         uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter),
         std={name: float(row.get("std") or 0.0) for name, row in rows.items()},
-        coefficients=_numbers(coefficients, model.n_coefficients, "rest_curvature"),
+        coefficients=_stacked(
+            document["rest_curvature"]["coefficients"], Frame.curvatures, "rest_curvature"
+        ),
         fixtures=dict(document.get("fixtures") or {}),
         identifiable=rows["bending_stiffness"].get("identifiable"),
         interval_95=None if interval is None else (interval[0], interval[1]),
@@ -416,12 +454,13 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         versions=dict(document.get("versions") or {}),
         document=document,
     )
-    return Parameters(
-        model,
-        _numbers(values, len(values), "parameters"),
-        _numbers(rest, model.chain.n_rests, "state", "rest_curvature"),
-        metadata,
-    )
+
+
+def _stacked(values: Any, names: Sequence[str], where: str) -> FloatArray:
+    """Numbers as they are in a plane; in space those of all components one after the other."""
+    if isinstance(values, Mapping):
+        values = [value for name in names for value in values[name]]
+    return _numbers(values, len(values), where)
 
 
 def _effect(row: Mapping[str, Any], k: int) -> Effect:
@@ -494,7 +533,7 @@ def _within_bounds(q: Parameter, row: Mapping[str, Any]) -> float:
     return float(value)
 
 
-def _numbers(values: Sequence[Any], size: int, *where: str) -> FloatArray:
+def _numbers(values: ArrayLike, size: int, *where: str) -> FloatArray:
     array = np.array(values, dtype=float)
     if array.shape != (size,):
         raise _DamagedError(where, f": {size} numbers belong here, found {array.size}")

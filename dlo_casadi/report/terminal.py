@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
@@ -13,6 +14,7 @@ from rich.text import Text
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.canvas import label_of
+from dlo_casadi.report.geometry import directions
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.session.outcome import (
     BranchShape,
@@ -151,7 +153,7 @@ def fixed_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     rows = [
         ("length", f"{cable.length:g} m", "", "fixed"),
         ("mass", f"{cable.mass:g} kg", "", "fixed"),
-        ("gravity", f"({gravity[0]:g}, {gravity[1]:g}) m/s^2", "", "fixed"),
+        ("gravity", vector(gravity, "g", "m/s^2"), "", "fixed"),
     ]
     unknowns = outcome.fit.problem.unknowns
     for q, free in zip(outcome.fit.model.parameters, unknowns.free, strict=True):
@@ -187,9 +189,18 @@ def rest_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     rest = outcome.stages[-1].rest_curvature
     if not rest.value.size:
         return []
-    low, high = rest.value.min(), rest.value.max()
-    text = f"{low:.3g} to {high:.3g} 1/m"
-    return [("rest curvature", text, "", f"std {rest.std.mean():.2g} 1/m on average")]
+    names = [f"rest curvature{name and f' k_{name}'}" for name in directions(outcome)]
+    return [
+        (
+            name,
+            f"{value.min():.3g} to {value.max():.3g} 1/m",
+            "",
+            f"std {std.mean():.2g} 1/m on average",
+        )
+        for name, value, std in zip(
+            names, np.atleast_2d(rest.value), np.atleast_2d(rest.std), strict=True
+        )
+    ]
 
 
 # ---- errors ------------------------------------------------------------------------------------
@@ -269,14 +280,13 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     if load is not None:
         force, (low, high) = load["force"], load["interval_95"]
         lines.append(
-            f"  Without naming a cause: pulled by ({force[0]:.3g}, {force[1]:.3g}) N on average "
+            f"  Without naming a cause: pulled by {vector(force, '.3g', 'N')} on average "
             f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
     if outcome.next_pose is not None:
-        x, y = outcome.next_pose["end"]
         lines.append(
             f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "
-            f"({x:.3f}, {y:.3f}) m; {separation_text(outcome.next_pose)}"
+            f"{vector(outcome.next_pose['end'], '.3f', 'm')}; {separation_text(outcome.next_pose)}"
         )
     return lines
 
@@ -459,12 +469,13 @@ def prediction_table(shape: dict[str, Any], notes: Iterable[str] = ()) -> Render
     for row in prediction_rows(shape):
         table.add_row(*row)
     points = _table("Points from start to end")
-    for column in ("s [m]", "x [m]", "y [m]"):
-        points.add_column(column, justify="right")
-    count = len(shape["points"])
-    for k, (x, y) in enumerate(shape["points"]):
+    count, axes = len(shape["points"]), "xyz"[: len(shape["start"])]
+    for column in ("s", *axes):
+        points.add_column(f"{column} [m]", justify="right")
+    for k, place in enumerate(shape["points"]):
         if k % max(1, (count - 1) // 10) == 0:
-            points.add_row(f"{shape['length'] * k / (count - 1):.4f}", f"{x:.5f}", f"{y:.5f}")
+            s = shape["length"] * k / (count - 1)
+            points.add_row(f"{s:.4f}", *(f"{x:.5f}" for x in place))
     return Group(table, points, *(Text(note) for note in notes))
 
 
@@ -476,16 +487,18 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
         if at is None:
             rows.append((side, "free"))
             continue
-        x, y = shape[f"force_on_{side}"]
-        rows.append((side, f"({at[0]:g}, {at[1]:g}) m"))
+        rows.append((side, vector(at, "g", "m")))
         reached = shape["points"][0 if side == "start" else -1]
         if math.dist(at, reached) > _SHOWN:
-            place = f"({reached[0]:.5f}, {reached[1]:.5f}) m"
+            place = vector(reached, ".5f", "m")
             rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
-        rows.append((f"force of the cable on its {side}", f"({x:.4g}, {y:.4g}) N"))
-        if shape[f"{side}_heading"] is not None:
-            moment = shape[f"moment_on_{side}"]
-            rows.append((f"moment of the cable on its {side}", f"{moment:.4g} N m"))
+        force, moment = shape[f"force_on_{side}"], shape[f"moment_on_{side}"]
+        rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
+        if any(shape.get(f"{side}_{key}") is not None for key in ("heading", "orientation")):
+            said = (
+                f"{moment:.4g} N m" if isinstance(moment, float) else vector(moment, ".4g", "N m")
+            )
+            rows.append((f"moment of the cable on its {side}", said))
     rows.append(("energy", f"{shape['energy']:.6g} J"))
     rows.append(("smallest bend radius", _mm(shape["min_bend_radius"])))
     stable = "yes" if shape["stable"] else "NO: the cable would not stay there"
@@ -494,6 +507,11 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
         turned = f"equally low with the clamp turned by {shape['tipping']:.2g} rad"
         rows.append(("also stable", f"falling to the other side, {turned}"))
     return rows
+
+
+def vector(components: Iterable[float], form: str, unit: str) -> str:
+    """Components of a vector in brackets, and their unit."""
+    return f"({', '.join(format(x, form) for x in components)}) {unit}"
 
 
 def plus_minus(value: float, std: float) -> str:

@@ -102,8 +102,8 @@ class Chain:
 
     @property
     def n_rests(self) -> int:
-        """Number of rest curvatures: of all cells about the first axis, then the next."""
-        return self.n_cells * len(self.kind.node.curvatures)
+        """Number of rest strains: the first strain of all cells, then the next."""
+        return self.n_cells * len(self.kind.node.strains)
 
     @cached_property
     def rest_stencils(self) -> tuple[NDArray[np.intp], FloatArray]:
@@ -135,11 +135,16 @@ class Chain:
         return cells, weights
 
     def rest_inside(self, means: FloatArray) -> FloatArray:
-        """Rest curvature inside the slots (..., n_slots, 3 axes, q) of means (..., n_rests, q)."""
+        """Rest strains inside the slots (..., n_slots, 3 strains, q) of means (..., n_rests, q)."""
         cells, weights = self.rest_stencils
-        by_axis = [weights @ part[..., cells, :] for part in self.by_axis(means)]
-        return np.concatenate(by_axis, axis=-2)
+        by_strain = [weights @ part[..., cells, :] for part in self.by_strain(means)]
+        return np.concatenate(by_strain, axis=-2)
 
-    def by_axis(self, means: FloatArray) -> list[FloatArray]:
-        """Parts (..., n_cells, q) of means (..., n_rests, q), one for each curvature."""
-        return np.split(means, len(self.kind.node.curvatures), axis=-2)
+    def by_strain(self, means: FloatArray) -> list[FloatArray]:
+        """Parts (..., n_cells, q) of means (..., n_rests, q), one for each strain."""
+        return np.split(means, len(self.kind.node.strains), axis=-2)
+
+    def curvatures(self, means: FloatArray) -> FloatArray:
+        """Curvatures (..., axes, n_cells) among strains (..., n_rests) of the cells."""
+        by_strain = means.reshape((*means.shape[:-1], -1, self.n_cells))
+        return by_strain[..., -len(self.kind.node.curvatures) :, :]

@@ -123,9 +123,8 @@ class Slot:
     ----------
     local : (n_local,)
         Local coordinates of its nodes, see `Element.local`.
-    rest : (3 axes,) [1/m]
-        Rest curvature of the cell: mean, and linear and quadratic variation inside, about each
-        axis that has one.
+    rest : (3 strains,) [1/m]
+        Rest strains of the cell: mean, and linear and quadratic variation inside, of each.
     place : (5,)
         A row of `Layout.slots`.
     mesh : float [m]
@@ -242,11 +241,7 @@ class Element(ABC):
 
     @abstractmethod
     def strain(self, slot: Slot) -> ca.SX:
-        """Mean curvatures (axes,) of the cell [1/m]; 0 without one."""
-
-    def twist(self, slot: Slot) -> ca.SX:
-        """Mean twist of the cell [1/m]; 0 in a plane."""
-        return ca.SX(0)
+        """Mean strains of the cell [1/m], see `Node.strains`; 0 without one."""
 
     @abstractmethod
     def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:

@@ -72,22 +72,17 @@ class Helix(Element):
         return ca.vertcat(Frame.gap(local[:4], other[:4]), other[4:] - local[4:])
 
     def strain(self, slot: Slot) -> ca.SX:
-        """Mean curvatures about the axes y and z."""
-        return slot.local[5:] / (slot.length * slot.stretch)
-
-    def twist(self, slot: Slot) -> ca.SX:
-        """Mean twist."""
-        return slot.local[4] / (slot.length * slot.stretch)
+        """Mean twist, and mean curvatures about the axes y and z."""
+        return slot.local[4:] / (slot.length * slot.stretch)
 
     def bends(self, slot: Slot) -> list[ca.SX]:
-        """Twist and curvatures minus rest curvatures (3,) [1/m] at the Gauss points."""
-        mean = ca.vertcat(self.twist(slot), self.strain(slot)) - _rest(slot, 0.0)
-        return [mean]
+        """Twist and curvatures minus those at rest (3,) [1/m] at the Gauss points."""
+        return [self.strain(slot) - _rest(slot, 0.0)]
 
     def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
         """Energy of bending and twist [J], the mean over the Gauss points.
 
-            W = 1/2 (k - k_0)^T B (k - k_0) + 1/2 GJ tau^2
+            W = 1/2 (k - k_0)^T B (k - k_0) + 1/2 GJ (tau - tau_0)^2
 
         times the factors of the section laws, of each half of the cell at its own point.
         """
@@ -108,9 +103,8 @@ class Helix(Element):
 
 
 def _rest(slot: Slot, x: float) -> ca.SX:
-    """Rest twist 0 and rest curvatures (3,) at x from -1/2 to 1/2 of the element."""
-    values = [slot.rest[3 * i] + x * slot.rest[3 * i + 1] for i in range(2)]
-    return ca.vertcat(0, *values)
+    """Rest twist and rest curvatures (3,) at x from -1/2 to 1/2 of the element."""
+    return ca.vertcat(*(slot.rest[3 * i] + x * slot.rest[3 * i + 1] for i in range(3)))
 
 
 def _size(bend: ca.SX) -> ca.SX:

@@ -29,8 +29,9 @@ class Node(ABC):
         Numbers of a node, of its increment, and of a position.
     axes, turns : tuple of str
         Names of the components of a position, and of an increment.
-    curvatures : tuple of str
-        Names of the curvatures that have a value at rest.
+    strains, curvatures : tuple of str
+        Names of the components of a strain, which have a value at rest, and of those among them,
+        the last, that are curvatures.
     identity : tuple of float
         Coordinates of the node whose tangent is the world's x axis.
     """
@@ -40,6 +41,7 @@ class Node(ABC):
     dimension: ClassVar[int]
     axes: ClassVar[tuple[str, ...]]
     turns: ClassVar[tuple[str, ...]]
+    strains: ClassVar[tuple[str, ...]]
     curvatures: ClassVar[tuple[str, ...]]
     identity: ClassVar[tuple[float, ...]]
 
@@ -97,6 +99,7 @@ class Heading(Node):
     dimension = 2
     axes = ("x", "y")
     turns = ("heading",)
+    strains = ("k",)
     curvatures = ("k",)
     identity = (0.0,)
 
@@ -169,6 +172,7 @@ class Frame(Node):
     dimension = 3
     axes = ("x", "y", "z")
     turns = ("rotation_x", "rotation_y", "rotation_z")
+    strains = ("twist", "k_y", "k_z")
     curvatures = ("k_y", "k_z")
     identity = (0.0, 0.0, 0.0, 1.0)
 

@@ -15,6 +15,7 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.declared import declared_model, straight
+from dlo_casadi.session.hanging import pulled_elsewhere
 from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import conditions, line_without_end
 from dlo_casadi.session.outcome import PoseInput
@@ -23,6 +24,12 @@ from dlo_casadi.session.plausibility import (
     Suspicion,
     repeated,
     suspicions,
+)
+from dlo_casadi.session.plausibility_in_space import (
+    Clamped,
+    stretched,
+    suspicions_in_space,
+    wrong_orientations,
 )
 from dlo_casadi.thresholds import CONTRADICTS, FITS, MUCH_BETTER, OUT_OF_STEP
 
@@ -92,19 +99,50 @@ def _reason(name: str, message: str) -> str:
 
 def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
     """Everything in a session that looks like a mistake, by `plausibility`."""
-    if config.experiment.in_space:
-        return ()
     read = [item for item in inputs if len(item.points)]
-    found = suspicions(lines_of(config, inputs))
+    in_space = config.experiment.in_space
+    lines = lines_of(config, inputs)
+    found = suspicions_in_space(lines) if in_space else suspicions(lines)
     if not any(item.certain for item in found):
         doubtful = {item.pose for item in found}
         sound = [item for item in read if item.name not in doubtful]
         found += repeated([item.name for item in sound], [item.points for item in sound])
-        found += wrong_headings(config, sound)
+        found += _stretched(config, sound)
+        found += (_wrong_orientations if in_space else wrong_headings)(config, sound)
     if not any(item.certain for item in found):
         doubtful = {item.pose for item in found}
-        found += hangs_elsewhere(config, [item for item in read if item.name not in doubtful])
+        sound = [item for item in read if item.name not in doubtful]
+        if in_space:
+            lines_in_space = [(item.points, item.s) for item in sound]
+            found += pulled_elsewhere(lines_in_space, config.experiment.gravity)
+        else:
+            found += hangs_elsewhere(config, sound)
     return found
+
+
+def _stretched(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Markers that lie farther apart than the cable between them is long."""
+    marked = [(item.name, item.points, item.s) for item in read if item.s is not None]
+    names, points, s = zip(*marked, strict=True) if marked else ((), (), ())
+    return stretched(names, points, s, config.cable.length)
+
+
+def _wrong_orientations(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Orientations of clamps held against the lines beside them."""
+    poses = {pose.name: pose for pose in config.experiment.poses}
+    clamps = {}
+    for side, step in (("start", 1), ("end", -1)):
+        if getattr(config.experiment.boundary, side) == "clamped":
+            clamps[side] = [
+                Clamped(
+                    item.name,
+                    getattr(poses[item.name], f"{side}_orientation"),
+                    getattr(poses[item.name], side),
+                    item.points[::step],
+                )
+                for item in read
+            ]
+    return wrong_orientations(clamps, config.cable.length)
 
 
 def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
@@ -117,7 +155,9 @@ def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
     points = {item.name: item.points for item in inputs if len(item.points)}
     known = {item.name: item.s for item in inputs if item.s is not None}
     lines = _lines(config, points, known)
-    if config.experiment.measurement.kind == "images" and config.experiment.boundary.end != "free":
+    experiment = config.experiment
+    photographs = experiment.measurement.kind == "images" and not experiment.in_space
+    if photographs and experiment.boundary.end != "free":
         fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
         sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
         doubtful = [pose for pose in poses if pose.name not in sound and pose.file.is_file()]
@@ -129,10 +169,11 @@ def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
 
 
 def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, FloatArray]) -> Lines:
-    """Ends and lengths of lines (K, 2), some of them markers at known arc lengths (K,)."""
+    """Ends and lengths of lines (K, d), some of them markers at known arc lengths (K,)."""
     length = config.cable.length
     poses = [pose for pose in config.experiment.poses if pose.name in points]
-    unknown, whole = (np.nan, np.nan), np.array([0.0, length])
+    d = len(config.experiment.gravity)
+    unknown, whole = (np.nan,) * d, np.array([0.0, length])
     spans = np.array([known.get(pose.name, whole)[[0, -1]] for pose in poses]).reshape(-1, 2)
     measured = np.array(
         [np.linalg.norm(np.diff(_sparse(points[p.name]), axis=0), axis=1).sum() for p in poses]
@@ -142,11 +183,12 @@ def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, Float
     share = np.where(spans[:, 1] > spans[:, 0], np.diff(spans)[:, 0], np.inf) / length
     return Lines(
         tuple(pose.name for pose in poses),
-        np.array([(pose.start, pose.end or unknown) for pose in poses]).reshape(-1, 2, 2),
-        np.array([points[pose.name][[0, -1]] for pose in poses]).reshape(-1, 2, 2),
+        np.array([(pose.start, pose.end or unknown) for pose in poses]).reshape(-1, 2, d),
+        np.array([points[pose.name][[0, -1]] for pose in poses]).reshape(-1, 2, d),
         measured / share,
         length,
         np.abs(spans - whole) + np.array(unseen).reshape(-1, 1),
+        np.array([pose.name in known for pose in poses], dtype=bool),
     )
 
 

@@ -8,10 +8,11 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from dlo_casadi.config import Config
 from dlo_casadi.equilibrium import PoseBranch
-from dlo_casadi.estimation.band import EDGE
+from dlo_casadi.estimation.band import COVERED
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.thresholds import DIFFERENT
@@ -88,12 +89,17 @@ class PoseShape:
         Arc lengths of the measured points.
     gap : (K, d) [m]
         Measured minus predicted points.
-    residual : (K,) [m]
-        Distance of the measured points across the prediction; in the plane positive to its left.
+    residual : (K,) or (K, 2) [m]
+        Distance of the measured points across the prediction: in the plane to its left, in space
+        along two normals, which at the start are the axes y and z of the cable's frame there and
+        are carried along without twist.
     energy : float [J]
     stable : bool
-    spread : (M,) or None [m]
-        Standard deviation across the curve of the next hanging; None if it was not computed.
+    forces : (2, d) [N]
+        Of the cable on what holds its start and its end.
+    spread : (M,) or (M, 2) or None [m]
+        Standard deviation across the curve of the next hanging, as the residual; None if it was
+        not computed.
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
     tipping : float or None [rad]
@@ -107,6 +113,7 @@ class PoseShape:
     residual: FloatArray
     energy: float
     stable: bool
+    forces: FloatArray
     measured_branch: BranchShape | None = None
     tipping: float | None = None
     spread: FloatArray | None = None
@@ -336,8 +343,11 @@ class Outcome:
             if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:
                 continue
             places = np.linspace(0.0, self.fit.model.cable.length, len(shape.spread))
-            std = np.hypot(np.interp(shape.s, places, shape.spread), self.measurement.std)
-            inside.append(np.abs(shape.residual) <= EDGE * std)
+            spread = shape.spread.reshape((len(places), -1))
+            std = np.stack([np.interp(shape.s, places, column) for column in spread.T], axis=1)
+            std = np.hypot(std, self.measurement.std)
+            score = ((shape.residual.reshape(std.shape) / std) ** 2).sum(axis=1)
+            inside.append(score <= chi2.ppf(COVERED, std.shape[1]))
         return float(np.concatenate(inside).mean()) if inside else None
 
     def held_out(self, stage: Stage) -> HeldOut:

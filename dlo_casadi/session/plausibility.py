@@ -9,7 +9,7 @@ a list out of step as ends that fit another pose.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -60,10 +60,10 @@ class Lines:
     ----------
     names : tuple of str
         Of the m poses.
-    declared : (m, 2, 2) [m]
+    declared : (m, 2, d) [m]
         Start and end fixture of each pose; NaN for a free end.
-    measured : (m, 2, 2) [m]
-        The two ends of each measured line, in any order.
+    measured : (m, 2, d) [m]
+        The two ends of each measured line, in any order unless it is known.
     lengths : (m,) [m]
         Along each measured line, from point to point; of markers so much longer as the cable is.
     length : float [m]
@@ -71,6 +71,8 @@ class Lines:
     gaps : (m, 2) [m]
         Arc lengths between the fixtures and the ends of what was measured, as far as that is to
         be expected: of markers, and of lines whose points are far apart; else zero.
+    known : (m,) of bool, optional
+        Of which line it is known where it begins, as of markers; of none by default.
     """
 
     names: tuple[str, ...]
@@ -79,6 +81,12 @@ class Lines:
     lengths: FloatArray
     length: float
     gaps: FloatArray
+    known: NDArray[np.bool_] | None = None
+
+    @property
+    def ordered(self) -> NDArray[np.bool_]:
+        """Of which line (m,) it is known where it begins."""
+        return np.zeros(len(self.names), dtype=bool) if self.known is None else self.known
 
     @property
     def whole(self) -> bool:
@@ -96,7 +104,9 @@ class Lines:
             np.maximum(np.linalg.norm(ends - declared, axis=-1) - gaps, 0.0)
             for ends in (measured, measured[..., ::-1, :])
         ]
-        return np.minimum(*(np.sqrt(np.nanmean(way**2, axis=-1)) for way in ways)) / self.length
+        given, turned = (np.sqrt(np.nanmean(way**2, axis=-1)) for way in ways)
+        known = self.ordered.reshape((-1, *(1,) * (given.ndim - 1)))
+        return np.where(known, given, np.minimum(given, turned)) / self.length
 
 
 def suspicions(lines: Lines) -> tuple[Suspicion, ...]:
@@ -109,10 +119,15 @@ def suspicions(lines: Lines) -> tuple[Suspicion, ...]:
     """
     if not len(lines.names):
         return ()
-    for look in (wrong_units, wrong_frame, out_of_step):
+    for look in (wrong_units, counted_from_the_end, wrong_frame, out_of_step):
         found = look(lines)
         if found is not None:
             return (found,)
+    return single_poses(lines)
+
+
+def single_poses(lines: Lines) -> tuple[Suspicion, ...]:
+    """Poses that are wrong by themselves; of each the first reason."""
     single = (*too_long(lines), *exchanged(lines), *far_ends(lines))
     first = {item.pose: item for item in reversed(single)}
     return tuple(item for item in single if first[item.pose] is item)
@@ -156,7 +171,7 @@ def wrong_units(lines: Lines) -> Suspicion | None:
 
 def wrong_frame(lines: Lines) -> Suspicion | None:
     """Ends that fit all fixtures once the axes are turned or mirrored, or the origin is moved."""
-    own = _overall(lines.misfit(lines.measured, lines.declared))
+    own = overall(lines.misfit(lines.measured, lines.declared))
     if own < CONTRADICTS or not lines.whole:
         return None
     shifted, shift = _moved(lines, lines.measured)
@@ -169,7 +184,7 @@ def wrong_frame(lines: Lines) -> Suspicion | None:
         )
     for what, axes in FRAMES.items():
         turned = lines.measured @ axes.T
-        in_place = _overall(lines.misfit(turned, lines.declared))
+        in_place = overall(lines.misfit(turned, lines.declared))
         moved, shift = _moved(lines, turned)
         if len(lines.names) < 3:  # of so few ends, some turn and some origin fit any
             moved = np.inf
@@ -208,6 +223,24 @@ def out_of_step(lines: Lines) -> Suspicion | None:
     )
 
 
+def counted_from_the_end(lines: Lines) -> Suspicion | None:
+    """Markers that fit their fixtures once they are counted from the other end."""
+    marked = np.flatnonzero(lines.ordered)
+    if not len(marked):
+        return None
+    own = lines.misfit(lines.measured, lines.declared)[marked]
+    turned = replace(lines, gaps=lines.gaps[:, ::-1])
+    other = turned.misfit(lines.measured[:, ::-1], lines.declared)[marked]
+    if not (overall(own) > FITS and overall(other) < min(FITS, MUCH_BETTER * overall(own))):
+        return None
+    return Suspicion(
+        f"the markers are {overall(own) * lines.length:.3g} m RMS from the declared start and end, "
+        f"but {overall(other) * lines.length:.3g} m once they are counted from the other end. Try: "
+        "s_m from the start; or are start and end of the poses exchanged?",
+        True,
+    )
+
+
 def too_long(lines: Lines) -> tuple[Suspicion, ...]:
     """Single poses whose points, in their order, run to and fro."""
     return tuple(
@@ -234,7 +267,7 @@ def exchanged(lines: Lines) -> tuple[Suspicion, ...]:
         return ()
     return tuple(
         Suspicion(
-            f"{lines.names[i]}: its end ({ends[i][0]:g}, {ends[i][1]:g}) m is where the other "
+            f"{lines.names[i]}: its end {_at(ends[i], 'g')} m is where the other "
             "poses have their start. Try: are start and end exchanged?",
             False,
             lines.names[i],
@@ -283,7 +316,7 @@ def _all_near(ratio: FloatArray, factor: float) -> bool:
     return bool(near.mean() >= NEARLY_ALL)
 
 
-def _overall(misfit: FloatArray) -> float:
+def overall(misfit: FloatArray) -> float:
     """Root mean square over the poses, the worst fifth left out: a pose or two may be wrong."""
     kept = np.sort(misfit)[: max(1, int(np.ceil(NEARLY_ALL * len(misfit))))]
     return float(np.sqrt(np.mean(kept**2)))
@@ -296,8 +329,8 @@ def _moved(lines: Lines, measured: FloatArray) -> tuple[float, FloatArray]:
     """
     away = measured.mean(axis=1) - lines.declared.mean(axis=1)
     shift = np.median(np.where(np.isfinite(away), away, (measured - lines.declared)[:, 0]), axis=0)
-    return _overall(lines.misfit(measured - shift, lines.declared)), shift
+    return overall(lines.misfit(measured - shift, lines.declared)), shift
 
 
-def _at(point: FloatArray) -> str:
-    return f"({point[0]:.3f}, {point[1]:.3f})"
+def _at(point: FloatArray, form: str = ".3f") -> str:
+    return f"({', '.join(format(value, form) for value in point)})"

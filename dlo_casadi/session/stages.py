@@ -23,6 +23,7 @@ from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model import END_ROLL, CableModel
+from dlo_casadi.rod.node import Frame
 from dlo_casadi.session.outcome import (
     BranchShape,
     ParameterEstimate,
@@ -46,25 +47,40 @@ def pose_shape(
     curve = prediction.curve
     places = np.linspace(0.0, curve.length, _CURVE_POINTS)
     eq: Equilibrium = prediction.equilibrium
-    tipping = None if item.pose.branch else eq.tipping
-    if not item.readable:
-        empty = np.zeros(0)
-        none = np.zeros((0, curve.d))
-        return PoseShape(
-            curve.at(places), None, empty, none, empty, eq.energy, eq.stable, tipping=tipping
-        )
-    s = item.nearest(curve)
-    gap = item.points - curve.at(s)
-    across = np.einsum("knd,kd->kn", curve.normals(s), gap)
-    residual = across[:, 0] if curve.d == 2 else np.linalg.norm(across, axis=1)
-    rmse = float(np.sqrt((gap**2).sum(axis=1).mean()))
-    branch = None
-    if other is not None:
+    s: FloatArray = np.zeros(0)
+    gap: FloatArray = np.zeros((0, curve.d))
+    rmse = branch = None
+    if item.readable:
+        s = item.nearest(curve)
+        gap = item.points - curve.at(s)
+        rmse = float(np.sqrt((gap**2).sum(axis=1).mean()))
+    if item.readable and other is not None:
         distances = item.distances(other.prediction.curve)
         branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)
     return PoseShape(
-        curve.at(places), rmse, s, gap, residual, eq.energy, eq.stable, branch, tipping
+        curve.at(places),
+        rmse,
+        s,
+        gap,
+        _across(prediction, s, gap),
+        eq.energy,
+        eq.stable,
+        np.stack([eq.lam_start, eq.lam]),
+        branch,
+        None if item.pose.branch else eq.tipping,
     )
+
+
+def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArray:
+    """Components across the cable, see `PoseShape.residual`, of gaps (K, d) [m] at s (K,) [m]."""
+    curve, start = prediction.curve, prediction.equilibrium.x[:1]
+    if curve.d == 2:
+        return np.asarray(np.einsum("knd,kd->kn", curve.normals(s), gap)[:, 0])
+    normals = curve.normals(np.concatenate([[0.0], s]))
+    y = Frame.to_world(start, np.array([[0.0, 1.0, 0.0]]))[0]
+    toward, beside = normals[0] @ y
+    turned = np.array([[toward, beside], [-beside, toward]]) / np.hypot(toward, beside)
+    return np.asarray(np.einsum("ij,kjd,kd->ki", turned, normals[1:], gap))
 
 
 def _stage(
@@ -121,10 +137,10 @@ def _spread(
     known: Prediction,
     uncertainty: Uncertainty,
 ) -> FloatArray:
-    """Standard deviation (M,) [m] across a predicted curve of the next hanging."""
+    """Standard deviation (M,), in space (M, 2), [m] across a curve of the next hanging."""
     places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
     found = spread_across(model, p, known.rest, item.pose, known.equilibrium, uncertainty, places)
-    return np.linalg.norm(found, axis=1)
+    return found if model.in_space else found[:, 0]
 
 
 def _no_rest(model: CableModel) -> RestCurvatureEstimate:

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import VisionError
+from dlo_casadi.vision.image import spoilt
 from dlo_casadi.vision.view import Array, Camera, View
 from dlo_casadi.vision.viewpoint import Viewpoint
 
 MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
 LEAST_MARKERS = 3  # for the pose of a camera: fewer span no more than a line of the board
 _BEST_CORNER_PX = 0.05  # what sampling and rounding to grey levels leave of a corner at least
-_WHITE, _MUCH_WHITE = 250, 0.3  # grey level, and share of a picture that is overexposed
-_BLURRED_PX = 2.5  # standard deviation of edges from which markers of some 30 px are not read
 CORNERS_THAT_SHARE = 4  # corners that share light, blur and print: those of a marker count as one
 
 
@@ -123,7 +122,7 @@ def locate_camera(image: NDArray[np.uint8], board: Board, camera: Camera) -> Vie
             f"the camera's place needs {LEAST_MARKERS} markers of the board, and "
             f"{'only ' if seen else ''}{sorted(seen)} of {sorted(board.marker_centers)} are seen. "
             "Try: a photograph with the whole board in it, sharp and not covered."
-            + _spoilt(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+            + spoilt(image)
             + "".join(f" The {message[:1].lower()}{message[1:]}" for message in messages)
         )
     found, plane, rms = _agreeing(seen, image.shape, board, camera)
@@ -236,7 +235,7 @@ def detect_markers(image: NDArray[np.uint8], board: Board) -> tuple[dict[int, Ar
             f"board not found: {other} of {board.dictionary} in the picture, but the board has "
             f"{sorted(board.marker_centers)}. Try: the right dictionary; markers flat, in focus, "
             f"inside the picture, with a white margin (mean brightness {grey.mean():.0f} of 255)."
-            f"{_spoilt(grey)}{_mirrored(detector, grey, board)}"
+            f"{spoilt(image)}{_mirrored(detector, grey, board)}"
         )
     single = {n: _refine(grey, quads[0]) for n, quads in ours.items() if len(quads) == 1}
     return single, set(ours) - set(single)
@@ -249,23 +248,6 @@ def _markers(detector: cv2.aruco.ArucoDetector, grey: NDArray[np.uint8]) -> dict
     for number, quad in zip([] if numbers is None else numbers.ravel(), quads, strict=True):
         found.setdefault(int(number), []).append(quad.reshape(4, 2))
     return found
-
-
-def _spoilt(grey: NDArray[np.uint8]) -> str:
-    """Sentence for a photograph that is overexposed or blurred.
-
-    A step of the height h blurred by the standard deviation s is nowhere steeper than
-    h / (s sqrt(2 pi)).
-    """
-    white = float(np.mean(grey >= _WHITE))
-    if white > _MUCH_WHITE:
-        return f" The picture is overexposed: {100 * white:.0f} % of it are white; less light."
-    step = float(np.subtract(*np.percentile(grey, [99.0, 1.0])))
-    slope = np.hypot(*np.gradient(grey.astype(np.float32)))
-    blur = step / (np.sqrt(2 * np.pi) * max(float(np.percentile(slope, 99.9)), 1e-3))
-    if blur > _BLURRED_PX:
-        return f" The picture is blurred: no edge is sharper than {blur:.0f} px."
-    return ""
 
 
 def _mirrored(detector: cv2.aruco.ArucoDetector, grey: NDArray[np.uint8], board: Board) -> str:

@@ -198,7 +198,7 @@ def measure_line(
             f"{1e3 * width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm. "
             "Try: the right diameter, in metres; is the cable in the picture?"
         )
-    _check_fixtures(trace.points[kept], view, start, end, course.typical)
+    _check_fixtures(trace.points[kept], view, start, end, course)
     confidence = float(np.clip(trace.sound.sum() / max(1, trace.inside.sum()), 0.0, 1.0))
     return MeasuredLine(
         trace,
@@ -217,7 +217,7 @@ def _in_picture(point: Array, view: View) -> bool:
 
 
 def _check_fixtures(
-    points: Array, view: View, start: Array, end: Array | None, length: float
+    points: Array, view: View, start: Array, end: Array | None, course: Course
 ) -> None:
     """Raise if the line ends far from a fixture that is in the picture."""
     places = [("start", start, points[0])]
@@ -225,12 +225,21 @@ def _check_fixtures(
         places.append(("end", end, points[-1]))
     for name, fixture, tip in places:
         away = float(np.linalg.norm(tip - fixture))
-        if away > _FAR * length and _in_picture(fixture, view):
+        if away <= _FAR * course.typical or not _in_picture(fixture, view):
+            continue
+        if course.in_space:
+            (u, v), (at_u, at_v) = view.to_pixels([fixture, tip])
             raise VisionError(
-                f"the cable does not reach its {name}: the line found ends {away:.3f} m from "
-                f"({fixture[0]:.3f}, {fixture[1]:.3f}) m, at ({tip[0]:.3f}, {tip[1]:.3f}) m. "
-                f"Try: {name} in metres and in the board frame? Is the cable hidden there?"
+                f"the cable does not reach its {name}: the line found ends at ({at_u:.0f}, "
+                f"{at_v:.0f}) px, and the {name} is declared where ({u:.0f}, {v:.0f}) px shows it. "
+                f"Try: {name} in metres and in the board frame? Is the photograph of this pose? Is "
+                "the cable hidden there?"
             )
+        raise VisionError(
+            f"the cable does not reach its {name}: the line found ends {away:.3f} m from "
+            f"({fixture[0]:.3f}, {fixture[1]:.3f}) m, at ({tip[0]:.3f}, {tip[1]:.3f}) m. "
+            f"Try: {name} in metres and in the board frame? Is the cable hidden there?"
+        )
 
 
 def _width_message(width: float, diameter: float, pixel: float) -> tuple[str, ...]:

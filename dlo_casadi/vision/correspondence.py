@@ -9,10 +9,10 @@ import numpy as np
 from dlo_casadi.vision.sight import Sight
 from dlo_casadi.vision.view import Array
 
-_CAP = 4.0  # standard deviations: how much a pair off its epipolar line may cost
-_SKIP = 1.0  # cost of a pixel at either end that the other photograph does not show
+_CAP = 3.0  # standard deviations: from there on, a pair costs as much as a pixel that is left over
+_GOOD = 2.0  # standard deviations: a pair
 _STEP = 0.05  # cost of a pair: of equal ways, along an epipolar line, the shortest is taken
-_NEAR_PX = 2.0  # how far off a curve may be seen; pixels four times as far are not of it
+_NEAR_PX = 2.0  # how far off a curve may be seen; pixels three times as far are not of it
 _POSE_PX = 0.5  # px: what the cameras' places add to the error of an epipolar line
 
 
@@ -39,10 +39,11 @@ def match_lines(one: Sight, other: Sight) -> Match:
     For rays a and b of the same point b^T E a = 0, with the essential matrix E = [t]_x R of the
     second camera's place seen from the first. The way of least cost
 
-        sum min(d_kl / s_kl, 4)^2 + 0.05,  d^2 = (b^T E a)^2 / (|(E a)_xy|^2 + |(E^T b)_xy|^2)
+        sum min(d_kl / s_kl, 3)^2 + 0.05,  d^2 = (b^T E a)^2 / (|(E a)_xy|^2 + |(E^T b)_xy|^2)
 
     through all pairs (k, l) that never goes back, by dynamic programming; s^2 adds up the
-    variances of both pixels and of the cameras' places. Pixels at the ends may be left over.
+    variances of both pixels and of the cameras' places. Pixels at the ends may be left over, at
+    the price of a pair that does not match: what one photograph hides costs alike everywhere.
 
     References
     ----------
@@ -54,7 +55,7 @@ def match_lines(one: Sight, other: Sight) -> Match:
     off /= np.sqrt(variance)
     cost = np.minimum(off, _CAP) ** 2 + _STEP
     first, second = cheapest_way(cost)
-    good = off[first, second] < _CAP / 2
+    good = off[first, second] < _GOOD
     first, second = first[good], second[good]
     found = len(np.unique(first)) + len(np.unique(second))
     return Match(first, second, found / (len(one.pixels) + len(other.pixels)))
@@ -77,7 +78,7 @@ def places_along(sight: Sight, points: Array) -> Array:
     """
     seen = sight.viewpoint.to_pixels(points)
     away = np.linalg.norm(sight.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX
-    first, second = cheapest_way(away)
+    first, second = cheapest_way(np.minimum(away, _CAP) ** 2 + _STEP)
     off = away[first, second]
     order = np.argsort(-off, kind="stable")  # of several points the nearest is written last
     places = np.full(len(sight.pixels), np.nan)
@@ -123,15 +124,15 @@ def cheapest_way(cost: Array) -> tuple[np.ndarray, np.ndarray]:
     """
     high, wide = cost.shape
     total = np.empty_like(cost)
-    total[0] = np.minimum(cost[0] + _SKIP * np.arange(wide), np.cumsum(cost[0]))
+    total[0] = np.minimum(cost[0] + _CAP**2 * np.arange(wide), np.cumsum(cost[0]))
     for k in range(1, high):
         above = total[k - 1].copy()
         above[1:] = np.minimum(above[1:], total[k - 1, :-1])
-        above[0] = min(above[0], _SKIP * k)
+        above[0] = min(above[0], _CAP**2 * k)
         run = np.cumsum(cost[k])
         total[k] = run + np.minimum.accumulate(above - run + cost[k])
-    last_row = total[-1] + _SKIP * np.arange(wide)[::-1]
-    last_column = total[:, -1] + _SKIP * np.arange(high)[::-1]
+    last_row = total[-1] + _CAP**2 * np.arange(wide)[::-1]
+    last_column = total[:, -1] + _CAP**2 * np.arange(high)[::-1]
     if last_row.min() <= last_column.min():
         k, m = high - 1, int(last_row.argmin())
     else:
@@ -140,7 +141,7 @@ def cheapest_way(cost: Array) -> tuple[np.ndarray, np.ndarray]:
     while k > 0 or m > 0:
         behind = total[k, m] - cost[k, m]
         ways = [(total[i, j], i, j) for i, j in _before(k, m)]
-        skipped = _SKIP * (m if k == 0 else k if m == 0 else np.inf)
+        skipped = _CAP**2 * (m if k == 0 else k if m == 0 else np.inf)
         best = min(ways)
         if skipped <= behind + 1e-9 and skipped <= best[0]:
             break

@@ -13,6 +13,8 @@ from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 
 from dlo_casadi.errors import VisionError
 
+_WHITE, _MUCH_WHITE = 250, 0.3  # grey level, and share of a picture that is overexposed
+_BLURRED_PX = 2.0  # standard deviation of edges from which markers of some 30 px are not read
 _JPEG_START = b"\xff\xd8"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 
@@ -88,6 +90,24 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
             pose=path.name,
         )
     return image
+
+
+def spoilt(image: NDArray[np.uint8]) -> str:
+    """Sentence for a photograph (H, W, 3) that is overexposed or blurred; empty if it is neither.
+
+    A step of the height h blurred by the standard deviation s is nowhere steeper than
+    h / (s sqrt(2 pi)).
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    white = float(np.mean(grey >= _WHITE))
+    if white > _MUCH_WHITE:
+        return f" The picture is overexposed: {100 * white:.0f} % of it are white; less light."
+    step = float(np.subtract(*np.percentile(grey, [99.9, 0.1])))
+    slope = np.hypot(*np.gradient(grey.astype(np.float32)))
+    blur = step / (np.sqrt(2 * np.pi) * max(float(np.percentile(slope, 99.9)), 1e-3))
+    if blur > _BLURRED_PX:
+        return f" The picture is blurred: no edge is sharper than {blur:.0f} px."
+    return ""
 
 
 def _declared_size(data: bytes) -> tuple[int, int]:

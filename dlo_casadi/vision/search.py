@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.contrast import candidate_maps, local_contrast, thresholds
+from dlo_casadi.vision.contrast import Contrast, candidate_maps, local_contrast, thresholds
 from dlo_casadi.vision.ordering import Chain, Course, order_strands
 from dlo_casadi.vision.strands import find_strands
 from dlo_casadi.vision.view import Array
@@ -23,16 +23,23 @@ _GOOD_FOLDED = -0.9  # the same where a cable's length in the picture is not kno
 _LEAST = 0.25  # share of the length that must be seen
 _TWIN = 0.5  # other strands this long, relative to the cable, are a second cable
 _ROOT = 3.0  # diameters: so near to the chain begins a strand that it covers twice
+_ALIKE = 0.5  # of its difference from the surroundings: how far strands of a cable differ in colour
 _TWIN_CONTRAST = 0.6  # ... if they stand out as well, relative to the cable
 
 
 @dataclass(frozen=True)
 class _Line:
-    """A strand in metres, its width relative to the cable's, and how much it stands out."""
+    """A strand in metres, its width relative to the cable's, and how it looks.
+
+    How much it stands out from its surroundings, its colour, and its difference from them [grey
+    levels].
+    """
 
     points: Array
     width: float
     level: float
+    colour: Array
+    step: Array
 
     @property
     def length(self) -> float:
@@ -82,19 +89,15 @@ def find_cable(
     for candidate in candidate_maps(contrast, area_px):
         for cut in thresholds(candidate[plane.reachable], area_px):
             mask = (candidate > cut) & plane.reachable
-            lines = _lines(mask, candidate, plane, fixtures, diameter)
+            lines = _lines(mask, candidate, plane, contrast, fixtures, diameter)
             longest = max([longest, *(line.length for line in lines)])
             if workings is not None and best is None:
                 workings.candidate, workings.cut = candidate, cut
                 workings.lines = [line.points for line in lines]
-            chain = order_strands(
-                [line.points for line in lines],
-                [line.width for line in lines],
-                start=start,
-                end=end,
-                diameter=diameter,
-                course=course,
-            )
+            chain = _chain(lines, start, end, diameter, course)
+            if chain is not None and course.in_space:
+                lines = _of_one_colour(lines, [lines[i] for i in chain.used])
+                chain = _chain(lines, start, end, diameter, course)
             if chain is not None and (best is None or chain.cost < best.chain.cost):
                 ours = [lines[i] for i in chain.used]
                 rest = [lines[i] for i in range(len(lines)) if i not in chain.used]
@@ -118,8 +121,33 @@ def find_cable(
         best = replace(best, chain=_with_folds(best, diameter))
         if workings is not None:
             workings.chosen = best.chain.strands
-    _refuse_twins(best, plane, fixtures, diameter, length)
+    _refuse_twins(best, plane, contrast, fixtures, diameter, course)
     return best.chain
+
+
+def _chain(
+    lines: list[_Line], start: Array, end: Array | None, diameter: float, course: Course
+) -> Chain | None:
+    """Put strands in order."""
+    return order_strands(
+        [line.points for line in lines],
+        [line.width for line in lines],
+        start=start,
+        end=end,
+        diameter=diameter,
+        course=course,
+    )
+
+
+def _of_one_colour(lines: list[_Line], chosen: list[_Line]) -> list[_Line]:
+    """Strands of the colour of the longest one of the chosen, and not of a shadow's.
+
+    Away from the board a shadow is a line of its own, and the cable's contrast changes with what is
+    behind it, but not its colour.
+    """
+    ours = max(chosen, key=lambda line: line.length)
+    step = float(np.linalg.norm(ours.step))
+    return [line for line in lines if np.linalg.norm(line.colour - ours.colour) < _ALIKE * step]
 
 
 def _with_folds(found: _Finding, diameter: float) -> Chain:
@@ -128,10 +156,9 @@ def _with_folds(found: _Finding, diameter: float) -> Chain:
     Seen from its side, a bend is a strand with a free end that the cable covers twice: it begins
     where the chain turns back, and both parts of the chain there lead into it.
     """
-    level = float(np.median([line.level for line in found.ours]))
     parts = list(found.chain.strands)
     for line in found.rest:
-        if line.length < 2 * diameter or line.level < _TWIN_CONTRAST * level:
+        if line.length < 2 * diameter:
             continue
         whole = np.vstack(parts)
         for way in (line.points, line.points[::-1]):
@@ -162,6 +189,7 @@ def _lines(
     mask: NDArray[np.bool_],
     candidate: NDArray[np.float32],
     plane: WorkPlane,
+    contrast: Contrast,
     fixtures: list[Array],
     diameter: float,
 ) -> list[_Line]:
@@ -175,6 +203,8 @@ def _lines(
     for strand in find_strands(mask, width_px):
         columns, rows = strand.points.astype(int).T
         level = float(np.median(candidate[rows, columns]))
+        colour = np.median(plane.image[rows, columns], axis=0)
+        step = np.median(contrast.difference[rows, columns], axis=0) * contrast.noise
         smooth = gaussian_filter1d(strand.points, 0.5 * width_px, axis=0, mode="nearest")
         points = plane.to_board(smooth[1:-1:2])
         cuts = [0, len(points)]
@@ -184,18 +214,25 @@ def _lines(
             if margin <= nearest < len(points) - margin and away[nearest] < diameter:
                 cuts.append(nearest)
         parts = [points[a:b] for a, b in pairwise(sorted(cuts))]
-        lines += [_Line(part, strand.width / width_px, level) for part in parts if len(part) > 2]
+        width = strand.width / width_px
+        lines += [_Line(part, width, level, colour, step) for part in parts if len(part) > 2]
     return lines
 
 
 def _refuse_twins(
-    best: _Finding, plane: WorkPlane, fixtures: list[Array], diameter: float, length: float
+    best: _Finding,
+    plane: WorkPlane,
+    contrast: Contrast,
+    fixtures: list[Array],
+    diameter: float,
+    course: Course,
 ) -> None:
     """Raise if strands away from the chain look like a second cable.
 
     Within reach of the fixtures all of them count together; beyond, where the cable cannot be
     anyway, only one long strand does.
     """
+    length = course.typical
     rest = ((best.candidate > best.cut) & plane.inside).astype(np.uint8)
     for strand in best.chain.strands:
         at = np.round(plane.to_pixels(strand)).astype(np.int32)
@@ -205,7 +242,8 @@ def _refuse_twins(
     level = float(np.median([line.level for line in best.ours]))
     width = float(np.median([line.width for line in best.ours]))
     near, far = 0.0, 0.0
-    for line in _lines(rest > 0, best.candidate, plane, fixtures, diameter):
+    lines = _lines(rest > 0, best.candidate, plane, contrast, fixtures, diameter)
+    for line in _of_one_colour(lines, best.ours) if course.in_space else lines:
         alike = line.level > _TWIN_CONTRAST * level and 0.6 < line.width / width < 1.6
         if not alike or line.length < 5 * diameter:
             continue

@@ -21,7 +21,7 @@ from dlo_casadi.vision.workings import Workings
 _NEAREST = 0.2  # m: no cable is photographed from nearer than that
 _BESIDE = 1.6  # widths: stretches that lie nearer to each other share an edge
 _APART = 2.0  # widths along the line: what is nearer is the same stretch
-_TIP = 4.0  # widths: a line that ends farther from a fixture is told of
+TIP = 4.0  # widths: a line that ends farther from a fixture is told of
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def see_cable(
                 f"the line in the photograph ends {away / pixel:.0f} px from where the {name} is "
                 "declared"
                 for away, name in tips
-                if away > _TIP * width
+                if away > TIP * width
             ),
         ),
         trace.direction,

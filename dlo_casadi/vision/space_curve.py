@@ -24,7 +24,7 @@ _HUBER = 3.0  # standard deviations, from where on a pixel counts less
 # Spectral densities q of the third derivative that are tried, in L^2, where a curve of length L has
 # 0 <= t <= 1: from a bow of 0.3 L to waves of 300 L; afterwards those near the last.
 _WANDER, _WANDER_NEXT = np.logspace(-1.0, 5.0, 13), np.array([0.3, 0.6, 1.0, 1.7, 3.0])
-_LOOPS, _SETTLED = 15, 1e-5  # m
+_LOOPS, _SETTLED = 15, 3e-5  # m: a quarter of the smallest std of a line from three photographs
 
 
 @dataclass(frozen=True)

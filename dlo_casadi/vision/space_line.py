@@ -12,7 +12,8 @@ from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import Board, locate_camera
 from dlo_casadi.vision.correspondence import Match, match_lines, triangulate
 from dlo_casadi.vision.curve import chord_length
-from dlo_casadi.vision.sight import Sight, other_stretches, see_beside, see_cable
+from dlo_casadi.vision.image import spoilt
+from dlo_casadi.vision.sight import TIP, Sight, other_stretches, see_beside, see_cable
 from dlo_casadi.vision.space_curve import CurveFit, first_curve, fit_curve_to_sights
 from dlo_casadi.vision.view import Array, Camera
 
@@ -22,10 +23,15 @@ _SPAN = (
 )
 # rendered photographs move by less than a tenth of their std
 _SPANS = (20, 100)
-_AGREE = 0.8  # share of its pixels that a photograph must share with the others
+_AGREE = (
+    0.6  # share of its pixels that must agree with the others: each may hide parts of the cable
+)
+_KNOWN = 0.25  # diameters: standard deviation beyond which a point is not told
+_MISSING = 0.1  # of the length: a line that is so much shorter passes by a stretch that none shows
+_SURE = 0.9  # share from which no other pair is tried for the first curve
 _AGREE_PX = 1.0  # px, beside four standard deviations: errors of cameras' places
-_FAR = 0.1  # of the length: a line that ends so far from a fixture is not this pose's
-_LONGER = 1.1  # of the length: a line in space cannot be longer
+_FAR = 0.05  # of the length, beside what is not seen: a line that ends farther away is another's
+_LONGER = 1.1  # of the length: a line in space, up to its fixtures, cannot be longer
 _NARROW = np.radians(5.0)  # between two cameras: below, depths are ten times worse than the rest
 
 
@@ -110,18 +116,18 @@ def measure_views(
                 image, viewpoint, start=start, end=end, diameter=diameter, length=length
             )
         except VisionError as error:
-            problems[name] = f"{name}: {error.message}"
+            why = spoilt(image)
+            problems[name] = f"{name}: {error.message}{'' if why in error.message else why}"
     fixtures = [np.asarray(at, float) for at in (start, end) if at is not None]
     spans = int(np.clip(length / (_SPAN * diameter), *_SPANS))
     fit, order = _agreeing_fit(sights, problems, fixtures, length, spans)
-    line = None
+    line, missing = None, 0.0
     if fit is not None:
         seen = [sights[name] for name in order]
         fit, seen = _resolve(fit, seen, [photographs[name] for name in order])
         sights.update(zip(order, seen, strict=True))
-        line = _points(fit, diameter)
-        if len(line.points) < 2:
-            line = None
+        missing = 1.0 - _whole(fit, fixtures) / length if len(fixtures) == 2 else 0.0
+        line = _points(fit, diameter) if missing < _MISSING else None
     messages = [
         f"{name}: {message}"
         for name, sight in sights.items()
@@ -132,7 +138,13 @@ def measure_views(
             f"{next(iter(sights))} alone gives no line in space; its pixels serve a fit. Try: a "
             "second photograph from another place, 30 to 90 degrees around the cable."
         )
-    elif line is not None:
+    elif fit is not None and line is None:
+        messages.append(
+            f"the photographs show a line in space that is {100 * missing:.0f} % shorter than the "
+            "cable: a stretch is hidden in some of them, or pointed to the camera. No line is "
+            "given. Try: a photograph from another side; check the length"
+        )
+    elif fit is not None and line is not None:
         messages += _line_messages(line, fit, fixtures, length)
     return Views(line, sights, problems, tuple(messages))
 
@@ -158,38 +170,44 @@ def _agreeing_fit(
     Those that contradict it are moved from the sights to the problems.
     """
     while len(sights) > 1:
-        pair = _best_pair(sights)
-        if pair.angle < _NARROW:
-            one, other = pair.names
-            for name in list(sights)[1:]:
+        pairs = _pairs(sights)
+        if max(pair.angle for pair in pairs) < _NARROW:
+            first, *others = sights
+            for name in others:
                 problems[name] = (
-                    f"{name}: the photographs are taken from nearly the same place ({one}, {other} "
-                    f"{np.degrees(pair.angle):.1f} degrees apart): no depth. Try: step aside, 30 "
-                    "to 90 degrees around the cable."
+                    f"{name}: the photographs are taken from nearly the same place as {first}, "
+                    f"less than {np.degrees(_NARROW):.0f} degrees apart: no depth. Try: step "
+                    "aside, 30 to 90 degrees around the cable."
                 )
                 del sights[name]
-            return None, []
-        names = list(sights)
-        fit = _fit(sights, pair, spans) if pair.match.share > _AGREE else None
-        if fit is None or not _possible(fit, fixtures, length):
-            _blame(sights, problems, pair, fixtures)
-            continue
-        shares = [_agreement(sights[n], r) for n, r in zip(names, fit.residuals, strict=True)]
-        worst = int(np.argmin(shares))
-        if shares[worst] >= _AGREE:
-            return fit, names
-        name = names[worst]
-        problems[name] = (
-            f"{name}: only {100 * shares[worst]:.0f} % of the line in it lie on the line in space "
-            "that the other photographs of this pose show. Try: is it of this pose? Was the cable "
-            "or the board moved between the photographs?"
-        )
-        del sights[name]
+            break
+        best: tuple[float, CurveFit, str] | None = None
+        for pair in pairs:
+            fit = _fit(sights, pair, spans) if pair.match.share > _AGREE else None
+            if fit is None or not _possible(fit, list(sights.values()), fixtures, length):
+                continue
+            shares = dict(zip(sights, map(_agreement, sights.values(), fit.residuals), strict=True))
+            worst = min(shares, key=lambda name: shares[name])
+            if best is None or shares[worst] > best[0]:
+                best = shares[worst], fit, worst
+            if best[0] > _SURE:
+                break
+        if best is None:
+            _blame(sights, problems, pairs[0], fixtures)
+        elif best[0] > _AGREE:
+            return best[1], list(sights)
+        else:
+            problems[best[2]] = (
+                f"{best[2]}: only {100 * best[0]:.0f} % of the line in it lie on the line in space "
+                "that the photographs of this pose show together. Try: is it of this pose? Was the "
+                "cable or the board moved between the photographs?"
+            )
+            del sights[best[2]]
     return None, []
 
 
-def _best_pair(sights: dict[str, Sight]) -> _Pair:
-    """The two photographs whose lines match best, seen from the most different places."""
+def _pairs(sights: dict[str, Sight]) -> list[_Pair]:
+    """All pairs of photographs, first those that match well and are seen from different places."""
     names = list(sights)
     pairs = []
     for i, one in enumerate(names):
@@ -197,7 +215,7 @@ def _best_pair(sights: dict[str, Sight]) -> _Pair:
             ahead = float(sights[one].viewpoint.rotation[2] @ sights[other].viewpoint.rotation[2])
             match = match_lines(sights[one], sights[other])
             pairs.append(_Pair((one, other), match, float(np.arccos(np.clip(ahead, -1, 1)))))
-    return max(pairs, key=lambda pair: (pair.match.share > _AGREE, np.sin(pair.angle)))
+    return sorted(pairs, key=lambda pair: -(pair.match.share**8) * np.sin(pair.angle))
 
 
 def _fit(sights: dict[str, Sight], pair: _Pair, spans: int) -> CurveFit:
@@ -209,11 +227,14 @@ def _fit(sights: dict[str, Sight], pair: _Pair, spans: int) -> CurveFit:
     return fit_curve_to_sights(list(sights.values()), first_curve(points, along, spans))
 
 
-def _possible(fit: CurveFit, fixtures: list[Array], length: float) -> bool:
-    """Whether a curve is no longer than the cable, and leads from fixture to fixture."""
-    ends = fit.curve.position(np.array([0.0, 1.0]))
-    away = [np.linalg.norm(end - at) for end, at in zip(ends, fixtures, strict=False)]
-    return bool(fit.curve.length < _LONGER * length and max(away) < _FAR * length)
+def _possible(fit: CurveFit, sights: list[Sight], fixtures: list[Array], length: float) -> bool:
+    """Whether a curve is no longer than the cable, and ends where the photographs show its ends."""
+    tips = np.array([_tips_off(sight, fixtures) / sight.width for sight in sights])
+    shown = np.all(tips < TIP, axis=0)
+    ends = fit.curve.position(np.array([0.0, 1.0]))[: len(fixtures)]
+    away = np.linalg.norm(ends - np.array(fixtures), axis=1)
+    far = _FAR * length + TIP * sights[0].diameter
+    return bool(_whole(fit, fixtures) < _LONGER * length and np.all(away[shown] < far))
 
 
 def _agreement(sight: Sight, residuals: Array) -> float:
@@ -226,7 +247,7 @@ def _blame(
     sights: dict[str, Sight], problems: dict[str, str], pair: _Pair, fixtures: list[Array]
 ) -> None:
     """Leave out the photograph whose line ends farthest from where the fixtures are declared."""
-    off = {name: _tips_off(sight, fixtures) for name, sight in sights.items()}
+    off = {name: float(_tips_off(sight, fixtures).max()) for name, sight in sights.items()}
     worst = max(off, key=lambda name: off[name])
     others = ", ".join(name for name in sights if name != worst)
     problems[worst] = (
@@ -239,11 +260,11 @@ def _blame(
     del sights[worst]
 
 
-def _tips_off(sight: Sight, fixtures: list[Array]) -> float:
-    """Distance [px] of the line's ends from the fixtures, the larger one."""
+def _tips_off(sight: Sight, fixtures: list[Array]) -> Array:
+    """Distances [px] of the line's ends from the fixtures, as the photograph shows them."""
     places = sight.viewpoint.to_pixels(fixtures)
     ends = sight.pixels[[0, -1]][: len(places)]
-    return float(np.linalg.norm(ends - places, axis=1).max())
+    return np.asarray(np.linalg.norm(ends - places, axis=1))
 
 
 def _resolve(
@@ -283,11 +304,11 @@ def _surprise(fit: CurveFit) -> float:
 
 
 def _points(fit: CurveFit, diameter: float) -> SpaceLine:
-    """Evenly spaced points that are known better than the cable is thick."""
+    """Evenly spaced points that are well known, compared with the cable's thickness."""
     count = max(2, round(fit.curve.length / _SPACING) + 1)
     t = np.linspace(0.0, 1.0, count)
     covariance, std = fit.std(t)
-    known = np.nonzero(std < 0.5 * diameter)[0]
+    known = np.nonzero(std < _KNOWN * diameter)[0]
     gaps = np.nonzero(np.diff(known) > 1)[0]
     return SpaceLine(
         fit.curve.position(t[known]),
@@ -297,19 +318,24 @@ def _points(fit: CurveFit, diameter: float) -> SpaceLine:
     )
 
 
+def _whole(fit: CurveFit, fixtures: list[Array]) -> float:
+    """Length [m] of a curve and of the straight ways from its ends to the fixtures."""
+    ends = fit.curve.position(np.array([0.0, 1.0]))
+    away = [float(np.linalg.norm(end - at)) for end, at in zip(ends, fixtures, strict=False)]
+    return fit.curve.length + sum(away)
+
+
 def _line_messages(
-    line: SpaceLine, fit: CurveFit | None, fixtures: list[Array], length: float
+    line: SpaceLine, fit: CurveFit, fixtures: list[Array], length: float
 ) -> list[str]:
     """Sentences on how the line in space fits its fixtures and its length."""
-    assert fit is not None
     messages = []
     steps = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
     seen = float(np.delete(steps, list(line.gaps)).sum())
-    whole = fit.curve.length
+    whole = _whole(fit, fixtures)
     ends = fit.curve.position(np.array([0.0, 1.0]))
     for name, end, at in zip(("start", "end"), ends, fixtures, strict=False):
         away = float(np.linalg.norm(end - at))
-        whole += away
         if away > max(0.03 * length, 0.01):
             messages.append(f"the line in space stops {1e3 * away:.0f} mm before the {name}")
     if len(fixtures) == 2 and abs(whole / length - 1.0) > 0.03:

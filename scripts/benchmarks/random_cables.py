@@ -12,12 +12,15 @@ from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dlo_casadi.assembly import Given, Shapes
+from dlo_casadi.codegen import plane, space
 from dlo_casadi.codegen.compiled import shape_record
-from dlo_casadi.codegen.generate import generate, numbers_of
+from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.kernels import kernels_of
 from dlo_casadi.codegen.library import compile_library
+from dlo_casadi.codegen.poses import frame_poses
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
@@ -57,6 +60,13 @@ class Problem:
     ends: FloatArray
     headings: FloatArray
 
+    @property
+    def table(self) -> FloatArray:
+        """All poses as the C solver takes them."""
+        poses = np.zeros((len(self.ends), 6))
+        poses[:, 2:4], poses[:, 4:] = self.ends, self.headings
+        return poses
+
     def pose(self, i: int) -> Pose:
         """One pose for the Python solver."""
         end, (first, last), model = self.ends[i], self.headings[i], self.model
@@ -66,6 +76,93 @@ class Problem:
             float(first) if model.start == "clamped" else None,
             float(last) if model.end == "clamped" else None,
         )
+
+
+@dataclass(frozen=True)
+class SpaceProblem:
+    """One random cable in space between two clamps."""
+
+    model: CableModel
+    rest: FloatArray
+    poses: tuple[Pose, ...]
+
+    @property
+    def table(self) -> FloatArray:
+        """All poses as the C solver takes them."""
+        return frame_poses(self.poses)
+
+
+def space_problem(
+    rng: np.random.Generator, poses: int, n: int = 20, element: str = "quadratic"
+) -> SpaceProblem:
+    """A cable of 1 m of any ratio of stiffness to weight between two clamps.
+
+    EI over weight L^3 from 0.003 to 3, GJ over EI from 0.3 to 1, rest curvature up to half a turn;
+    chords from 0.5 to 0.9 L, both ends turned by up to 60 degrees against the chord, the end rolled
+    by up to 180 degrees.
+    """
+    mass = 0.1
+    stiffness = 9.81 * mass * np.exp(rng.uniform(np.log(0.003), np.log(3.0)))
+    cable = Cable(1.0, mass, 0.01, stiffness, torsional_stiffness=stiffness * rng.uniform(0.3, 1.0))
+    gravity = (0.0, 0.0, -9.81)
+    model = CableModel(cable, n, element, "clamped", "clamped", gravity)
+    rest = model.rest_basis @ rng.normal(size=model.n_coefficients)
+    bends = np.linalg.norm(model.chain.curvatures(rest), axis=0) / n
+    rest *= rng.uniform(0.0, np.pi) / bends.sum()
+    found = []
+    for _ in range(poses):
+        chord = Rotation.random(random_state=rng)
+        first, last = (chord * _tilted(rng) for _ in range(2))
+        roll = Rotation.from_rotvec([rng.uniform(-np.pi, np.pi), 0.0, 0.0])
+        end = rng.uniform(0.5, 0.9) * chord.apply([1.0, 0.0, 0.0])
+        found.append(
+            Pose(
+                (0.0, 0.0, 0.0),
+                tuple(end),
+                start_orientation=tuple(first.as_quat()),
+                end_orientation=tuple((last * roll).as_quat()),
+            )
+        )
+    return SpaceProblem(model, rest, tuple(found))
+
+
+def _tilted(rng: np.random.Generator) -> Rotation:
+    """A turn by up to 60 degrees about an axis across x."""
+    angle, about = rng.uniform(0.0, np.pi / 3), rng.uniform(0.0, 2 * np.pi)
+    return Rotation.from_rotvec(angle * np.array([0.0, np.cos(about), np.sin(about)]))
+
+
+def check_in_space(problem: SpaceProblem, shape: NDArray[np.void], i: int) -> tuple[bool, float]:
+    """Whether a shape is a stable equilibrium by the Python model, and its worst end error.
+
+    The error is in m or rad; stability is that of all eigenvalues of the whole matrix.
+    """
+    model, x = problem.model, shape["frames"]
+    given = Given.of(model.nominal, problem.rest, problem.poses[i].vector[None])
+    # The solver's moments are about the world's axes, multipliers about the nodes' own.
+    moments = [
+        Rotation.from_quat(frame).inv().apply(moment)
+        for frame, moment in zip((x[0], x[-1]), shape["moments"], strict=True)
+    ]
+    lam = np.concatenate([shape["lam"], *moments])
+    _, slope, matrix = model.assembly.balance(Shapes.declared(x[None], lam[None]), given)
+    scale = float(matrix.scale[0])
+    balanced = np.abs(slope.x).max() < 1e-7 * scale
+    stable = (np.linalg.eigvalsh(matrix.dense()[0] / scale) < 0).sum() == model.n_multipliers
+    return bool(balanced and stable), float(np.abs(slope.y).max())
+
+
+def compare_in_space(problem: SpaceProblem, shape: NDArray[np.void], i: int) -> str:
+    """Our energy against that of the Python solver: same, lower, higher or python_failed."""
+    model = problem.model
+    try:
+        other = solve_equilibrium(model, model.nominal, problem.rest, problem.poses[i])
+    except EquilibriumError:
+        return "python_failed"
+    slack = 1e-6 * (abs(other.energy) + model.cable.mass * 9.81 * model.cable.length)
+    if abs(shape["energy"] - other.energy) <= slack:
+        return "same"
+    return "lower" if shape["energy"] < other.energy else "higher"
 
 
 def random_problem(
@@ -131,7 +228,7 @@ def random_starts(rng: np.random.Generator, problem: Problem) -> FloatArray:
 class AnyCable:
     """The compiled solver of all cables of one kind: the mesh is compiled, numbers are not."""
 
-    def __init__(self, problem: Problem, flags: tuple[str, ...] = ("-O2",)) -> None:
+    def __init__(self, problem: Problem | SpaceProblem, flags: tuple[str, ...] = ("-O2",)) -> None:
         model = problem.model
         source = generate(model, model.nominal, problem.rest, inline=False)
         texts = dict(source.files)
@@ -147,19 +244,23 @@ class AnyCable:
         self.record = shape_record(model)
         self._work = np.empty(source.workspace)
 
-    def table(self, problem: Problem) -> FloatArray:
+    def table(self, problem: Problem | SpaceProblem) -> FloatArray:
         """Numbers of a cable, laid out as the compiled code expects."""
-        model = problem.model
-        kernels = kernels_of(model, model.nominal, problem.rest, inline=False)
-        return np.array(numbers_of(model, model.nominal, problem.rest, kernels))
+        model, rest = problem.model, problem.rest
+        if model.in_space:
+            meshes = space.meshes_of(model, model.nominal, rest, inline=False)
+            return np.array(space.numbers_of(model, model.nominal, rest, meshes))
+        kernels = kernels_of(model, model.nominal, rest, inline=False)
+        return np.array(plane.numbers_of(model, model.nominal, rest, kernels))
 
     def solve(
-        self, problem: Problem, branch: int = 0, starts: FloatArray | None = None
+        self,
+        problem: Problem | SpaceProblem,
+        branch: int = 0,
+        starts: FloatArray | None = None,
     ) -> tuple[NDArray[np.void], NDArray[np.intc], float]:
         """Shapes, statuses and seconds of all poses of a problem, cold or from headings."""
-        table = self.table(problem)
-        poses = np.zeros((len(problem.ends), 6))
-        poses[:, 2:4], poses[:, 4:] = problem.ends, problem.headings
+        table, poses = self.table(problem), problem.table
         warm = np.zeros(len(poses), self.record)
         if starts is not None:
             warm["headings"] = starts

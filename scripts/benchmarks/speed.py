@@ -86,7 +86,7 @@ def generated(n: int, element: str, repeats: int) -> dict[str, Any]:
     folder = Path(tempfile.mkdtemp(prefix="dlo_speed_"))
     c = ctypes.CDLL(str(compile_library(replace(source, files=texts), folder, FLAGS)))
     pointer, size = ctypes.c_void_p, ctypes.c_size_t
-    c.dlo_time.argtypes = [pointer, ctypes.c_int, size, pointer, pointer, pointer]
+    c.dlo_time.argtypes = [pointer, ctypes.c_int, pointer, size, pointer, pointer, pointer]
     work, shape = np.empty(source.workspace), np.zeros(16 * (n + 8))
     everything = []
     for end in poses():
@@ -94,7 +94,7 @@ def generated(n: int, element: str, repeats: int) -> dict[str, Any]:
         for keep in (False, True):
             seconds = np.zeros(repeats)
             c.dlo_time(
-                *(pose.ctypes.data, 1, repeats, seconds.ctypes.data),
+                *(pose.ctypes.data, 1, None, repeats, seconds.ctypes.data),
                 *(shape.ctypes.data, work.ctypes.data),
             )
             if keep:

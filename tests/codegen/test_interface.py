@@ -190,6 +190,21 @@ def test_sensitivities_are_central_differences(element, start, end, effects):
             assert np.abs(getattr(slope, name)[..., k] - expected).max() < 1e-6 * size, (k, name)
 
 
+@pytest.mark.parametrize("solver", ["links", "clamped"])
+def test_a_step_stays_on_its_branch_within_its_bound_on_the_work(solver, request):
+    solver = request.getfixturevalue(solver)
+    held = {"headings": (0.7, -0.6)}
+    shape = solver.solve((0.5, 0.1), **held)
+    stepped = solver.step(shape, (0.503, 0.098), steps=5, **held)
+    assert stepped.status == "ok"
+    expected = solver.solve((0.503, 0.098), warm=shape, **held)
+    np.testing.assert_allclose(stepped.points, expected.points, atol=1e-8)
+    for steps, status in ((1, "iteration_limit"), (0, "bad_argument")):
+        short = solver.step(shape, (0.503, 0.098), steps=steps, **held)
+        assert short.status == status
+        assert all_zero(short)
+
+
 def test_sensitivity_of_a_shape_of_another_pose_is_refused(links):
     shape = links.solve((0.5, 0.1))
     with pytest.raises(EquilibriumError, match="bad_argument"):

@@ -9,7 +9,16 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 
-from benchmarks.random_cables import AnyCable, check, compare_with_ipopt, missed, random_problem
+from benchmarks.random_cables import (
+    AnyCable,
+    check,
+    check_in_space,
+    compare_in_space,
+    compare_with_ipopt,
+    missed,
+    random_problem,
+    space_problem,
+)
 
 from dlo_casadi.codegen import STATUSES
 from dlo_casadi.equilibrium import solve_equilibrium
@@ -81,3 +90,23 @@ def test_24_random_starts_find_nothing_lower(start, end):
         held = solve_equilibrium(model, model.nominal, problem.rest, problem.pose(0))
         assert held.energy == pytest.approx(shape["energy"], rel=1e-7, abs=1e-9)
         np.testing.assert_allclose(held.points, shape["points"], atol=1e-7)
+
+
+def test_random_clamped_cables_in_space_have_stable_equilibria():
+    """scripts/benchmark.py --only space_random solves a hundred thousand."""
+    rng = np.random.default_rng(0)
+    solver = AnyCable(space_problem(rng, 1, 10), flags=("-O1",))
+    failed, words = 0, []
+    for _ in range(10):
+        problem = space_problem(rng, 50, 10)
+        shapes, statuses, _ = solver.solve(problem)
+        failed += np.count_nonzero(statuses)
+        for i in np.flatnonzero(statuses == 0)[:6]:
+            right, error = check_in_space(problem, shapes[i], i)
+            assert right
+            assert error < 1e-9
+        there = np.flatnonzero(statuses == 0)[:3]
+        words += [compare_in_space(problem, shapes[i], i) for i in there]
+    assert failed <= 2
+    assert words.count("higher") <= 1
+    assert words.count("same") + words.count("lower") >= 25

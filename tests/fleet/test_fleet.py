@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,8 @@ from dlo_casadi.durable import only_run
 from dlo_casadi.errors import DloError
 from dlo_casadi.executors import InProcess
 from dlo_casadi.fleet import find_sessions, fit_fleet
-from dlo_casadi.fleet.columns import empty_row
+from dlo_casadi.fleet.columns import COLUMNS, empty_row, row_of
+from dlo_casadi.fleet.one import Job, fit_one
 from dlo_casadi.fleet.outliers import judge, robust_z
 from dlo_casadi.fleet.overview import overview_html
 from dlo_casadi.parallel import open_executor
@@ -171,6 +173,31 @@ def test_results_and_hidden_folders_are_no_sessions(tmp_path):
     assert base == (tmp_path / "cables").resolve()
     with pytest.raises(DloError, match="no configuration in"):
         find_sessions(tmp_path / "nowhere")
+
+
+def test_a_cable_in_space_has_columns_of_its_own(fleet, tmp_path):
+    """A planar report with what one in space has instead."""
+    (tmp_path / "rows").mkdir()
+    job = Job(find_sessions(fleet)[1][-1], "hash", tmp_path, replace(QUICK, reports=True))
+    plane = fit_one(job)
+    report = json.loads((job.folder / "report.json").read_text())
+    found = report["stages"][-1]["parameters"]
+    found["torsional_stiffness"] = {**found["bending_stiffness"], "value": 0.2, "std": 0.1}
+    about = found["rest_curvature"]
+    double = {key: [2 * value for value in about[key]] for key in ("value", "std")}
+    found["rest_curvature"] = {"s": about["s"], "k_y": about, "k_z": double}
+    report["unexplained"] = {"force": [1.0, 2.0, 3.0], "position": 0.1}
+
+    row = row_of(plane["session"], "hash", "loom", report, 1.0)
+    assert row.keys() == COLUMNS.keys()
+    assert plane["torsional_stiffness"] is None
+    assert (row["torsional_stiffness"], row["torsional_stiffness_std"]) == (0.2, 0.1)
+    assert [row[f"unexplained_force_{axis}"] for axis in "xyz"] == [1.0, 2.0, 3.0]
+    for name in ("rest_curvature", "rest_curvature_std"):
+        assert row[name] == plane[name]
+    assert plane["rest_curvature_z"] == []
+    assert row["rest_curvature_z"] == double["value"]
+    assert row["rest_curvature_z_std"] == double["std"]
 
 
 def fake(key, stiffness, error=1e-3, verdict="complete"):

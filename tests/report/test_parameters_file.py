@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_sessions import BENCH, small
+from small_sessions import BENCH, CONFIGS, small
 
 from dlo_casadi.assembly import Given
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
@@ -44,6 +44,41 @@ def fitted(name, *effects, n=20):
     for effect in effects:
         model = model.with_effect(effect)
     return fit_model(model, measured, declared.tolerances, 3e-4, decades=(0,)), measured
+
+
+def test_a_cable_in_space_is_rebuilt_exactly(outcome, tmp_path):
+    config = load_config(CONFIGS / "markers_in_space.yaml")
+    _, measured = read_poses(config, lambda *_: None)
+    declared = declared_model(config)
+    model = declared.model.with_mesh(8)
+    fit = fit_model(model, measured[:3], declared.tolerances, 3e-4, decades=(0,))
+    path = as_file(fit, replace(outcome, config=config), tmp_path / "parameters.yaml")
+    document = read_yaml(path)
+    assert list(document["rest_curvature"]["coefficients"]) == ["k_y", "k_z"]
+    assert document["cable"]["torsional_stiffness"] == pytest.approx(0.0197 / 1.3)
+    assert {"torsional_stiffness", "end_roll"} < set(document["parameters"])
+    assert document["fixtures"] == {
+        "start": [0.4, -0.2, 0.3],
+        "start_orientation": [-0.480585, -0.087156, -0.095296, 0.867387],
+        "end_orientation": None,
+    }
+
+    cable = load_parameters(path)
+    assert cable.model == fit.model
+    assert np.array_equal(cable.p, fit.p)
+    assert np.array_equal(cable.rest, fit.rest)
+    assert np.array_equal(cable.metadata.coefficients, fit.coefficients)
+    assert not cable.metadata.edited
+    for change, message in (
+        (lambda d: d["cable"].pop("torsional_stiffness"), "torsional_stiffness is missing"),
+        (lambda d: d["rest_curvature"]["coefficients"].pop("k_z"), "k_z is missing"),
+        (lambda d: d["rest_curvature"]["coefficients"]["k_z"].pop(), "26 numbers belong here"),
+    ):
+        damaged = read_yaml(path)
+        change(damaged)
+        (tmp_path / "damaged.yaml").write_text(dump_yaml(damaged))
+        with pytest.raises(ConfigError, match=message):
+            load_parameters(tmp_path / "damaged.yaml")
 
 
 def as_file(fit, outcome, path):

@@ -1,0 +1,79 @@
+"""What the templates of a cable in a plane are filled with."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.codegen.kernels import Kernels, c_number, kernels_of, table_to_c
+from dlo_casadi.equilibrium import resting_headings, total_dead_load
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.floating]
+
+# Doubles of a workspace per slot; as in the template.
+_ARRAYS = 38
+# Parts of the templates.
+TEXTS = {
+    "WHERE": "in a plane",
+    "ANGLES": """Angles are headings against the x axis of the board frame,
+ * counter-clockwise positive, continuous along the cable (a full clockwise turn ends at -2 pi).""",
+    "NODES": "\n#define DLO_N_HEADINGS @N_HEADINGS@ /* @HEADINGS_ARE@ */",
+    "START_FRAME": "start_heading",
+    "END_FRAME": "end_heading",
+    "BRANCH": """\
+ *   branch     in   which equilibrium. Between two pins DLO_LOWEST costs two solves, or five for
+ *                   a cable that is curved at rest; a named branch costs one, for it takes the
+ *                   first equilibrium that turns as asked for. With a clamp two to four solves are
+ *                   made, with a free end three, and the lowest that turns so is taken. Where
+ *                   none is found to turn so the status is DLO_OTHER_BRANCH.""",
+    "SNAP": "snap-through",
+    "POSE": "{0.0, 0.0}, {0.6 * DLO_LENGTH, 0.1 * DLO_LENGTH}, 0.5, -0.5",
+}
+
+
+def _extra(model: CableModel, p: FloatArray) -> list[float]:
+    """Numbers of the cable that no kernel holds, in the order of the template's macros."""
+    down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
+    offsets, length = model.held(p, 0, 0)
+    return [float(length), down, *total_dead_load(model, p), *np.array(offsets).ravel()[2:]]
+
+
+def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray, kernels: Kernels) -> list[float]:
+    """The solver's table: numbers of the kernels, nodes, widths of the cells, rest, the others."""
+    stretch = float(model.held(p, 0, 0)[1]) / model.cable.length
+    return [
+        *kernels.table,
+        *(model.chain.places / model.cable.length),
+        *(1 / (np.diff(model.chain.cells, axis=1).ravel() * stretch)),
+        *resting_headings(model.chain, rest),
+        *_extra(model, p),
+    ]
+
+
+def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> dict[str, str]:
+    """What the marks of the templates stand for."""
+    kernels = kernels_of(model, p, rest, inline)
+    functions, loops = kernels.to_c(model.yields)
+    chain, rows = model.chain, len(kernels.table)
+    count = chain.n_nodes
+    return {
+        "N_HEADINGS": str(count),
+        "HEADINGS_ARE": chain.kind.nodes_are,
+        "LENGTH": c_number(float(model.held(p, 0, 0)[1])),
+        "WORKSPACE": str(_ARRAYS * (count + 1)),
+        "ELEMENTS": str(chain.n_slots),
+        "FIRST": str(chain.layout.advancing[0]),
+        "LOW": str(int(model.start == "clamped")),
+        "HIGH": str(count - int(model.end == "clamped")),
+        "STRETCHES": str(int(model.extensible)),
+        "TABLE": table_to_c(numbers_of(model, p, rest, kernels)),
+        "PLACES": str(rows),
+        "WIDTHS": str(rows + count),
+        "RESTING": str(rows + 2 * count - 1),
+        "EXTRA": str(rows + 3 * count - 1),
+        # Elimination and solution: about 30 operations a node; the trial point is evaluated, too.
+        "OPERATIONS": str(2 * kernels.operations + 30 * count),
+        "KERNELS": functions,
+        "LOOPS": loops,
+    }

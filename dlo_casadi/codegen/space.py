@@ -1,0 +1,172 @@
+"""What the templates of a cable in space are filled with."""
+
+from __future__ import annotations
+
+import re
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.codegen.kernels import (
+    Kernels,
+    c_number,
+    kernels_of,
+    statements,
+    table_to_c,
+    with_helpers,
+)
+from dlo_casadi.equilibrium import total_dead_load
+from dlo_casadi.errors import DloError
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.floating]
+
+# Doubles of a workspace per node, and beside those four coarse shapes; as in the template.
+_NUMBERS, _COARSE_SHAPES = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 4
+# Fewest elements of the coarse mesh, and elements of the fine one in each of its elements.
+LEAST_COARSE, COARSENING = 4, 3
+# Parts of the templates.
+TEXTS = {
+    "WHERE": "in space",
+    "ANGLES": """Vectors are in world axes, orientations are unit quaternions (x, y, z, w).""",
+    "NODES": "",
+    "START_FRAME": "start_orientation",
+    "END_FRAME": "end_orientation",
+    "BRANCH": """\
+ *   branch     in   DLO_LOWEST: four first guesses are followed, with a free end three, and the
+ *                   stable equilibrium of lowest energy is taken.""",
+    "SNAP": "snap-through, or a twist at which the cable loops",
+    "POSE": """{0.0, 0.0, 0.0}, {0.6 * DLO_LENGTH, 0.1 * DLO_LENGTH, 0.1 * DLO_LENGTH},
+                           {0.0, 0.0, 0.0, 1.0}, {0.0, 0.0, 0.0, 1.0}, 0.0""",
+}
+
+
+def coarse_elements(model: CableModel) -> int:
+    """Elements of the mesh on which first guesses are followed: with a free end all."""
+    coarse = model.n if model.end == "free" else max(LEAST_COARSE, round(model.n / COARSENING))
+    return min(model.n, coarse)
+
+
+def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:
+    """Rest strains (n_rests,) of the coarse cells: means of those of the fine ones."""
+    low, high = model.chain.cells.T
+    shares = [
+        np.clip(np.minimum(high, end) - np.maximum(low, start), 0.0, None) / (end - start)
+        for start, end in coarse.chain.cells
+    ]
+    return np.concatenate(
+        [np.array(shares) @ part for part in np.split(rest, len(model.node.strains))]
+    )
+
+
+def _clamps(model: CableModel, p: FloatArray) -> FloatArray:
+    """Frames (8,) of the true clamps in the declared ones, and the end's offset ahead (3,)."""
+
+    def held(ends: FloatArray) -> FloatArray:
+        return np.array(model.held(p, ends, 0)[0]).ravel()
+
+    still = np.concatenate([np.zeros(6), model.node.identity, model.node.identity])
+    found = held(still)
+    anywhere = np.random.default_rng(0).normal(size=(2, 4))
+    anywhere /= np.linalg.norm(anywhere, axis=1)[:, None]
+    expected = [
+        (Rotation.from_quat(q) * Rotation.from_quat(turn)).as_quat()
+        for q, turn in zip(anywhere, found[6:].reshape(2, 4), strict=True)
+    ]
+    turned = held(np.concatenate([np.zeros(6), anywhere.ravel()]))[6:].reshape(2, 4)
+    if np.abs(np.abs((turned * expected).sum(axis=1)) - 1).max() > 1e-12:
+        raise DloError(
+            "no solver can be generated: an effect moves the clamps in another way than about "
+            "their own axes\n  Try: dlo predict, or dlo_casadi.predict, which know it."
+        )
+    return found[3:]
+
+
+def _extra(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
+    """Numbers of the cable that no kernel holds, in the order of the template's macros."""
+    length = float(model.held(p, 0, 0)[1])
+    widths = np.diff(model.chain.cells, axis=1).ravel()
+    bends = model.chain.curvatures(rest) * widths
+    return [
+        length,
+        length / model.n,
+        *model.gravity,
+        *total_dead_load(model, p),
+        *_clamps(model, p),
+        *bends.T.ravel(),
+    ]
+
+
+def meshes_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True
+) -> dict[str, Kernels]:
+    """Kernels of the fine mesh and, where there is one, of the coarse mesh, by their names in C."""
+    found = {"kernel": kernels_of(model, p, rest, inline)}
+    count = coarse_elements(model)
+    if count < model.n:
+        coarse = model.with_mesh(count)
+        means = coarse_rest(model, coarse, rest)
+        found["coarse_kernel"] = kernels_of(coarse, p, means, inline)
+    return found
+
+
+def numbers_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, meshes: dict[str, Kernels]
+) -> list[float]:
+    """The solver's table: numbers of the kernels of both meshes, then the others."""
+    rows = [number for kernels in meshes.values() for number in kernels.table]
+    return [*rows, *_extra(model, p, rest)]
+
+
+def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> dict[str, str]:
+    """What the marks of the templates stand for."""
+    meshes, count = meshes_of(model, p, rest, inline), coarse_elements(model)
+    if meshes["kernel"].ends is not None:
+        raise DloError(
+            "no solver can be generated for a cable in space whose ends are held by springs\n"
+            "  Try: dlo predict, or dlo_casadi.predict, which know them."
+        )
+    functions: list[str] = []
+    loops: dict[str, str] = {}
+    at = 0
+    for name, kernels in meshes.items():
+        functions += [
+            _kernel_text(f"{name}_{k}", kernel.members, kernel.function)
+            for k, kernel in enumerate(kernels.slots)
+        ]
+        call = f"{name}_{{k}}(w->x + 4 * j, w->lam, {{row}}, table, w->slot + SLOT * j)"
+        loops[name] = "\n".join(kernels.loops(call, at))
+        at += len(kernels.table)
+    return {
+        "LENGTH": c_number(float(model.held(p, 0, 0)[1])),
+        "WORKSPACE": str(_NUMBERS * (model.n + 1) + 4 * _COARSE_SHAPES * (count + 1)),
+        "COARSE": str(count),
+        "REACHES": str(int(not model.extensible)),
+        "TABLE": table_to_c(numbers_of(model, p, rest, meshes)),
+        "EXTRA": str(at),
+        # Elimination and solution: about 500 operations a node.
+        "OPERATIONS": str(meshes["kernel"].operations + 500 * (model.n + 1)),
+        "KERNELS": with_helpers(functions),
+        "LOOPS": loops["kernel"],
+        "COARSE_LOOPS": re.sub("^", "    ", loops.get("coarse_kernel", ""), flags=re.MULTILINE),
+    }
+
+
+def _kernel_text(name: str, members: tuple[int, int], function: ca.Function) -> str:
+    first, last = members
+    targets = {(0, i): f"out[{i}] =" for i in range(function.nnz_out(0))}
+    body = statements(function, ("x", "lam", "row", "table"), targets)
+    return "\n".join(
+        [
+            f"/* Slots {first} to {last - 1}. */",
+            f"static void {name}(const double *x, const double *lam, const double *row,",
+            f"{' ' * len(f'static void {name}(')}const double *table, double *restrict out)",
+            "{",
+            body,
+            "    (void)x, (void)lam, (void)row, (void)table;",
+            "}",
+            "",
+        ]
+    )

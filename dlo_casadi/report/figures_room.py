@@ -1,0 +1,52 @@
+"""Cables in space in a figure: their rooms, seen from a corner."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from dlo_casadi.report.canvas import BLACK, GREY
+from dlo_casadi.report.room import Mark, Room, seen
+
+FORCE = "#6A3D9A"
+_STYLES: dict[str, dict[str, Any]] = {
+    "grid": {"color": "#E3E3E3", "lw": 0.6},
+    "shadow": {"color": "#9AA5B1", "lw": 1.0},
+    "plumb": {"color": "#9AA5B1", "lw": 0.8, "ls": ":"},
+    "world": {"color": GREY, "lw": 0.9},
+    "weight": {"color": GREY, "lw": 0.9},
+    "force": {"color": FORCE, "lw": 1.2},
+    "axis-x": {"color": "#D0103A", "lw": 1.2},
+    "axis-y": {"color": "#00805A", "lw": 1.2},
+    "axis-z": {"color": "#3A3AD6", "lw": 1.2},
+    "fixture start": {"color": BLACK, "marker": "s", "ms": 3, "markevery": [0]},
+    "fixture end": {"color": BLACK, "marker": "o", "ms": 3, "markevery": [0]},
+}
+
+
+def draw_marks(axes: Axes, marks: Iterable[Mark]) -> None:
+    """Draw what stands in a room, in millimetres."""
+    for mark in marks:
+        points = seen(mark.points)
+        if mark.label:
+            axes.text(
+                points[0, 0],
+                points[0, 1],
+                mark.label,
+                color=GREY,
+                fontsize=7,
+                ha="center",
+                va="center",
+            )
+        elif mark.kind in _STYLES:
+            axes.plot(*points.T, **_STYLES[mark.kind])
+
+
+def frame_room(axes: Axes, room: Room) -> None:
+    """Show all of a room, without ticks: the floor's squares tell its size."""
+    width, height = room.window / 2
+    axes.set(xlim=(-width, width), ylim=(-height, height), xticks=[], yticks=[])
+    axes.grid(visible=False)
+    axes.set_aspect("equal")
