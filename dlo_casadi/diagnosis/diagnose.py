@@ -413,7 +413,14 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
     modes included; where something is, the noise is too large and the significance too low.
     """
     try:
-        noise, rest_scatter = errors_of(closed.problem, closed.point, closed.linearization, modes=0)
+        noise, rest_scatter = errors_of(
+            closed.problem,
+            closed.point,
+            closed.linearization,
+            modes=0,
+            estimated=not closed.noise.known,
+            repeats=closed.problem.rest_scatter.std == 0,
+        )
     except EstimationError:  # with the effect hardly a point is left over: nothing is shown
         return 1.0
     rough, scatter = open_.problem.roughness_std, open_.problem.scatter

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from dlo_casadi.equilibrium import Equilibrium, Pose
 from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_of
+from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
@@ -90,8 +90,7 @@ def spread_across(
     scatter = np.array([uncertainty.scatter.get(name, 0.0) for name in model.deviations])
     variance += ((own * np.where(np.isfinite(scatter), scatter, 0.0)) ** 2).sum(axis=2)
     if uncertainty.rest_scatter.std > 0:
-        modes = modes_of(model.chain.cells, model.cable.length)
-        modes = np.kron(np.eye(len(model.node.curvatures)), modes)
+        modes = modes_in(model)
         hanging = sweep.observe(shapes, p, rest, sweep.by_rest(shapes, p, rest, modes))
         sizes = np.tile(uncertainty.rest_scatter.sizes, modes.shape[1] // MODES)
         variance += ((across(hanging.slopes[0]) * sizes) ** 2).sum(axis=2)

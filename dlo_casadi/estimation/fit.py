@@ -167,7 +167,7 @@ def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )
-    problem, point, converged = refine(problem, best, estimate=not problem.noise.known)
+    problem, point, converged = refine(problem, best, estimate=not problem.noise.known, first=True)
     return Fit(problem, point, converged)
 
 

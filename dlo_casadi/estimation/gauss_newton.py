@@ -25,7 +25,7 @@ from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_of
+from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -232,10 +232,8 @@ class BatchProblem:
         self, theta: FloatArray, shapes: Shapes, feet: Sequence[FloatArray]
     ) -> list[FloatArray]:
         """Change (R_j, axes MODES) of the fitted residuals by rest curvatures of the poses' own."""
-        p, rest, model = self.unknowns.p(theta), self.unknowns.rest(theta), self.unknowns.model
-        modes = modes_of(model.chain.cells, model.cable.length)
-        modes = np.kron(np.eye(len(model.node.curvatures)), modes)
-        along = self.sweep.by_rest(shapes, p, rest, modes)
+        p, rest = self.unknowns.p(theta), self.unknowns.rest(theta)
+        along = self.sweep.by_rest(shapes, p, rest, modes_in(self.unknowns.model))
         seen = self.sweep.observe(shapes, p, rest, along)
         return [
             self.measured[j].residual_along(

@@ -60,23 +60,31 @@ def refine(
     estimate: bool,
     rounds: int = 3,
     modes: int = SMOOTH_MODES,
+    first: bool = False,
 ) -> tuple[BatchProblem, Point, bool]:
     """Alternate between the fit, the noise, the roughness of the rest curvature and the scatter.
 
     Roughness and scatter (how much the poses' ends differ from one another, within the
     tolerances) maximise the marginal likelihood (MacKay's fixed point).
 
+    Parameters
+    ----------
+    first : bool
+        Whether it is not known yet if the cable comes back to the same shape.
+
     References
     ----------
     MacKay, Neural Computation 4 (1992).
     """
+    repeats = problem.rest_scatter.std == 0 and not first
     point, converged = problem.descend(point, tolerance=1e-2)
     for round_ in range(rounds):
         lin = problem.linearize(point)
         noise, rest = problem.noise, problem.rest_scatter
         if round_ < 2:
-            estimated = estimate
-            noise, rest = errors_of(problem, point, lin, modes, estimated=estimated)
+            noise, rest = errors_of(
+                problem, point, lin, modes, estimated=estimate, repeats=repeats
+            )
         roughness = roughness_of(problem, point, lin)
         scatter = scatter_of(problem, point, lin)
         ends = np.isfinite(scatter)
@@ -103,7 +111,8 @@ def errors_of(
     lin: Linearization,
     modes: int = SMOOTH_MODES,
     *,
-    estimated: bool = True,
+    estimated: bool,
+    repeats: bool,
 ) -> tuple[NoiseModel, RestScatter]:
     """Noise of the points and rest curvature of each hanging's own, from the residuals.
 
@@ -115,6 +124,9 @@ def errors_of(
     ----------
     estimated : bool
         Whether the noise is; else it is taken as it is.
+    repeats : bool
+        Whether the cable does. It is a property of the specimen: a scatter that is not there in the
+        declared model, but once an effect has been added, is what that effect does not explain.
 
     Raises
     ------
@@ -131,6 +143,8 @@ def errors_of(
                 break
         else:
             noise, together = _white_noise(problem, point), True
+    if repeats:
+        return noise, RestScatter()
     found = rest_scatter_of(problem, point, lin, noise)
     return replace(noise, std=found.noise * noise.std) if together else noise, found.rest
 

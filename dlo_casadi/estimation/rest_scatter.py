@@ -29,6 +29,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from dlo_casadi.model import CableModel
+
 FloatArray = NDArray[np.floating]
 
 # Cosines of a rest curvature, and its correlation lengths that are tried, shares of L.
@@ -74,6 +76,12 @@ def modes_of(cells: FloatArray, length: float) -> FloatArray:
     primitive = np.sin(np.pi / length * np.multiply.outer(cells, k)) * length / (k * np.pi)
     waves = (primitive[:, 1] - primitive[:, 0]) / (cells[:, 1] - cells[:, 0])[:, None]
     return np.column_stack([np.ones(len(cells)), np.sqrt(2.0) * waves])
+
+
+def modes_in(model: CableModel) -> FloatArray:
+    """The same as rest curvatures of a model's cells, axis by axis: (n_rests, axes MODES)."""
+    axes = np.eye(len(model.node.strains))[:, -len(model.node.curvatures) :]
+    return np.kron(axes, modes_of(model.chain.cells, model.cable.length))
 
 
 def _shares(smoothness: float) -> FloatArray:
