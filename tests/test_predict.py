@@ -234,6 +234,9 @@ def test_the_command_takes_what_the_function_takes(loom, capsys):
     assert "end_heading" not in printed
     assert main(["predict", str(loom), *asked]) == 0
     assert "moment of the cable on its end" in capsys.readouterr().out
+    table = ["shape-table", str(loom), "--list", "ends.csv", "--output", "table.parquet"]
+    assert main(table) == 2
+    assert "is in space: tables hold shapes in a plane" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

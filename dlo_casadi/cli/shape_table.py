@@ -65,9 +65,14 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print the counts as JSON")
     chosen = parser.parse_args(plain_numbers(argv))
 
-    parquet_library()
     cable = load_parameters(chosen.parameters)
     model, p, rest, metadata = cable
+    if model.in_space:
+        raise DloError(
+            f"{model.cable.name!r} is in space: tables hold shapes in a plane.\n"
+            "  Try: dlo predict, or dlo generate-solver for many shapes"
+        )
+    parquet_library()
     if chosen.elements or chosen.element:
         if model.has_state:
             raise DloError("the state of a drifting cable belongs to the fit's own elements")

@@ -2,6 +2,7 @@
 
 from dlo_casadi.codegen.compiled import CompiledSolver, CompiledSpaceSolver
 from dlo_casadi.codegen.generate import Solver, generate
+from dlo_casadi.codegen.obstacles import Capsule, Gap, HalfSpace
 from dlo_casadi.codegen.shapes import (
     STATUSES,
     Shape,
@@ -13,8 +14,11 @@ from dlo_casadi.codegen.shapes import (
 
 __all__ = [
     "STATUSES",
+    "Capsule",
     "CompiledSolver",
     "CompiledSpaceSolver",
+    "Gap",
+    "HalfSpace",
     "Shape",
     "ShapePath",
     "Slope",

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.library import compile_library
+from dlo_casadi.codegen.obstacles import Gap, HalfSpace, Obstacle
 from dlo_casadi.codegen.poses import (
     branch_number,
     frame_poses,
@@ -79,6 +80,27 @@ def slope_record(model: CableModel) -> np.dtype[Any]:
     )
 
 
+def obstacle_record(model: CableModel) -> np.dtype[Any]:
+    """Layout of the C solver's dlo_obstacle."""
+    place = (float, model.node.dimension)
+    fields: dict[str, Any] = {"kind": np.intc, "a": place, "b": place, "radius": float}
+    return np.dtype({"names": list(fields), "formats": list(fields.values())}, align=True)
+
+
+def gap_record(model: CableModel) -> np.dtype[Any]:
+    """Layout of the C solver's dlo_gap."""
+    d = model.node.dimension
+    fields: dict[str, Any] = {
+        "distance": float,
+        "place": float,
+        "point": (float, d),
+        "normal": (float, d),
+        "gradient": (float, 12 if model.in_space else 4),
+        "obstacle": np.uintp,
+    }
+    return np.dtype({"names": list(fields), "formats": list(fields.values())}, align=True)
+
+
 class _Compiled(Generic[S]):
     """The generated C of a model, compiled; see `CompiledSolver` and `CompiledSpaceSolver`."""
 
@@ -105,6 +127,7 @@ class _Compiled(Generic[S]):
         self._c.dlo_solve.argtypes = [pointer, integer, pointer, pointer, *tail]
         self._c.dlo_step.argtypes = [pointer, pointer, integer, pointer, *tail]
         self._c.dlo_sensitivity.argtypes = [pointer, pointer, pointer, *tail]
+        self._c.dlo_clearance.argtypes = [pointer, pointer, size, pointer, pointer]
         self._c.dlo_batch.argtypes = [pointer, size, integer, pointer, pointer, *tail]
         self._c.dlo_path.argtypes = [
             *(pointer, size, integer, pointer, pointer, pointer, pointer),
@@ -199,6 +222,51 @@ class _Compiled(Generic[S]):
         del kept
         shapes = tuple(self._read(record, int(k)) for record, k in zip(out, statuses, strict=True))
         return ShapePath(shapes, jump.value if jump.value < len(poses) else None)
+
+    def clearance(
+        self, shape: S, obstacles: Sequence[Obstacle], slope: Slope | SpaceSlope | None = None
+    ) -> Gap:
+        """Where the cable comes nearest to obstacles, and how far it is from them.
+
+        Parameters
+        ----------
+        obstacles : sequence of Obstacle, at least one
+        slope : as of `sensitivity`, optional
+            For the gradient.
+
+        Raises
+        ------
+        DloError
+            If there is no obstacle, or a number is not finite.
+        """
+        record = np.zeros(1, self.record)
+        record["points"], record[self._state] = shape.points, getattr(shape, self._state)
+        given = np.zeros(len(obstacles), obstacle_record(self.model))
+        for row, obstacle in zip(given, obstacles, strict=True):
+            row["kind"], row["radius"] = isinstance(obstacle, HalfSpace), obstacle.radius
+            row["a"], row["b"] = obstacle.ends
+        along = np.zeros(1, self._slope)
+        for name in self._slope.names or () if slope else ():
+            along[name] = getattr(slope, name)
+        out = np.zeros(1, gap_record(self.model))
+        status = self._c.dlo_clearance(
+            record.ctypes.data,
+            given.ctypes.data,
+            len(given),
+            along.ctypes.data if slope else None,
+            out.ctypes.data,
+        )
+        if status:
+            raise DloError(f"no clearance ({STATUSES[status]}): {len(obstacles)} obstacles given")
+        found = out[0]
+        return Gap(
+            float(found["distance"]),
+            float(found["place"]),
+            found["point"].copy(),
+            found["normal"].copy(),
+            found["gradient"].copy(),
+            int(found["obstacle"]),
+        )
 
     def _derived(self, shape: S, pose: FloatArray) -> Any:
         record, address = self._warm(shape)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi import __version__
 from dlo_casadi.codegen import plane, space
+from dlo_casadi.codegen.kernels import c_number
 from dlo_casadi.codegen.prefix import check_prefix
 from dlo_casadi.durable import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.effects import MeasurementEffect, StateEffect
@@ -116,6 +117,7 @@ def _values(model: CableModel, prefix: str, digest: str) -> dict[str, str]:
         "START_CLAMPED": str(clamped["start"]),
         "END_CLAMPED": str(clamped["end"]),
         "END_FREE": str(int(model.end == "free")),
+        "RADIUS": c_number(model.cable.diameter / 2),
         "ELASTIC": str(int(model.yields)),
     }
 
@@ -190,7 +192,8 @@ def generate(
     own, kind = (space, "space") if model.in_space else (plane, "plane")
     values = _values(model, prefix, digest) | own.values(model, p, rest, inline)
     texts = {**own.TEXTS, "TYPES": _template(f"{kind}_types.h.in").rstrip()}
-    parts = (f"{kind}.c.in", f"{kind}_guesses.c.in", f"{kind}_shape.c.in", "interface.c.in")
+    own_parts = [f"{kind}{part}.c.in" for part in ("", "_guesses", "_shape")]
+    parts = [*own_parts, "clearance.c.in", "interface.c.in"]
     source = "".join(_template(name) for name in parts)
     names = {
         f"{prefix}_solver.h": "solver.h.in",

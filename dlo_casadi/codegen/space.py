@@ -31,6 +31,7 @@ LEAST_COARSE, COARSENING = 4, 3
 TEXTS = {
     "WHERE": "in space",
     "ANGLES": """Vectors are in world axes, orientations are unit quaternions (x, y, z, w).""",
+    "COLUMNS": "12",
     "NODES": "",
     "START_FRAME": "start_orientation",
     "END_FRAME": "end_orientation",

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -41,6 +42,7 @@ from dlo_casadi.report.geometry import (
 )
 from dlo_casadi.report.overlay import write_overlays
 from dlo_casadi.report.room import Room, around, rooms, seen
+from dlo_casadi.report.scene import pull_marks, scene_of
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 
 FloatArray = NDArray[np.floating]
@@ -457,32 +459,16 @@ def draw_unexplained(path: Path, outcome: Outcome) -> None:
     """Where the cable is pulled, and how, in each fit pose."""
     load = outcome.unexplained
     assert load is not None
-    names = load.get("poses") or [
-        pose.name for pose in outcome.poses if pose.role == "fit" and len(pose.points)
-    ]
-    length = outcome.config.cable.length
-    forces = np.array(load["force_per_pose"], dtype=float).reshape(-1, 2)
-    reach = 0.25 * length / max(float(np.hypot(*forces.T).max(initial=0.0)), 1e-12)
     with figure(path, (8.5, 7.0)) as drawing:
         axes = drawing.subplots()
-        for name, force in zip(names, forces, strict=False):
-            line = measured_line(outcome, name)
-            if line is None:
-                continue
-            places, points = line
-            axes.plot(*points.T, color=SKY, lw=1.2)
-            pulled = np.linspace(load["interval_95"][0], load["interval_95"][1], 9)
-            part = [np.interp(pulled, places, points[:, i]) for i in (0, 1)]
-            axes.plot(*part, color=GREEN, lw=5, solid_capstyle="butt")
-            root = [np.interp(load["position"], places, points[:, i]) for i in (0, 1)]
-            tip = [root[i] + reach * force[i] for i in (0, 1)]
-            arrow = {"arrowstyle": "-|>", "color": VERMILLION, "lw": 1.6}
-            axes.annotate("", xy=(tip[0], tip[1]), xytext=(root[0], root[1]), arrowprops=arrow)
-            axes.plot(*tip, alpha=0)  # an annotation does not count for the axes' limits
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set(xlabel="x [m]", ylabel="y [m]")
+        if outcome.config.experiment.in_space:
+            room, under = scene_of(outcome)
+            draw_marks(axes, [*under, *pull_marks(outcome, room)])
+            frame_room(axes, room)
+        else:
+            _draw_pull(axes, outcome, load)
         low, high = load["interval_95"]
-        size = float(np.hypot(*np.array(load["force"], dtype=float)))
+        size = math.hypot(*load["force"])
         handles = [
             Line2D([], [], color=SKY, label="fit poses"),
             Line2D([], [], color=GREEN, lw=4, label=f"pulled at {low:.3f} to {high:.3f} m (95 %)"),
@@ -494,3 +480,28 @@ def draw_unexplained(path: Path, outcome: Outcome) -> None:
             "model",
             fontsize=12,
         )
+
+
+def _draw_pull(axes: Axes, outcome: Outcome, load: dict[str, Any]) -> None:
+    names = load.get("poses") or [
+        pose.name for pose in outcome.poses if pose.role == "fit" and len(pose.points)
+    ]
+    length = outcome.config.cable.length
+    forces = np.array(load["force_per_pose"], dtype=float).reshape(-1, 2)
+    reach = 0.25 * length / max(float(np.hypot(*forces.T).max(initial=0.0)), 1e-12)
+    for name, force in zip(names, forces, strict=False):
+        line = measured_line(outcome, name)
+        if line is None:
+            continue
+        places, points = line
+        axes.plot(*points.T, color=SKY, lw=1.2)
+        pulled = np.linspace(load["interval_95"][0], load["interval_95"][1], 9)
+        part = [np.interp(pulled, places, points[:, i]) for i in (0, 1)]
+        axes.plot(*part, color=GREEN, lw=5, solid_capstyle="butt")
+        root = [np.interp(load["position"], places, points[:, i]) for i in (0, 1)]
+        tip = [root[i] + reach * force[i] for i in (0, 1)]
+        arrow = {"arrowstyle": "-|>", "color": VERMILLION, "lw": 1.6}
+        axes.annotate("", xy=(tip[0], tip[1]), xytext=(root[0], root[1]), arrowprops=arrow)
+        axes.plot(*tip, alpha=0)  # an annotation does not count for the axes' limits
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="x [m]", ylabel="y [m]")

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from dlo_casadi.report.canvas import BLACK, GREY
+from dlo_casadi.report.canvas import BLACK, GREEN, GREY, SKY, VERMILLION
 from dlo_casadi.report.room import Mark, Room, seen
 
 FORCE = "#6A3D9A"
@@ -18,6 +18,9 @@ _STYLES: dict[str, dict[str, Any]] = {
     "world": {"color": GREY, "lw": 0.9},
     "weight": {"color": GREY, "lw": 0.9},
     "force": {"color": FORCE, "lw": 1.2},
+    "taken": {"color": SKY, "lw": 1.2},
+    "pulled": {"color": GREEN, "lw": 5, "solid_capstyle": "butt"},
+    "pull": {"color": VERMILLION, "lw": 1.6},
     "axis-x": {"color": "#D0103A", "lw": 1.2},
     "axis-y": {"color": "#00805A", "lw": 1.2},
     "axis-z": {"color": "#3A3AD6", "lw": 1.2},

@@ -6,10 +6,15 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from dlo_casadi.report.canvas import BLACK, BLUE, PURPLE, label_of, styled
+from dlo_casadi.report.figures_room import draw_marks, frame_room
 from dlo_casadi.report.json_report import all_warnings
+from dlo_casadi.report.room import seen
+from dlo_casadi.report.scene import scene_of
 from dlo_casadi.report.terminal import (
     ON_BRANCH,
     describe,
@@ -18,6 +23,8 @@ from dlo_casadi.report.terminal import (
     verdict_lines,
 )
 from dlo_casadi.session.outcome import Outcome
+
+FloatArray = NDArray[np.floating]
 
 _POINTS = 40
 
@@ -45,22 +52,33 @@ def outcome_html(outcome: Outcome) -> str:
 def outcome_figure(outcome: Outcome) -> Figure:
     """All poses in one frame: measured points, and the shapes predicted from their ends alone."""
     stage = outcome.stages[-1]
+    in_space = outcome.config.experiment.in_space
     with styled((7.0, 5.0)) as drawing:
         axes = drawing.subplots()
+        room = scene_of(outcome)[0] if in_space else None
+        if room is not None:
+            draw_marks(axes, room.ground())
+
+        def place(points: FloatArray) -> FloatArray:
+            return points if room is None else seen(room.points(points))
+
         for pose in outcome.poses:
             color = PURPLE if pose.role == "held_out" else BLUE
             shape = stage.shapes.get(pose.name)
             if shape is not None:
-                axes.plot(*shape.curve.T, color=color, lw=1.4)
+                axes.plot(*place(shape.curve).T, color=color, lw=1.4)
             if len(pose.points):
                 shown = pose.points[:: max(1, len(pose.points) // _POINTS)]
-                axes.plot(*shown.T, ".", color=BLACK, ms=2.5)
+                axes.plot(*place(shown).T, ".", color=BLACK, ms=2.5)
         axes.plot([], [], ".", color=BLACK, label="measured")
         axes.plot([], [], color=BLUE, label=label_of(stage, outcome))
         if any(pose.role == "held_out" for pose in outcome.poses):
             axes.plot([], [], color=PURPLE, label="held out of the fit")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set(xlabel="x [m]", ylabel="y [m]")
+        if room is not None:
+            frame_room(axes, room)
+        else:
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.set(xlabel="x [m]", ylabel="y [m]")
         errors = ", ".join(f"{row[0]} {row[1]}" for row in _errors(outcome)[:2])
         axes.set_title(f"{outcome.config.cable.name}: {errors}")
         drawing.legend(loc="outside lower center", ncols=3)

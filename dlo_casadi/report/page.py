@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 
 from dlo_casadi.report.page_charts import charts
 from dlo_casadi.report.page_data import page_data
-from dlo_casadi.report.page_pictures import pictures
+from dlo_casadi.report.page_pictures import pictures, scene_pictures
 from dlo_casadi.report.room import VIEWS
 from dlo_casadi.report.terminal import vector
 from dlo_casadi.session.outcome import Outcome
@@ -36,6 +36,7 @@ def report_page(outcome: Outcome) -> str:
         outcome.config.experiment.in_space,
         pictures=drawn,
         room=drawn[0].room,
+        scenes=scene_pictures(outcome),
         charts={name: as_data(text) for name, text in charts(outcome).items()},
         **page_data(outcome),
     )

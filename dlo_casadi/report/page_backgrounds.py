@@ -105,7 +105,7 @@ def backgrounds(
         Whose predictions a board or a room must hold beside the measured lines.
     """
     if config.experiment.in_space:
-        return [_in_room(room) for room in rooms(config, poses, stages)]
+        return [in_room(room) for room in rooms(config, poses, stages)]
     files = {pose.name: pose.file for pose in config.experiment.poses}
     photographed = config.experiment.measurement.kind == "images"
     budget = PHOTOGRAPHS // max(1, len(poses))
@@ -166,7 +166,8 @@ def flat(points: FloatArray) -> FloatArray:
     return seen(points) * [1.0, -1.0]
 
 
-def _in_room(room: Room) -> Background:
+def in_room(room: Room) -> Background:
+    """A room as it is seen at first."""
     low, size = -room.window / 2, room.window
     whole = (float(low[0]), float(low[1]), float(size[0]), float(size[1]))
     return Background(whole, lambda points: flat(room.points(points)), room=room)

@@ -42,9 +42,10 @@ def charts(outcome: Outcome) -> dict[str, str]:
         drawn["chart-poses"] = poses_chart(outcome)
         drawn["chart-residuals"] = residuals_chart(outcome)
         drawn["chart-rest"] = rest_chart(outcome)
-    if outcome.next_pose is not None:
+    in_space = outcome.config.experiment.in_space  # there the board is a room, and no chart
+    if outcome.next_pose is not None and not in_space:
         drawn["chart-next"] = next_pose_chart(outcome)
-    if outcome.unexplained is not None:
+    if outcome.unexplained is not None and not in_space:
         drawn["chart-pull"] = pull_chart(outcome)
     return {name: json.dumps(json_item(model)) for name, model in drawn.items()}
 

@@ -18,8 +18,9 @@ from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.report.canvas import before_after, label_of, millimetres
 from dlo_casadi.report.geometry import beside
-from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds, flat
+from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds, flat, in_room
 from dlo_casadi.report.room import Mark, Room, around
+from dlo_casadi.report.scene import next_marks, pull_marks, scene_of
 from dlo_casadi.report.terminal import branch_text
 from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape
 
@@ -106,6 +107,30 @@ def pictures(outcome: Outcome) -> list[Picture]:
     stages = [stage for stage in before_after(outcome) if stage is not None]
     behind = backgrounds(outcome.config, outcome.poses, stages)
     return [_picture(outcome, pose, b) for pose, b in zip(outcome.poses, behind, strict=True)]
+
+
+def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
+    """Pictures of all poses in one room: "pull", "next"; none in a plane."""
+    said = {
+        "pull": ("with the pull as an arrow in each pose", outcome.unexplained, pull_marks),
+        "next": ("with the proposed end", outcome.next_pose, next_marks),
+    }
+    shown = {key: value for key, value in said.items() if value[1] is not None}
+    if not outcome.config.experiment.in_space or not shown:
+        return {}
+    room, under = scene_of(outcome)
+    return {
+        key: Picture(
+            name=key,
+            role="fit",
+            alt=f"Measured cables in space, {text}",
+            box=in_room(room).whole,
+            whole=in_room(room).whole,
+            room=room,
+            under=tuple(map(_drawn, [*under, *marks(outcome, room)])),
+        )
+        for key, (text, _, marks) in shown.items()
+    }
 
 
 def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Picture]:

@@ -203,20 +203,45 @@ def upright(gravity: Sequence[float]) -> FloatArray:
 
 def rooms(config: Config, poses: Sequence[PoseInput], stages: Sequence[Stage]) -> list[Room]:
     """A room for each pose of a session, all of one size; the last stage's forces are drawn."""
+    forces = [shape.forces for stage in stages[-1:] for shape in stage.shapes.values()]
+    lines = [
+        [
+            pose.points,
+            *(stage.shapes[pose.name].curve for stage in stages if pose.name in stage.shapes),
+        ]
+        for pose in poses
+    ]
+    drawn = [
+        np.concatenate([*own, _held(config, pose.name)])
+        for own, pose in zip(lines, poses, strict=True)
+    ]
+    return _rooms(config, drawn, np.concatenate([np.zeros((0, 3)), *forces]))
+
+
+def common_room(
+    config: Config, poses: Sequence[PoseInput], places: Sequence[FloatArray], forces: FloatArray
+) -> Room:
+    """One room about all measured poses and other places (K, 3) [m], for forces (K, 3) [N]."""
+    held = [_held(config, pose.name) for pose in config.experiment.poses]
+    drawn = np.concatenate([*(pose.points for pose in poses), *held, *places])
+    return _rooms(config, [drawn], forces)[0]
+
+
+def _held(config: Config, name: str) -> FloatArray:
+    """Where the ends of a pose are held (1 or 2, 3) [m]."""
+    pose = next(pose for pose in config.experiment.poses if pose.name == name)
+    return np.array([point for point in (pose.start, pose.end) if point is not None])
+
+
+def _rooms(config: Config, drawn: Sequence[FloatArray], forces: FloatArray) -> list[Room]:
+    """Rooms of one size about points (K, 3) [m], for forces (K, 3) [N]."""
     length = _MM * config.cable.length
     directions = upright(config.experiment.gravity)
-    forces = [shape.forces for stage in stages[-1:] for shape in stage.shapes.values()]
-    largest = max([float(np.linalg.norm(pair, axis=1).max()) for pair in forces], default=0.0)
+    largest = float(np.linalg.norm(forces, axis=1).max(initial=0.0))
     newton = _ARROW * length / largest if largest > 0 else 0.0
-    declared = {pose.name: pose for pose in config.experiment.poses}
-    drawn = []
-    for pose in poses:
-        held = [declared[pose.name].start, declared[pose.name].end]
-        ends = np.array([point for point in held if point is not None])
-        own = [stage.shapes[pose.name].curve for stage in stages if pose.name in stage.shapes]
-        drawn.append(_MM * np.concatenate([pose.points, ends, *own]) @ directions.T)
-    middles = [(points.min(axis=0) + points.max(axis=0)) / 2 for points in drawn]
-    away = [np.linalg.norm(x - c, axis=1).max() for x, c in zip(drawn, middles, strict=True)]
+    standing = [_MM * points @ directions.T for points in drawn]
+    middles = [(points.min(axis=0) + points.max(axis=0)) / 2 for points in standing]
+    away = [np.linalg.norm(x - c, axis=1).max() for x, c in zip(standing, middles, strict=True)]
     radius = float(max(away)) + _ARROW * length
     return [
         Room(
@@ -227,5 +252,5 @@ def rooms(config: Config, poses: Sequence[PoseInput], stages: Sequence[Stage]) -
             length,
             newton,
         )
-        for points, middle in zip(drawn, middles, strict=True)
+        for points, middle in zip(standing, middles, strict=True)
     ]

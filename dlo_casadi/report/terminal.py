@@ -167,6 +167,7 @@ def footnotes(outcome: Outcome) -> list[str]:
     """What the table of parameters needs to be read rightly."""
     lines = []
     stiffness = outcome.stages[-1].parameters.get("bending_stiffness")
+    twisting = outcome.stages[-1].parameters.get("torsional_stiffness")
     if stiffness is not None and stiffness.identifiable is False:
         bound = unidentified(stiffness)
         known = f"EI {bound}" if bound[0] in "<>" else f"EI: {bound}"
@@ -176,8 +177,14 @@ def footnotes(outcome: Outcome) -> list[str]:
             "hang a known weight on the cable and declare it under model.effects."
         )
     elif stiffness is not None:
+        known = "EI is" if twisting is None else "EI and GJ are"
         lines.append(
-            "Shapes give the ratio of stiffness to weight: EI is as good as the declared mass."
+            f"Shapes give the ratio of stiffness to weight: {known} as good as the declared mass."
+        )
+    if twisting is not None and twisting.identifiable is False:
+        lines.append(
+            "GJ is not identifiable from these shapes. Try: poses that twist the cable, with the "
+            "end clamp rolled by up to half a turn."
         )
     return lines
 

@@ -16,7 +16,17 @@ def small(name):
 
 def photographs(names):
     """Configuration of a quick run of a few photographs of configs/cable.yaml."""
-    config = load_config(CONFIGS / "cable.yaml")
+    return some("cable", names)
+
+
+def in_space(names):
+    """Configuration of a quick run of a few poses of configs/markers_in_space.yaml."""
+    return some("markers_in_space", names)
+
+
+def some(session, names):
+    """Configuration of a quick run of a few poses of a session in configs."""
+    config = load_config(CONFIGS / f"{session}.yaml")
     poses = tuple(pose for pose in config.experiment.poses if pose.name in names)
     experiment = config.experiment.model_copy(update={"poses": poses})
     return quick(replace(config, experiment=experiment))

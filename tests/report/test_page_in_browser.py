@@ -14,6 +14,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 from test_figures import LOAD
 from test_page import HOSTILE, diagnosed, hostile
+from test_room import in_room_pulled
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.report.geometry import beside
@@ -25,11 +26,11 @@ pytestmark = pytest.mark.skipif(
     BROWSER is None or DRIVER is None, reason="needs chromium and chromium-driver"
 )
 WIDTHS = [390, 1440]  # px, a phone and a large screen
-PAGES = ["photographs", "centerlines", "failed"]
+PAGES = ["photographs", "centerlines", "failed", "space", "failed in space"]
 
 
 @pytest.fixture(scope="module")
-def pages(photographed, outcome, tmp_path_factory):
+def pages(photographed, outcome, in_room, tmp_path_factory):
     """A page of each kind, as files."""
     folder = tmp_path_factory.mktemp("pages")
     lost = replace(
@@ -45,6 +46,8 @@ def pages(photographed, outcome, tmp_path_factory):
         "failed": failure_page(
             photographed.config, DloError("nothing fits"), (lost, *photographed.poses[1:])
         ),
+        "space": report_page(in_room_pulled(in_room)),
+        "failed in space": failure_page(in_room.config, DloError("nothing fits"), in_room.poses),
         "hostile": report_page(hostile(outcome)),
     }
     for name, text in texts.items():
@@ -127,7 +130,7 @@ def test_nothing_is_wider_than_the_screen(visit, name, width):
     assert browser.execute_script(wide) <= 0
 
 
-@pytest.mark.parametrize("name", ["photographs", "centerlines"])
+@pytest.mark.parametrize("name", ["photographs", "centerlines", "space"])
 def test_every_chart_is_drawn(visit, name):
     browser = visit(name)
     ink = """
@@ -297,3 +300,51 @@ def test_charts_fit_the_paper_they_are_printed_on(visit):
     assert max(wide) > 1000  # px; between the margins of A4 there are 688
     assert max(np.multiply(wide, zoom)) <= 681
     assert set(after) == {""}
+
+
+def points_of(browser, selector):
+    text = find(browser, selector).get_dom_attribute("points")
+    return np.array([pair.split(",") for pair in text.split()], dtype=float)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_a_drag_turns_all_rooms_and_enlarges_none(visit, width):
+    browser = visit("space", width)
+    before = [points_of(browser, f"#after-{k}") for k in (0, 1)]
+    pull = points_of(browser, ".scene .pull")
+    room = find(browser, ".gallery .room")
+    chain = webdriver.ActionChains(browser).move_to_element(room).click_and_hold()
+    chain.move_by_offset(60, 0).release().perform()
+    wait(browser, "return document.querySelector('#after-0').dataset.whole !== undefined")
+
+    for k in (0, 1):
+        after = points_of(browser, f"#after-{k}")
+        assert np.abs(after - before[k]).max() > 10
+    assert find(browser, "#large").get_attribute("open") is None
+    assert np.abs(points_of(browser, ".scene .pull") - pull).max() > 1
+    find(browser, ".enlarge").click()
+    assert find(browser, "#large").get_attribute("open") is not None
+
+
+def test_rooms_are_seen_from_where_one_chooses(visit, in_room):
+    """From the front: world x to the right, height up; deviations are enlarged there, too."""
+    browser = visit("space")
+    find(browser, ".layers [data-view='-90.0 0.0']").click()
+    wait(browser, "return document.querySelector('#after-0').dataset.whole !== undefined")
+    pose = in_room.poses[0]
+    shown = points_of(browser, "#measured-0")
+    expected = 1e3 * pose.points[:, [0, 2]] * [1, -1]
+    assert np.diff(shown, axis=0) == pytest.approx(np.diff(expected, axis=0), abs=0.03)
+
+    find(browser, ".layers [value='10']").click()
+    tenfold = beside(pose, in_room.stage("batch").shapes[pose.name], 10.0)
+    moved = 1e3 * (tenfold - pose.points)[:, [0, 2]] * [1, -1]
+    assert points_of(browser, "#after-0") - shown == pytest.approx(moved, abs=0.2)
+
+
+def test_residuals_in_space_have_two_directions(visit, in_room):
+    browser = visit("space")
+    Select(find(browser, "#pose-choice")).select_by_visible_text("pose_01")
+    residual = in_room.stage("batch").shapes["pose_01"].residual / in_room.measurement.std
+    assert chosen(browser, "after") == pytest.approx(residual[:, 0], rel=1e-5, abs=1e-6)
+    assert chosen(browser, "after-z") == pytest.approx(residual[:, 1], rel=1e-5, abs=1e-6)

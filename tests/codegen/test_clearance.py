@@ -1,0 +1,115 @@
+"""Distances of the whole cable from obstacles, in a plane and in space."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.codegen import Capsule, CompiledSolver, CompiledSpaceSolver, HalfSpace
+from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.errors import DloError
+from dlo_casadi.model import CableModel
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+
+POSE = Pose(
+    (0.0, 0.0, 0.0),
+    (0.4, 0.1, 0.1),
+    start_orientation=(0.0, 0.0, 0.0, 1.0),
+    end_orientation=(0.2, 0.0, 0.0, 0.98),
+)
+BALL = Capsule((0.2, 0.3, -0.1), (0.2, 0.3, -0.1), 0.05)
+ROD = Capsule((0.1, -0.2, -0.2), (0.3, -0.2, 0.2), 0.02)
+FLOOR = HalfSpace((0.0, 0.0, -0.3), (0.0, 0.0, 2.0))
+
+
+@pytest.fixture(scope="module")
+def space():
+    cable = Cable(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
+    model = CableModel(cable, 12, "quadratic", "clamped", "clamped", gravity=(0.0, 0.0, -9.81))
+    return CompiledSpaceSolver(model, model.nominal, np.zeros(model.chain.n_rests), flags=("-O0",))
+
+
+def fine(shape):
+    """Points of the axis, dense, from places and tangents at the nodes."""
+    from scipy.interpolate import CubicHermiteSpline
+
+    s = np.linspace(0.0, 0.6, len(shape.points))
+    tangents = Rotation.from_quat(shape.frames).apply([1.0, 0.0, 0.0])
+    return CubicHermiteSpline(s, shape.points, tangents)(np.linspace(0.0, 0.6, 20001))
+
+
+@pytest.mark.parametrize("obstacle", [BALL, ROD, FLOOR], ids=["ball", "rod", "floor"])
+def test_distance_is_that_of_many_points_and_its_gradient_central_differences(space, obstacle):
+    shape = space.solve(POSE)
+    gap = space.clearance(shape, [obstacle], space.sensitivity(shape, POSE))
+    points = fine(shape)
+    if isinstance(obstacle, HalfSpace):
+        away = points[:, 2] + 0.3
+    else:
+        a, b = np.array(obstacle.a), np.array(obstacle.b)
+        u = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
+        away = np.linalg.norm(points - a - u[:, None] * (b - a), axis=1) - obstacle.radius
+    assert gap.distance == pytest.approx(away.min() - 0.002, abs=1e-8)
+    assert np.linalg.norm(gap.normal) == pytest.approx(1.0)
+    step = 1e-5
+    for column in range(12):
+        ahead = []
+        for sign in (1, -1):
+            by = sign * step * np.eye(3)[column % 3]
+            side = ("start", "end")[column // 6]
+            name = side if column % 6 < 3 else f"{side}_orientation"
+            value = np.array(getattr(POSE, name))
+            if column % 6 < 3:
+                moved = value + by
+            else:
+                moved = (Rotation.from_rotvec(by) * Rotation.from_quat(value)).as_quat()
+            there = space.solve(replace(POSE, **{name: tuple(moved)}), warm=shape)
+            ahead.append(space.clearance(there, [obstacle]).distance)
+        expected = (ahead[0] - ahead[1]) / (2 * step)
+        assert gap.gradient[column] == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_nearest_of_many_obstacles_is_told_and_a_cut_is_negative(space):
+    shape = space.solve(POSE)
+    far = [space.clearance(shape, [one]).distance for one in (BALL, ROD, FLOOR)]
+    gap = space.clearance(shape, [BALL, ROD, FLOOR])
+    assert gap.obstacle == int(np.argmin(far))
+    assert gap.distance == min(far)
+    inside = Capsule(tuple(shape.points[6]), tuple(shape.points[6]), 0.05)
+    assert space.clearance(shape, [inside]).distance == pytest.approx(-0.052, abs=1e-7)
+    with pytest.raises(DloError, match="0 obstacles"):
+        space.clearance(shape, [])
+    with pytest.raises(DloError, match="not_finite"):
+        space.clearance(shape, [replace(BALL, radius=np.nan)])
+
+
+@pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
+def test_in_a_plane(element):
+    model = CableModel(Cable(0.8, 0.2, 0.01, 0.1), 12, element, "clamped", "pinned")
+    solver = CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells), flags=("-O0",))
+    pose = np.array([0.5, 0.1, 0.4])
+
+    def solved(at, warm=None):
+        return solver.solve(at[:2], headings=(at[2], 0.0), warm=warm)
+
+    shape = solved(pose)
+    slope = solver.sensitivity(shape, pose[:2], headings=(pose[2], 0.0))
+    ball, floor = Capsule((0.3, 0.4), (0.3, 0.4), 0.05), HalfSpace((0.0, -0.5), (0.0, 1.0))
+    for obstacle in (ball, floor):
+        gap = solver.clearance(shape, [obstacle], slope)
+        # Links are straight; a node is a place of the cable, but seldom the nearest one.
+        nodes = shape.points - np.array(obstacle.ends[0])
+        near = np.linalg.norm(nodes, axis=1) if obstacle is ball else nodes[:, 1]
+        assert gap.distance <= near.min() - obstacle.radius - 0.005 + 1e-12
+        assert gap.distance > near.min() - obstacle.radius - 0.005 - 0.01
+        for column in range(3):
+            by = 1e-6 * np.eye(3)[column]
+            ahead, behind = (
+                solver.clearance(solved(pose + sign * by, shape), [obstacle]).distance
+                for sign in (1, -1)
+            )
+            assert gap.gradient[column] == pytest.approx((ahead - behind) / 2e-6, abs=1e-5)
