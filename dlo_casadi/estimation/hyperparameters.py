@@ -82,9 +82,7 @@ def refine(
         lin = problem.linearize(point)
         noise, rest = problem.noise, problem.rest_scatter
         if round_ < 2:
-            noise, rest = errors_of(
-                problem, point, lin, modes, estimated=estimate, repeats=repeats
-            )
+            noise, rest = errors_of(problem, point, lin, modes, estimated=estimate, repeats=repeats)
         roughness = roughness_of(problem, point, lin)
         scatter = scatter_of(problem, point, lin)
         ends = np.isfinite(scatter)
