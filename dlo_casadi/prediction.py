@@ -17,6 +17,7 @@ from dlo_casadi.config import implausible_quaternion
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium import Branch, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.estimation.band import EDGE, spread_across
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.model import CableModel
 from dlo_casadi.report.drawing import prediction_figure
@@ -80,6 +81,16 @@ class PredictedShape:
     curve: CableCurve
     seen: CableCurve
 
+    def band(self, count: int = 101) -> FloatArray:
+        """Half width (count,) [m] of the band across the cable that holds 90 % of next hangings.
+
+        Uncertain parameters, scatter of the fixtures and how the cable repeats; first order.
+        """
+        model, p, rest, metadata = self.cable
+        s = np.linspace(0.0, self.curve.length, count)
+        std = spread_across(model, p, rest, self.pose, self.equilibrium, metadata.uncertainty, s)
+        return np.asarray(EDGE * np.linalg.norm(std, axis=1))
+
     def points(self, count: int = 101) -> FloatArray:
         """Points (count, d) [m] evenly spaced along the cable, from start to end.
 
@@ -135,6 +146,7 @@ class PredictedShape:
             "min_bend_radius": eq.min_bend_radius,
             "tipping": eq.tipping,
             "points": self.points(count).tolist(),
+            "band_90": self.band(count).tolist(),
         }
 
 

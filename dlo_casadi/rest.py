@@ -1,4 +1,4 @@
-"""Rest curvature on a basis of cubic B-splines: its number of unknowns does not grow with n."""
+"""Rest curvature on a basis of B-splines: its number of unknowns does not grow with n."""
 
 from __future__ import annotations
 
@@ -13,28 +13,32 @@ _DEGREE = 3
 
 @dataclass(frozen=True)
 class RestCurvature:
-    """kappa_0(s) = sum_k c_k B_k(s), clamped uniform cubic B-splines on [0, L].
+    """kappa_0(s) = sum_k c_k B_k(s), clamped uniform B-splines on [0, L].
+
+    They are cubic; with fewer than four coefficients a parabola, a line or a constant.
 
     Parameters
     ----------
     length : float [m]
     n_coefficients : int
-        0 = straight at rest; otherwise >= 4.
+        0 = straight at rest.
     """
 
     length: float
     n_coefficients: int
 
     @property
-    def _knots(self) -> NDArray[np.floating]:
-        inner = np.linspace(0.0, self.length, self.n_coefficients - _DEGREE + 1)
-        return np.concatenate([[0.0] * _DEGREE, inner, [self.length] * _DEGREE])
+    def _spline(self) -> BSpline:
+        degree = min(_DEGREE, self.n_coefficients - 1)
+        inner = np.linspace(0.0, self.length, self.n_coefficients - degree + 1)
+        knots = np.concatenate([[0.0] * degree, inner, [self.length] * degree])
+        return BSpline(knots, np.eye(self.n_coefficients), degree)
 
     def basis(self, s: NDArray[np.floating]) -> NDArray[np.floating]:
         """Values (len(s), n_coefficients) of the basis functions at arc lengths s [m]."""
         if self.n_coefficients == 0:
             return np.zeros((len(s), 0))
-        return BSpline(self._knots, np.eye(self.n_coefficients), _DEGREE)(s)
+        return self._spline(s)
 
     def cell_means(self, cells: NDArray[np.floating]) -> NDArray[np.floating]:
         """Means (n_cells, n_coefficients) of the basis functions over cells (n_cells, 2) [m].
@@ -44,7 +48,7 @@ class RestCurvature:
         """
         if self.n_coefficients == 0:
             return np.zeros((len(cells), 0))
-        primitive = BSpline(self._knots, np.eye(self.n_coefficients), _DEGREE).antiderivative()
+        primitive = self._spline.antiderivative()
         return (primitive(cells[:, 1]) - primitive(cells[:, 0])) / np.diff(cells, axis=1)
 
     @property

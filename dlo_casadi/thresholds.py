@@ -41,12 +41,17 @@ CLEARLY_WORSE = 2.0
 # Kass and Raftery 1995), whatever its cross-validated error.
 BIC_APART = 10.0
 
+# Different poses from which effects are told by how they change from pose to pose: two may differ
+# by chance, as two hangings of one do.
+DIFFERENT = 3
+
 # ---- what an explanation has to do -------------------------------------------------------------
 
-# Effects are no explanation if a pose that is left out is predicted worse than so many times the
-# noise, and than this share of what it was without them. Measured, a complete model's error is 0.9
-# and 1.1 times the noise (two sessions); without the effect it is 0.85 and 1.6 times where that is
-# small, and 3 to 41 times on the eight others.
+# A model is no explanation if a pose that is left out is predicted worse than so many times what
+# noise, fixtures, parameters and the cable's scatter let expect, and, with effects, than this share
+# of what it was without them. Measured, a complete model's error is 0.9 to 1.3 times (eight
+# sessions); without the effect it is 0.85 and 1.6 times where that is small, and 3 to 41 times on
+# the eight others.
 UNSEEN = 2.0
 UNSEEN_LEFT = 0.5
 # Of the mean square error that the declared model makes beyond the noise, what effects beside an
@@ -64,6 +69,7 @@ ALONG_GRAVITY = 2.0
 # Absolute correlation of two nuisances beyond which their effects on the shapes are one: either's
 # variance is then five times, 1 / (1 - 0.9^2), what it would be if the other were known.
 ALIKE = 0.9
+
 # Poses that repeat worse than this many times the noise limit every prediction. Noise alone gives
 # (simulated, white and correlated over 3 % of the length) 1.1 to 1.3 with five hangings, 1.4 to 1.6
 # with two, of which half may thus be flagged without need.

@@ -147,13 +147,11 @@ def test_a_cantilever_bends_out_of_its_plane_as_within():
     assert down[1] == pytest.approx(beam, rel=0.05)
 
 
-def test_turns_twist_the_cable_and_too_many_are_refused():
+def test_turns_twist_the_cable_either_way_alike():
     m = model(16)
-    place = pose((0.7, 0.0, 0.0))
     energies = [solved(m, pose((0.7, 0.0, 0.0), turns=turns)).energy for turns in (-1, 0, 1)]
     assert energies[0] == pytest.approx(energies[2], rel=1e-6)
     assert energies[1] < energies[2]
-    assert solved(m, place).twist_angle == pytest.approx(0.0, abs=1e-6)
 
 
 def test_derivatives_by_increments():

@@ -73,7 +73,7 @@ MARKER = Range(1.0e-4, 10.0, "m")
 MESH = Range(2, 2000, "elements")
 # Cubic splines need four coefficients. A line of 240 points has four between two knots of 64; the
 # covariance that a result holds grows with their square.
-REST_COEFFICIENTS = Range(4, 64, "coefficients")
+REST_COEFFICIENTS = Range(0, 64, "coefficients")
 
 
 def implausible_sizes(

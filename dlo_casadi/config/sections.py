@@ -446,7 +446,7 @@ class EstimationOptions(Section):
     rest_curvature_coefficients: (
         Annotated[Count, Field(ge=REST_COEFFICIENTS.least, le=REST_COEFFICIENTS.most)] | None
     ) = None
-    """Number of coefficients of the rest curvature; chosen from the data when absent."""
+    """Number of coefficients of the rest curvature, 0 for a straight one; chosen from the data."""
 
 
 class DiagnosisOptions(Section):

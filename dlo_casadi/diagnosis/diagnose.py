@@ -18,7 +18,6 @@ from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.equivalents import untried_equivalents
 from dlo_casadi.diagnosis.next_pose import NextPose, next_pose
 from dlo_casadi.diagnosis.pull import Pull, estimate_pull
-from dlo_casadi.diagnosis.repeatability import limiting_spread
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
 from dlo_casadi.diagnosis.structure import (
     Structure,
@@ -29,12 +28,14 @@ from dlo_casadi.diagnosis.structure import (
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.hyperparameters import noise_of, settle
+from dlo_casadi.estimation.hyperparameters import errors_of, settle
+from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
 from dlo_casadi.thresholds import (
     BIC_APART,
+    DIFFERENT,
     LEAST_NOISE_DEGREES,
     LEFT,
     REFITTED,
@@ -170,7 +171,7 @@ def diagnose(
         found = search.with_cause_of(pull, found)
     if found.unexplained and found.added:
         found = search.without_wrong_causes(found, pull)
-        if found.added or not fit.noise.known:
+        if found.added or not fit.errors_known:
             pull = estimate_pull(found.fit, search.executor)
     tried = {row.name for row in found.ranked}
     added = tuple(
@@ -248,10 +249,13 @@ class _Search:
         """Whether a pull may have a cause: in one pose a force fits as well as any."""
         return len(self.declared.problem.used) > 1 and self.max_effects > 0
 
-    @cached_property
+    @property
     def doubt(self) -> float | None:
-        """What a gain has to be held against where poses do not repeat; None where they do."""
-        return self.significance if limiting_spread(self.declared) is not None else None
+        """What a gain has to be held against where a pose or two were taken again and again."""
+        count = different_poses(self.declared.problem.history)
+        return (
+            self.significance if count < min(DIFFERENT, len(self.declared.problem.used)) else None
+        )
 
     @cached_property
     def first(self) -> list[Screened]:
@@ -293,7 +297,7 @@ class _Search:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = _corrected(single, len(screened))
             closed = settle(winner.fit)
-            if not self.declared.noise.known:
+            if not closed.errors_known:
                 again = _p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
             if p_value > self.significance:
@@ -336,9 +340,11 @@ class _Search:
         if not added and not fit.noise.known:
             fit = settle(fit)
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
-        limit = max(UNSEEN * fit.noise.std, UNSEEN_LEFT * self.error)
-        unpredicted = bool(added) and validation.rmse > limit
-        unexplained = structure.p_value < self.significance or unpredicted
+        limit = UNSEEN * fit.expected_error
+        if added:
+            limit = max(limit, UNSEEN_LEFT * self.error)
+        unpredicted = (bool(added) or self.several) and validation.rmse > limit
+        unexplained = structure.p_noise < self.significance or unpredicted
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
 
     def with_cause_of(self, pull: Pull | None, found: _Found) -> _Found:
@@ -356,7 +362,7 @@ class _Search:
         than LEFT of what it was: then what is missing beside them is small against what they
         explain. And all go if one force in each pose explains more than they do.
         """
-        floor = found.fit.noise.std**2 + found.fit.fixture_error**2
+        floor = found.fit.expected_error**2
         after, before = (max(x**2 - floor, 0.0) for x in (found.validation.rmse, self.error))
         if after <= LEFT * before and not self._needless(found, pull):
             return found
@@ -407,15 +413,23 @@ def _p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int)
     modes included; where something is, the noise is too large and the significance too low.
     """
     try:
-        noise = noise_of(closed.problem, closed.point, closed.linearization, modes=0)
+        noise, rest_scatter = errors_of(
+            closed.problem,
+            closed.point,
+            closed.linearization,
+            modes=0,
+            estimated=not closed.noise.known,
+            repeats=closed.problem.rest_scatter.std == 0,
+        )
     except EstimationError:  # with the effect hardly a point is left over: nothing is shown
         return 1.0
-    problem = open_.problem.changed(noise, open_.problem.roughness_std, open_.problem.scatter)
-    problem.refresh(open_.point.feet)
+    rough, scatter = open_.problem.roughness_std, open_.problem.scatter
+    larger = closed.problem.changed(noise, rough, scatter, rest_scatter)
+    larger.refresh(closed.point.theta, closed.point.shapes, closed.point.feet)
+    problem = open_.problem.changed(noise, rough, scatter, rest_scatter)
+    problem.share_metric(larger)
     point = problem.evaluate(open_.point.theta, open_.point.shapes, open_.point.feet)
     point, _ = problem.descend(point)
-    larger = closed.problem.changed(noise, open_.problem.roughness_std, open_.problem.scatter)
-    larger.refresh(closed.point.feet)
     other = larger.evaluate(closed.point.theta, closed.point.shapes, closed.point.feet)
     other, _ = larger.descend(other)
     gain = max(2 * (point.objective - other.objective), 0.0)
@@ -428,9 +442,9 @@ def _improving(
 ) -> list[Confirmed]:
     """Refits that improve both the fit and what it predicts.
 
-    Where the same pose does not repeat to the noise, scores count points as if they were
-    independent, and they are not. There whole poses alone decide: a gain as large must have less
-    than the probability `doubt` if poses that are left out are predicted no better (Student's t).
+    Hangings of one or two poses have in common whatever is wrong with their measurement. There
+    whole hangings decide: a gain as large must have less than the probability `doubt` if those
+    left out are predicted no better (Student's t).
     """
     out = []
     for item in tried:

@@ -149,11 +149,9 @@ class _Search:
         """Fit with the load held at the share of the length, then with its place free."""
         share, point = way
         problem = self.held_at(share)
-        problem.refresh(point.feet)
         held = Fit(problem, *problem.descend(point))
         found = self.base.problem.unknowns
         moving = self._problem(Unknowns(self.model, self.free, held.p, found.rest_free))
-        moving.share_metric(problem)
         theta = moving.unknowns.pack(held.p, held.coefficients)
         start = replace(held.point, theta=theta)
         return Fit(moving, *moving.descend(start, MOST_STEPS))
@@ -170,15 +168,9 @@ class _Search:
         )
 
     def _problem(self, unknowns: Unknowns) -> BatchProblem:
-        problem = self.base.problem
-        return BatchProblem(
-            unknowns,
-            problem.history,
-            problem.noise,
-            problem.tolerances,
-            problem.roughness_std,
-            pull_scatter(self.base),
-        )
+        problem = self.base.problem.of(unknowns, scatter=pull_scatter(self.base))
+        problem.share_metric(self.base.problem)
+        return problem
 
 
 def pull_scatter(base: Fit) -> FloatArray:

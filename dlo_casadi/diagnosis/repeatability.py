@@ -5,15 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.repeats import repeatability
+from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.thresholds import ALIKE, REPEATS
+from dlo_casadi.thresholds import ALIKE, DIFFERENT, REPEATS
 
 FloatArray = NDArray[np.floating]
 
 
 def limiting_spread(fit: Fit) -> float | None:
     """How badly the same pose repeats [m], where that is what limits a prediction, else None."""
+    if different_poses(fit.problem.history) >= DIFFERENT:
+        return None
     spread = repeatability(fit.problem.history, fit.model.cable.length)
     if spread is None or fit.noise.source == "repeats":
         return spread

@@ -101,7 +101,7 @@ class _Linearized:
             now = Observed(problem.curve_of(seen.z[j]), shapes.lam[j])
             change = ObservedChange(seen.slopes[j], along.lam[j])
             moved = problem.measured[j].residual_along(now, s, change)
-            self.lin.by_theta[k][:, columns] = problem.whitening(j, s) @ moved[:, : len(columns)]
+            self.lin.by_theta[k][:, columns] = problem.whitening(j) @ moved[:, : len(columns)]
 
 
 def with_springs(sweep: Sweep, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Shapes:
@@ -154,15 +154,7 @@ class Screen:
     def _linearized(self, p: FloatArray) -> _Linearized:
         problem = self.fit.problem
         unknowns = Unknowns(self.model, self.free, p, problem.unknowns.rest_free)
-        larger = BatchProblem(
-            unknowns,
-            problem.history,
-            problem.noise,
-            problem.tolerances,
-            problem.roughness_std,
-            problem.scatter,
-            self.sweep,
-        )
+        larger = problem.of(unknowns, sweep=self.sweep)
         self.sweep = larger.sweep
         larger.share_metric(problem)
         if self.shapes is None:

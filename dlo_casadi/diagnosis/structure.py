@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from dlo_casadi.diagnosis.screening import survival
+from dlo_casadi.estimation.hyperparameters import rest_scatter_of
 from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.thresholds import KEPT_INFORMATION, KEPT_VARIANCE, LEAST_NOISE_DEGREES
@@ -46,6 +47,9 @@ class Structure:
         of its plane, a scale), the same in all poses; as a normal score, at most LARGEST_SCORE.
     per_pose : dict
         Slow energy per degree of freedom by pose name.
+    p_systematic : float
+        Where the cable does not repeat: probability of as much that poses which are alike have in
+        common, if each hanging has a rest curvature of its own and nothing else is missing.
     """
 
     statistic: float
@@ -57,11 +61,17 @@ class Structure:
     span_z: float
     position_z: float
     per_pose: dict[str, float]
+    p_systematic: float = 1.0
+
+    @property
+    def p_noise(self) -> float:
+        """Probability of the residual if it is noise and rest curvatures of each hanging's own."""
+        return min(self.p_value, self.p_systematic)
 
 
 def noise_degrees(fit: Fit) -> float:
     """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
-    return max(LEAST_NOISE_DEGREES, fit.noise.slow_dof)
+    return max(LEAST_NOISE_DEGREES, min(fit.noise.slow_dof, fit.problem.rest_scatter.dof))
 
 
 def screening_degrees(fit: Fit) -> float:
@@ -71,12 +81,13 @@ def screening_degrees(fit: Fit) -> float:
     of cable told it, which is too much: what is found so has to pass a second test, under the
     noise that is left once it is in the model.
     """
+    rest_dof = fit.problem.rest_scatter.dof
     if fit.noise.known:
         return noise_degrees(fit)
     if fit.noise.share == 0:
-        return float(fit.problem.n_residuals)
+        return float(min(fit.problem.n_residuals, max(LEAST_NOISE_DEGREES, rest_dof)))
     stretches = fit.model.cable.length / (np.sqrt(2 * np.pi) * fit.noise.length)
-    return float(max(LEAST_NOISE_DEGREES, len(fit.problem.used) * stretches))
+    return float(max(LEAST_NOISE_DEGREES, min(len(fit.problem.used) * stretches, rest_dof)))
 
 
 def structure_of(fit: Fit, noise_dof: float) -> Structure:
@@ -88,7 +99,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
         modes = smooth_modes(s, model.cable.length, SLOW_MODES, model.end == "free")
         seen = problem.measured[j].slow_rows(modes)
-        basis, _ = np.linalg.qr(problem.whitening(j, s) @ seen)
+        basis, _ = np.linalg.qr(problem.whitening(j) @ seen)
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
         covariance = np.eye(basis.shape[1])
         block = inner[k]
@@ -129,7 +140,16 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         _rank_score(energies, spans),
         _position_score(fit, noise_dof),
         dict(zip(names, energies.tolist(), strict=True)),
+        _systematic(fit),
     )
+
+
+def _systematic(fit: Fit) -> float:
+    """Probability of what poses that are alike have in common; 1 where the cable repeats."""
+    if fit.problem.rest_scatter.std == 0:
+        return 1.0
+    found = rest_scatter_of(fit.problem, fit.point, fit.linearization, fit.noise)
+    return found.p_systematic
 
 
 def _position_score(fit: Fit, noise_dof: float) -> float:
@@ -147,7 +167,7 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
         x = item.points / fit.model.cable.length
         terms = np.column_stack([x, *(x[:, a] * x[:, b] for a, b in pairs)])
         moved = np.einsum("dc,kt->kdct", np.eye(d), terms).reshape((len(x), d, size))
-        seen = problem.whitening(j, s) @ item.components(observed[j].curve, s, moved)
+        seen = problem.whitening(j) @ item.components(observed[j].curve, s, moved)
         information += seen.T @ seen
         cross += seen.T @ lin.by_theta[k]
         slope += seen.T @ lin.residuals[k]

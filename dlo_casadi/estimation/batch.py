@@ -104,7 +104,7 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
     for j, s in zip(problem.used, point.feet, strict=True):
         curve, lam = seen[j].curve.numbers, seen[j].lam
         each = ObservedChange(unit[: curve.size].reshape((*curve.shape, size)), unit[curve.size :])
-        item, white = problem.measured[j], problem.whitening(j, s)
+        item, white = problem.measured[j], problem.whitening(j)
         rows = -white @ item.residual_along(seen[j], s, each)
         here = np.concatenate([curve.ravel(), lam])
         target = white @ item.residual(seen[j], s) + rows @ here

@@ -17,13 +17,15 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
 from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.repeats import with_repeats
+from dlo_casadi.estimation.repeats import different_poses, with_repeats
+from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import LOOKS, LOOKS_IN_SPACE, all_at_once, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import END_ROLL, STIFFNESSES, CableModel
 from dlo_casadi.parallel import map_in_order
+from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
 
@@ -42,6 +44,8 @@ SEARCH_STD = 0.004
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
 ROUGHNESS_START = 0.3
+# Turns per length, several times what heavy cables were measured to have, 0.1 to 0.3 1/m.
+FIRST_REST_TURNS = 0.05
 
 
 def starting_points(
@@ -61,7 +65,8 @@ def starting_points(
     for start, decade in zip(starts, decades, strict=True):
         start[stiffnesses] += decade * np.log(10)
     shapes, feet = measured_shapes(problem)
-    problem.refresh(feet)
+    if not problem.has_metric:
+        problem.refresh(theta, shapes, feet)
     # The roll of a cable in its end clamp is as unknown as its rest shape.
     names = problem.unknowns.names
     held = np.array([k < problem.unknowns.n_parameters for k in range(len(names))])
@@ -128,17 +133,35 @@ def fit_model(
         begin = model.nominal if start is None else start.values_in(model)
     unknowns = Unknowns(model, chosen, begin)
     if start is not None:
-        return _continue(unknowns, measured, tolerances, start, max_iterations)
+        return _continue(unknowns, measured, start, max_iterations)
     noise = NoiseModel(FIRST_STD)
     if std is not None:
         declared = NoiseModel(std, source="declared")
         noise = with_repeats(declared, measured, model.cable.length)
     scatter = tolerances.deviation(model.node)
-    if sum(item.readable and not item.held_out for item in measured) == 1:
+    count = sum(item.readable and not item.held_out for item in measured)
+    if count == 1:
         # One pose does not deviate from others: what is wrong with it is wrong with the session.
         scatter = SCATTER_FLOOR * scatter
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
+    fit = _searched(problem, theta, decades)
+    if different_poses(measured) >= DIFFERENT and fit.beyond_noise:
+        # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
+        # left: search once more as if every hanging had a rest curvature of its own.
+        first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
+        loose = problem.changed(noise, ROUGHNESS_START, scatter, first)
+        try:
+            other = _searched(loose, theta, decades)
+        except EstimationError:
+            return fit
+        return max(fit, other, key=lambda found: found.log_evidence)
+    return fit
+
+
+def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Fit:
+    """The best minimum from starts over decades of stiffness, noise and scatters estimated."""
+    model = problem.unknowns.model
     best = None
     if len(problem.used) > POSES_OF_A_SEARCH and not model.has_state:
         rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)
@@ -151,7 +174,7 @@ def fit_model(
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )
-    problem, point, converged = refine(problem, best, estimate=std is None)
+    problem, point, converged = refine(problem, best, estimate=not problem.noise.known, first=True)
     return Fit(problem, point, converged)
 
 
@@ -164,11 +187,13 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
     model = problem.unknowns.model
     sure = NoiseModel(SEARCH_STD * model.cable.length)
     if model.in_space and sure.std > problem.noise.std:
-        doubtful = problem.changed(sure, problem.roughness_std, problem.scatter)
+        doubtful = problem.changed(
+            sure, problem.roughness_std, problem.scatter, problem.rest_scatter
+        )
         found = _best(doubtful, theta, decades)
         if found is None:
             return None
-        problem.refresh(found.feet)
+        problem.refresh(found.theta, found.shapes, found.feet)
         return problem.descend(
             problem.evaluate(found.theta, found.shapes, found.feet), tolerance=1e-2
         )[0]
@@ -200,7 +225,6 @@ def _better(problem: BatchProblem, point: Point, other: Point) -> bool:
 def _continue(
     unknowns: Unknowns,
     measured: Sequence[MeasuredPose],
-    tolerances: Tolerances,
     start: Fit,
     max_iterations: int = 40,
 ) -> Fit:
@@ -210,19 +234,12 @@ def _continue(
     p = np.where(known & unknowns.free, start.values_in(model), unknowns.fixed)
     unknowns = replace(unknowns, fixed=p)
     theta = unknowns.pack(p, start.coefficients)
-    problem = BatchProblem(
-        unknowns,
-        measured,
-        start.noise,
-        tolerances,
-        start.problem.roughness_std,
-        start.problem.scatter,
-    )
+    problem = start.problem.of(unknowns, measured)
     shapes, solved = problem.sweep.solve(carried_shapes(problem, start), p, unknowns.rest(theta))
     if not solved.all():
         raise EstimationError("the shapes of the first fit are no equilibria of the second model")
     feet = _feet_for(problem, start)
-    problem.refresh(feet)
+    problem.share_metric(start.problem)
     point = problem.evaluate(theta, shapes, feet)
     point, converged = problem.descend(point, max_iterations)
     return Fit(problem, point, converged)
@@ -293,7 +310,7 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     model = fit.model.with_mesh(n)
     unknowns = replace(problem.unknowns, model=model)
     try:
-        moved = _continue(unknowns, problem.history, problem.tolerances, fit)
+        moved = _continue(unknowns, problem.history, fit)
     except EstimationError:
         # The coarse mesh was too far off to be followed: start again from the measured shapes.
         names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]

@@ -18,12 +18,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -36,6 +38,8 @@ FloatArray = NDArray[np.floating]
 NO_INFORMATION = 1e-6
 # Farther than so [rad] no node is moved along its derivative: equilibria are not that linear.
 LONGEST_MOVE = 1.5
+# Cables come back to the same shape, unless the data tell otherwise.
+NO_REST_SCATTER = RestScatter()
 # A descent creeps where so many steps together gain no more than the last one may.
 CREEPING = 4
 # Steps that may follow one uphill before it is taken back, and how far up it may lead.
@@ -141,6 +145,8 @@ class BatchProblem:
         Prior of the rest curvature, see `Unknowns.prior_precision`.
     scatter : (n_deviations,), optional
         Standard deviations of a pose's own deviations; the tolerances by default.
+    rest_scatter : RestScatter
+        Rest curvature of each hanging's own; none by default.
     sweep : Sweep, optional
         Reused when only noise or priors have changed.
     """
@@ -153,6 +159,7 @@ class BatchProblem:
         tolerances: Tolerances,
         roughness_std: float = 1.0,
         scatter: FloatArray | None = None,
+        rest_scatter: RestScatter = NO_REST_SCATTER,
         sweep: Sweep | None = None,
     ) -> None:
         self.unknowns = unknowns
@@ -172,6 +179,7 @@ class BatchProblem:
         self.precision = unknowns.prior_precision(roughness_std)
         self.mean = unknowns.prior_mean()
         self.scatter = tolerances.deviation(unknowns.model.node) if scatter is None else scatter
+        self.rest_scatter = rest_scatter
         self.deviation_std = self.scatter[self.sweep.used_deviations]
         self._whitening: dict[int, FloatArray] = {}
 
@@ -197,20 +205,52 @@ class BatchProblem:
         """Curve of what the model says of its nodes."""
         return NodeCurve.of(self.unknowns.model.cable.length, z)
 
-    def whitening(self, j: int, feet: FloatArray) -> FloatArray:
-        """Whitening matrix (R_j, R_j) of pose j, computed for the feet at `refresh`."""
-        if j not in self._whitening:
-            self._whitening[j] = self.measured[j].whitening(self.noise, feet)
+    def whitening(self, j: int) -> FloatArray:
+        """Whitening matrix (R_j, R_j) of pose j, as of the last `refresh`."""
         return self._whitening[j]
 
-    def refresh(self, feet: Sequence[FloatArray]) -> None:
-        """Recompute the noise metric for points whose feet have moved."""
-        self._whitening = {}
-        for j, s in zip(self.used, feet, strict=True):
-            self.whitening(j, s)
+    def refresh(self, theta: FloatArray, shapes: Shapes, feet: Sequence[FloatArray]) -> None:
+        """Take the metric of the residuals at these unknowns, equilibria and feet.
+
+        The covariance of pose j is that of its noise plus E_j E_j^T, where E_j is what a standard
+        deviation of each mode of its own rest curvature does to the residuals.
+        """
+        self._whitening = {
+            j: self.measured[j].whitening(self.noise, s)
+            for j, s in zip(self.used, feet, strict=True)
+        }
+        if self.rest_scatter.std == 0:
+            return
+        moved = self.moved_by_rest(theta, shapes, feet)
+        for j, way in zip(self.used, moved, strict=True):
+            sizes = np.tile(self.rest_scatter.sizes, way.shape[1] // MODES)
+            seen = self._whitening[j] @ (way * sizes)
+            factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
+            self._whitening[j] = solve_triangular(factor, self._whitening[j], lower=True)
+
+    def moved_by_rest(
+        self, theta: FloatArray, shapes: Shapes, feet: Sequence[FloatArray]
+    ) -> list[FloatArray]:
+        """Change (R_j, axes MODES) of the fitted residuals by rest curvatures of the poses' own."""
+        p, rest = self.unknowns.p(theta), self.unknowns.rest(theta)
+        along = self.sweep.by_rest(shapes, p, rest, modes_in(self.unknowns.model))
+        seen = self.sweep.observe(shapes, p, rest, along)
+        return [
+            self.measured[j].residual_along(
+                Observed(self.curve_of(seen.z[j]), shapes.lam[j]),
+                s,
+                ObservedChange(seen.slopes[j], along.lam[j]),
+            )
+            for j, s in zip(self.used, feet, strict=True)
+        ]
+
+    @property
+    def has_metric(self) -> bool:
+        """Whether the metric of the residuals has been taken."""
+        return bool(self._whitening)
 
     def share_metric(self, other: BatchProblem) -> None:
-        """Take over the noise metric of a problem with the same fitted poses and noise."""
+        """Take over the metric of a problem with the same fitted poses: objectives compare then."""
         self._whitening = {
             mine: other._whitening[theirs]
             for mine, theirs in zip(self.used, other.used, strict=True)
@@ -225,7 +265,7 @@ class BatchProblem:
             item = self.measured[j]
             s = item.located(seen[j], guess)
             moved.append(s)
-            residuals.append(self.whitening(j, s) @ item.residual(seen[j], s))
+            residuals.append(self.whitening(j) @ item.residual(seen[j], s))
         data = float(sum(white @ white for white in residuals))
         gap = theta - self.mean
         used = shapes.deviation[np.ix_(self.used, self.sweep.used_deviations)]
@@ -263,7 +303,7 @@ class BatchProblem:
         size = self.unknowns.size
         for j, s in zip(self.used, point.feet, strict=True):
             now, item = Observed(self.curve_of(seen.z[j]), point.shapes.lam[j]), self.measured[j]
-            white = self.whitening(j, s)
+            white = self.whitening(j)
             d = item.residual(now, s)
             if ahead is not None and correction is not None:
                 change = ObservedChange(ahead.slopes[j], correction.lam[j])
@@ -405,26 +445,43 @@ class BatchProblem:
         Not for models with a state, whose poses depend on those before them.
         """
         kept = self.fitted[:: -(-len(self.fitted) // most)]
+        return self.of(self.unknowns, [self.history[k] for k in kept])
+
+    def of(
+        self,
+        unknowns: Unknowns,
+        measured: Sequence[MeasuredPose] | None = None,
+        scatter: FloatArray | None = None,
+        sweep: Sweep | None = None,
+    ) -> BatchProblem:
+        """Return a problem with the same noise, roughness and scatter, unless it is given here."""
         return BatchProblem(
-            self.unknowns,
-            [self.history[k] for k in kept],
+            unknowns,
+            self.history if measured is None else measured,
             self.noise,
             self.tolerances,
             self.roughness_std,
-            self.scatter,
+            self.scatter if scatter is None else scatter,
+            self.rest_scatter,
+            sweep,
         )
 
     def changed(
-        self, noise: NoiseModel, roughness_std: float, scatter: FloatArray | None = None
+        self,
+        noise: NoiseModel,
+        roughness_std: float,
+        scatter: FloatArray,
+        rest_scatter: RestScatter,
     ) -> BatchProblem:
-        """Return the same problem with another noise, roughness or scatter of the ends."""
+        """Return the same problem with another noise, roughness or scatter."""
         return BatchProblem(
             self.unknowns,
             self.history,
             noise,
             self.tolerances,
             roughness_std,
-            self.scatter if scatter is None else scatter,
+            scatter,
+            rest_scatter,
             self.sweep,
         )
 

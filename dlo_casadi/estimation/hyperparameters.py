@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,8 +16,17 @@ from dlo_casadi.estimation.noise import (
     smooth_modes,
     tell_of_noise,
 )
-from dlo_casadi.estimation.repeats import with_repeats
+from dlo_casadi.estimation.repeats import different_poses, with_repeats
+from dlo_casadi.estimation.rest_scatter import (
+    MOST_POSES,
+    RestLikelihood,
+    RestScatter,
+    ScatterEstimate,
+    ScatterSample,
+    estimate_rest_scatter,
+)
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
 
@@ -49,23 +60,29 @@ def refine(
     estimate: bool,
     rounds: int = 3,
     modes: int = SMOOTH_MODES,
+    first: bool = False,
 ) -> tuple[BatchProblem, Point, bool]:
     """Alternate between the fit, the noise, the roughness of the rest curvature and the scatter.
 
     Roughness and scatter (how much the poses' ends differ from one another, within the
     tolerances) maximise the marginal likelihood (MacKay's fixed point).
 
+    Parameters
+    ----------
+    first : bool
+        Whether it is not known yet if the cable comes back to the same shape.
+
     References
     ----------
     MacKay, Neural Computation 4 (1992).
     """
+    repeats = problem.rest_scatter.std == 0 and not first
     point, converged = problem.descend(point, tolerance=1e-2)
     for round_ in range(rounds):
         lin = problem.linearize(point)
-        noise = problem.noise
-        if estimate and round_ < 2 and not noise.known:
-            own = noise_of(problem, point, lin, modes)
-            noise = with_repeats(own, problem.history, problem.unknowns.model.cable.length)
+        noise, rest = problem.noise, problem.rest_scatter
+        if round_ < 2:
+            noise, rest = errors_of(problem, point, lin, modes, estimated=estimate, repeats=repeats)
         roughness = roughness_of(problem, point, lin)
         scatter = scatter_of(problem, point, lin)
         ends = np.isfinite(scatter)
@@ -74,34 +91,84 @@ def refine(
             float(np.abs(np.log(scatter[ends] / problem.scatter[ends])).max()),
         )
         changed = abs(np.log(noise.std / problem.noise.std))
-        problem = problem.changed(noise, roughness, scatter)
-        problem.refresh(point.feet)
+        same = rest.std == problem.rest_scatter.std or abs(
+            rest.std - problem.rest_scatter.std
+        ) < 0.05 * max(rest.std, problem.rest_scatter.std)
+        problem = problem.changed(noise, roughness, scatter, rest)
+        problem.refresh(point.theta, point.shapes, point.feet)
         point = problem.evaluate(point.theta, point.shapes, point.feet)
         point, converged = problem.descend(point)
-        if moved < 0.1 and changed < 0.02:
+        if moved < 0.1 and changed < 0.02 and same:
             break
     return problem, point, converged
 
 
-def noise_of(
-    problem: BatchProblem, point: Point, lin: Linearization, modes: int = SMOOTH_MODES
-) -> NoiseModel:
-    """Noise estimated from the residuals with all that the shape may do projected out.
+def errors_of(
+    problem: BatchProblem,
+    point: Point,
+    lin: Linearization,
+    modes: int = SMOOTH_MODES,
+    *,
+    estimated: bool,
+    repeats: bool,
+) -> tuple[NoiseModel, RestScatter]:
+    """Noise of the points and rest curvature of each hanging's own, from the residuals.
 
-    Lines of few points leave nothing over then: fewer slow displacements are projected out of
-    them, and at last the noise is white, of the size that the residuals have for each degree of
-    freedom.
+    The noise is estimated with all that the shape may do projected out. Lines of few points
+    leave nothing over then: fewer slow displacements are projected out of them, and at last the
+    noise is white, its size estimated together with that of the rest curvatures.
+
+    Parameters
+    ----------
+    estimated : bool
+        Whether the noise is; else it is taken as it is.
+    repeats : bool
+        Whether the cable does. It is a property of the specimen: a scatter that is not there in the
+        declared model, but once an effect has been added, is what that effect does not explain.
 
     Raises
     ------
     EstimationError
         If the points are hardly more than the unknowns that they determine.
     """
-    for count in range(modes, -1, -1):
-        samples = _noise_samples(problem, point, lin, count)
-        if tell_of_noise(samples):
-            return estimate_noise(samples, problem.unknowns.model.cable.length)
-    return _white_noise(problem, point)
+    noise, together = problem.noise, False
+    if estimated:
+        length = problem.unknowns.model.cable.length
+        for count in range(modes, -1, -1):
+            samples = _noise_samples(problem, point, lin, count)
+            if tell_of_noise(samples):
+                noise = with_repeats(estimate_noise(samples, length), problem.history, length)
+                break
+        else:
+            noise, together = _white_noise(problem, point), True
+    if repeats:
+        return noise, RestScatter()
+    found = rest_scatter_of(problem, point, lin, noise)
+    return replace(noise, std=found.noise * noise.std) if together else noise, found.rest
+
+
+def rest_scatter_of(
+    problem: BatchProblem, point: Point, lin: Linearization, noise: NoiseModel
+) -> ScatterEstimate:
+    """Rest curvature of each hanging's own; see `estimate_rest_scatter`."""
+    if different_poses(problem.history) < DIFFERENT:
+        return ScatterEstimate(RestScatter(), 1.0, 1.0)
+    size, std = problem.unknowns.size, problem.deviation_std
+    moved = problem.moved_by_rest(point.theta, point.shapes, point.feet)
+    kept = range(0, len(problem.used), -(-len(problem.used) // MOST_POSES))
+    samples = []
+    for k in kept:
+        white = problem.measured[problem.used[k]].whitening(noise, point.feet[k])
+        by = white @ lin.raw_directions[k]
+        samples.append(
+            ScatterSample(white @ lin.raw[k], white @ moved[k], by[:, size:] * std, by[:, :size])
+        )
+    seen = problem.observed(point.theta, point.shapes)
+    shapes = np.array([seen[problem.used[k]].curve.nodes for k in kept])
+    shapes = shapes - shapes[:, :1]
+    gap = shapes[:, None] - shapes[None]
+    distances = np.sqrt((gap**2).sum(axis=3).mean(axis=2))
+    return estimate_rest_scatter(RestLikelihood(samples, distances))
 
 
 def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
@@ -132,9 +199,15 @@ def _noise_samples(
     size = problem.unknowns.size
     bases, left_over = [], []
     scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in lin.raw_directions], axis=0)
-    for j, directions, s in zip(problem.used, lin.raw_directions, point.feet, strict=True):
+    rest = None
+    if problem.rest_scatter.std > 0:
+        rest = problem.moved_by_rest(point.theta, point.shapes, point.feet)
+    for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
+        directions = lin.raw_directions[k]
         own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
         slow = problem.measured[j].slow_rows(smooth_modes(s, length, modes, model.end == "free"))
+        if rest is not None:
+            slow = np.concatenate([slow, rest[k] / np.abs(rest[k]).max()], axis=1)
         basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
         basis = basis[:, values > 1e-3 * values[0]]
         shared = directions[:, :size] / np.maximum(scale, 1e-300)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
+from dlo_casadi.estimation.gauss_newton import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import BENDING_STIFFNESS, STIFFNESSES
@@ -42,12 +42,12 @@ def threshold(fit: Fit) -> float:
     the length in its metric of a systematic error of SYSTEMATIC_SHARE of it in all points.
     """
     square = 0.0
-    for j, feet in zip(fit.problem.used, fit.point.feet, strict=True):
+    for j in fit.problem.used:
         if fit.noise.source != "declared":
             break
         item = fit.problem.measured[j]
         constant = SYSTEMATIC_SHARE * fit.noise.std * item.relative_std[item.point_of]
-        square += float(((fit.problem.whitening(j, feet) @ constant) ** 2).sum())
+        square += float(((fit.problem.whitening(j) @ constant) ** 2).sum())
     return (NORMAL_95 + np.sqrt(square)) ** 2 * fit.inflation**2
 
 
@@ -142,16 +142,8 @@ def _held(fit: Fit, log_value: float, near: Point, name: str) -> tuple[Point, fl
     p = fit.p.copy()
     p[model.names.index(name)] = np.exp(log_value)
     unknowns = Unknowns(model, others, p, found.rest_free)
-    problem = BatchProblem(
-        unknowns,
-        fit.problem.history,
-        fit.noise,
-        fit.problem.tolerances,
-        fit.problem.roughness_std,
-        fit.problem.scatter,
-        fit.problem.sweep,
-    )
-    problem.refresh(near.feet)
+    problem = fit.problem.of(unknowns, sweep=fit.problem.sweep)
+    problem.share_metric(fit.problem)
     theta = near.theta
     shapes, converged = problem.sweep.solve(near.shapes, unknowns.p(theta), unknowns.rest(theta))
     if not converged.all():

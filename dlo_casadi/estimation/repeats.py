@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.thresholds import REPEATS_ARE_NOISE
+from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE
 
 FloatArray = NDArray[np.floating]
 
@@ -36,8 +36,14 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 
+def different_poses(measured: Sequence[MeasuredPose]) -> int:
+    """Number of fit poses that are held differently."""
+    fitted = [item.pose for item in measured if item.readable and not item.held_out]
+    return len({tuple(pose.ends) for pose in fitted})
+
+
 def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: float) -> NoiseModel:
-    """Noise of one line, or of repeats of one pose where they differ by more than twice that.
+    """Noise of one line, or of repeats of a pose or two where they differ by more than twice that.
 
     Pure error: the distances of repeats from their mean, sqrt(m / (m - 1)) larger for
     its loss of one degree of freedom in m, with their correlation along the cable. A fit that
@@ -48,6 +54,8 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     ----------
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
+    if different_poses(measured) >= DIFFERENT:
+        return noise  # what differs between hangings has its own place there, see `rest_scatter`
     spread = repeatability(measured, length)
     if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise

@@ -43,6 +43,17 @@ class Fit:
         return self.problem.noise
 
     @property
+    def beyond_noise(self) -> bool:
+        """Whether more is left than noise: chi-square by two standard deviations, or a scatter."""
+        excess = 2 * np.sqrt(2 / self.degrees_of_freedom)
+        return self.problem.rest_scatter.std > 0 or self.chi2_per_dof > 1 + excess
+
+    @property
+    def errors_known(self) -> bool:
+        """Whether nothing of what the residuals are held against was estimated from them."""
+        return self.noise.known and self.problem.rest_scatter.std == 0
+
+    @property
     def p(self) -> FloatArray:
         """Parameter vector, in the order of `model.names` (SI)."""
         return self.problem.unknowns.p(self.point.theta)
@@ -114,6 +125,40 @@ class Fit:
         ]
         return float(np.sqrt(np.concatenate(moved).mean()))
 
+    @cached_property
+    def hanging_error(self) -> float:
+        """RMS displacement of points [m] by the rest curvature of each hanging's own."""
+        problem = self.problem
+        if problem.rest_scatter.std == 0:
+            return 0.0
+        moved = problem.moved_by_rest(self.point.theta, self.point.shapes, self.point.feet)
+        square = 0.0
+        for way in moved:
+            sizes = np.tile(
+                problem.rest_scatter.sizes, way.shape[1] // len(problem.rest_scatter.sizes)
+            )
+            square += float(((way * sizes) ** 2).sum())
+        return float(np.sqrt(square / self._n_points))
+
+    @property
+    def _n_points(self) -> int:
+        return sum(len(self.problem.measured[j].points) for j in self.problem.used)
+
+    @cached_property
+    def expected_error(self) -> float:
+        """RMS distance [m] of the points of a pose that is only predicted, if nothing is missing.
+
+        Noise of the points, scatter of the fixtures, uncertain parameters, and how the cable
+        repeats.
+        """
+        per_point = self.problem.n_residuals / self._n_points
+        square = per_point * (self.noise.std**2 + self.fixture_error**2) + self.hanging_error**2
+        size, covariance = self.problem.unknowns.size, self.covariance * self.inflation**2
+        for directions in self.linearization.raw_directions:
+            by = directions[:, :size]
+            square += float(((by @ covariance) * by).sum()) / self._n_points
+        return float(np.sqrt(square))
+
     @property
     def inflation(self) -> float:
         """Factor on standard deviations where the residual exceeds the noise."""
@@ -129,6 +174,20 @@ class Fit:
         if name in self.model.names:
             slope = unknowns.slopes(self.point.theta)[self.model.names.index(name), k]
         return float(abs(slope) * np.sqrt(max(self.covariance[k, k], 0.0)) * self.inflation)
+
+    @property
+    def named_covariance(self) -> tuple[tuple[str, ...], FloatArray]:
+        """Names and covariance of all unknowns in SI units, the residual's excess included.
+
+        The unknowns are scaled or logarithmic: C = D C_theta D with D = dp/dtheta.
+        """
+        unknowns = self.problem.unknowns
+        slopes = unknowns.scales.copy()
+        by_theta = unknowns.slopes(self.point.theta)
+        for k, name in enumerate(unknowns.names[: unknowns.n_parameters]):
+            slopes[k] = by_theta[self.model.names.index(name), k]
+        scaled = self.covariance * np.outer(slopes, slopes) * self.inflation**2
+        return unknowns.names, np.asarray((scaled + scaled.T) / 2)
 
     def value(self, name: str) -> float:
         """Value of a parameter (SI)."""
@@ -153,14 +212,18 @@ class Fit:
     def log_evidence(self) -> float:
         """Laplace's approximation of the log marginal likelihood, constants dropped.
 
-        -objective + 1/2 log|P+| - 1/2 log|H| - 1/2 sum log|block| - log|noise|
+        -objective + 1/2 log|P+| - 1/2 log|H| - 1/2 sum log|block| + sum log|W|
+
+        with the whitenings W. A direction that is known worse than its scale counts as known so.
         """
         problem = self.problem
         eigen = np.linalg.eigvalsh(problem.precision)
         prior = float(np.log(eigen[eigen > 1e-12]).sum())
-        hessian = float(np.linalg.slogdet(self.normal.hessian)[1])
+        values = np.linalg.eigvalsh(self.normal.hessian)
+        hessian = float(np.log(np.maximum(values, 1.0)).sum())
+        white = sum(float(np.linalg.slogdet(problem.whitening(j))[1]) for j in problem.used)
         inner = sum(
             float(np.linalg.slogdet(block)[1]) + 2 * float(np.log(problem.deviation_std).sum())
             for block, _, _ in self.normal.inner
         )
-        return -self.point.objective + (prior - hessian - inner) / 2
+        return -self.point.objective + (prior - hessian - inner) / 2 + white

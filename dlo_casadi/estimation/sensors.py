@@ -58,6 +58,11 @@ class Sensor(Protocol):
         """Residuals of a point."""
         ...
 
+    @property
+    def marked(self) -> bool:
+        """Whether the arc lengths of the points are known."""
+        ...
+
     def places(self, pose: Pose, length: float) -> FloatArray:
         """First guess of the points' arc lengths (K,) [m], without a curve."""
         ...
@@ -144,6 +149,8 @@ class Centerline(_Points):
         Relative standard deviations.
     """
 
+    marked = False
+
     @property
     def per_point(self) -> int:
         """Residuals of a point."""
@@ -183,6 +190,7 @@ class Markers(_Points):
     """
 
     s: FloatArray
+    marked = True
 
     @property
     def per_point(self) -> int:

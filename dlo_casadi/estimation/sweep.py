@@ -311,6 +311,16 @@ class Sweep:
             still.rest[1:] += left[:-1].cumsum(axis=0)
         return self._solved(shapes, given, matrix, still)
 
+    def by_rest(
+        self, shapes: Shapes, p: FloatArray, rest: FloatArray, modes: FloatArray
+    ) -> Directions:
+        """How each equilibrium moves with its own rest curvature along modes (n_cells, q)."""
+        given = self._given(shapes, p, rest)
+        _, _, matrix = self.assembly.balance(shapes, given)
+        along = np.broadcast_to(modes, (self.m, *modes.shape))
+        none = np.zeros((self.m, given.p.shape[1], modes.shape[1]))
+        return self._solved(shapes, given, matrix, _still(self.assembly, self.m, along, none))
+
     def _solved(
         self, shapes: Shapes, given: Given, matrix: BandMatrix, still: Directions
     ) -> Directions:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dlo_casadi.report.canvas import BLACK, BLUE, GREY, VERMILLION, figure, styled
+from dlo_casadi.report.geometry import band_outline
 
 _SIZE = (7.0, 6.0)
 # Room for the number at the tip of an arrow, as a share of the drawing.
@@ -42,6 +43,9 @@ def _draw(drawing: Figure, shape: dict[str, Any]) -> None:
     span = float(np.ptp(points, axis=0).max())
     reach = 0.25 * span / max(largest, 1e-12)
     axes: Any = drawing.add_subplot(projection="3d" if in_space else None)
+    if not in_space:
+        band = band_outline(points, np.array(shape["band_90"]))
+        axes.fill(*band.T, color=BLUE, alpha=0.15, lw=0, label="90 % of next hangings")
     axes.plot(*points.T, color=BLUE, lw=2.5, label="cable")
     for at, (side, force) in zip((points[0], points[-1]), forces.items(), strict=True):
         held = side == "start" or shape["end"] is not None

@@ -15,6 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
+from dlo_casadi.estimation.band import EDGE
 from dlo_casadi.estimation.moment import LEAST_POINTS, law_of, measured_moment_curve
 from dlo_casadi.report.canvas import (
     BLACK,
@@ -32,6 +33,7 @@ from dlo_casadi.report.canvas import (
 )
 from dlo_casadi.report.figures_room import FORCE, draw_marks, frame_room
 from dlo_casadi.report.geometry import (
+    band_outline,
     directions,
     magnified,
     measured_line,
@@ -208,6 +210,10 @@ def _draw_pose(
         shape = stage.shapes.get(pose.name)
         if shape is not None:
             axes.plot(*place(magnified(pose, shape, factor)).T, color=color, ls=style)
+            spread = shape.spread if factor == 1 and stage is lines[-1][0] else None
+            if spread is not None and spread.ndim == 1:
+                outline = place(band_outline(shape.curve, EDGE * spread))
+                axes.fill(*outline.T, color=color, alpha=0.2)
     if len(pose.points):
         shown = pose.points[:: max(1, len(pose.points) // 60)]
         axes.plot(*place(shown).T, ".", color=BLACK, ms=2.5)

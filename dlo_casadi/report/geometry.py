@@ -28,6 +28,14 @@ def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray
     return np.asarray(pose.points - factor * shape.gap)
 
 
+def band_outline(curve: FloatArray, half_width: FloatArray) -> FloatArray:
+    """Outline (2 M, 2) [m] of a band of half widths (M,) [m] about a planar curve (M, 2)."""
+    tangent = np.gradient(curve, axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
+    side = half_width[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    return np.concatenate([curve + side, (curve - side)[::-1]])
+
+
 def directions(outcome: Outcome) -> tuple[str, ...]:
     """Names of the directions across a cable: in a plane there is one, which needs none."""
     return ("y", "z") if outcome.config.experiment.in_space else ("",)

@@ -43,6 +43,12 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
             "correlation_length_m": measurement.correlation_length,
         },
         "stages": [_stage(name, outcome) for name in names],
+        "repeatability": {
+            "rest_curvature_std": outcome.repeatability.rest_curvature_std,
+            "expected_spread_m": outcome.repeatability.expected_spread,
+            "source": outcome.repeatability.source,
+            "held_out_inside_90": outcome.inside_band,
+        },
         "discretization": {
             "n": outcome.discretization.n,
             "element": outcome.discretization.element,

@@ -32,6 +32,8 @@ from dlo_casadi.config import (
 )
 from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
 from dlo_casadi.errors import ConfigError, DloError
+from dlo_casadi.estimation.band import Uncertainty
+from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import STIFFNESSES, CableModel
 from dlo_casadi.parameters import Parameter
@@ -64,6 +66,8 @@ class Metadata:
         Fitted parameters, in the order of `covariance`.
     covariance : (N, N)
         In the products of the parameters' units.
+    uncertainty : Uncertainty
+        The same with what differs from pose to pose.
     std : dict
         Standard deviation of each parameter by name [SI]; 0 where it was not fitted.
     coefficients : (n_coefficients,) [1/m]
@@ -89,6 +93,7 @@ class Metadata:
     path: Path
     names: tuple[str, ...]
     covariance: FloatArray
+    uncertainty: Uncertainty
     std: dict[str, float]
     coefficients: FloatArray
     fixtures: dict[str, Any]
@@ -176,7 +181,8 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
 def fit_dict(fit: Fit) -> dict[str, Any]:
     """What a fit alone tells: the model, its parameters, covariance and state."""
     model = fit.model
-    names, covariance = covariance_si(fit)
+    names, covariance = fit.named_covariance
+    uncertainty = Uncertainty.of(fit)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "cable": {
@@ -218,6 +224,11 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
             "of": "cells, last pose done",
         },
         "covariance": {"names": list(names), "values": covariance},
+        "scatter": {
+            "fixtures": dict(uncertainty.scatter),
+            "rest_curvature_std": uncertainty.rest_scatter.std,
+            "rest_curvature_smoothness": uncertainty.rest_scatter.smoothness,
+        },
     }
     plain: dict[str, Any] = finite(document)
     return plain
@@ -233,20 +244,6 @@ def parameters_hash(document: Mapping[str, Any]) -> str:
     content["coefficients"] = document["rest_curvature"]["coefficients"]
     text = json.dumps(_as_floats(content), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def covariance_si(fit: Fit) -> tuple[tuple[str, ...], FloatArray]:
-    """Names and covariance of all fitted parameters in SI units, the residual's excess included.
-
-    The fit's own unknowns are scaled or logarithmic: C = D C_theta D with D = dp/dtheta.
-    """
-    unknowns = fit.problem.unknowns
-    slopes = unknowns.scales.copy()
-    by_theta = unknowns.slopes(fit.point.theta)
-    for k, name in enumerate(unknowns.names[: unknowns.n_parameters]):
-        slopes[k] = by_theta[fit.model.names.index(name), k]
-    scaled = fit.covariance * np.outer(slopes, slopes) * fit.inflation**2
-    return unknowns.names, np.asarray((scaled + scaled.T) / 2)
 
 
 def final_rest(fit: Fit) -> FloatArray:
@@ -406,11 +403,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary", "end"),
         gravity=gravity,
         effects=tuple(_effect(row, k) for k, row in enumerate(document["effects"])),
-        n_rest=_count(
-            document,
-            "n_rest",
-            REST_COEFFICIENTS._replace(least=0) if cable.straight else REST_COEFFICIENTS,
-        ),
+        n_rest=_count(document, "n_rest", REST_COEFFICIENTS),
         priors={name: float(std) for name, std in tolerances.items() if std is not None},
     )
     if set(rows) != set(model.names):
@@ -435,11 +428,19 @@ def _metadata(document: dict[str, Any], source: Path) -> Metadata:
     rows = document["parameters"]
     names = tuple(document["covariance"]["names"])
     covariance = np.array(document["covariance"]["values"], dtype=float)
+    covariance = covariance.reshape(len(names), len(names))
     interval = rows["bending_stiffness"].get("interval_95")
+    scatter = document.get("scatter") or {}
+    rest_scatter = RestScatter(
+        float(scatter.get("rest_curvature_std", 0.0)),
+        float(scatter.get("rest_curvature_smoothness", RestScatter().smoothness)),
+    )
+    fixtures = {name: float(std or 0.0) for name, std in scatter.get("fixtures", {}).items()}
     return Metadata(
         path=source,
         names=names,
-        covariance=covariance.reshape(len(names), len(names)),
+        covariance=covariance,
+        uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter),
         std={name: float(row.get("std") or 0.0) for name, row in rows.items()},
         coefficients=_stacked(
             document["rest_curvature"]["coefficients"], Frame.curvatures, "rest_curvature"

@@ -87,7 +87,7 @@ def declared_model(
         raise ConfigError("; ".join(problem.message for problem in problems), config.path)
     setup = replace(declared_setup(config), center=center)
     experiment, options = config.experiment, config.model
-    coefficients = config.estimation.rest_curvature_coefficients or REST_COEFFICIENTS
+    coefficients = config.estimation.rest_curvature_coefficients
     model = CableModel(
         cable=setup.cable,
         n=options.n or MESH,
@@ -95,7 +95,7 @@ def declared_model(
         start=experiment.boundary.start,
         end=experiment.boundary.end,
         gravity=experiment.gravity,
-        n_rest=max(coefficients, 4),
+        n_rest=REST_COEFFICIENTS if coefficients is None else coefficients,
     )
     if END_ROLL in model.names:
         model = replace(model, priors={END_ROLL: experiment.tolerances.roll})

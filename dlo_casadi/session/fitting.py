@@ -15,8 +15,9 @@ from dlo_casadi.estimation.hyperparameters import SMOOTH_MODES
 from dlo_casadi.estimation.mesh import discretization_error
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.session.declared import Declared
+from dlo_casadi.session.declared import REST_COEFFICIENTS, Declared
 from dlo_casadi.thresholds import MESH_SHARE
 
 # The search over decades of stiffness runs on this mesh; in space, where an element costs thirty
@@ -25,6 +26,8 @@ FIRST_MESH, FIRST_MESH_IN_SPACE = 20, 10
 FINEST_MESH = 160
 # The search for missing effects, a hundred refits, runs on at most so many elements.
 SEARCH_MESH = 80
+# Markers that are nearer to each other than this share of the cable are at one place.
+SAME_PLACE = 0.02
 # Huber's constant: points beyond it count with their distance instead of its square.
 HUBER = 1.5
 
@@ -40,6 +43,8 @@ def fit_declared(
     finest = config.model.n or n
     first = FIRST_MESH_IN_SPACE if declared.model.in_space else FIRST_MESH
     model = declared.model.with_mesh(min(finest or first, first))
+    if config.estimation.rest_curvature_coefficients is None:
+        model = replace(model, n_rest=min(model.n_rest, carried_coefficients(model, measured)))
     free = [name for name in model.names if name not in declared.fixed]
     fit = fit_model(
         model, measured, declared.tolerances, std, free=free, values=declared.start_values()
@@ -48,6 +53,20 @@ def fit_declared(
         fit = refine_mesh(fit, finest)
         return fit, mesh_error(fit)
     return fine_enough(fit, first)
+
+
+def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) -> int:
+    """Number of coefficients of the rest curvature that the measurements can carry.
+
+    All poses share one rest curvature, so that each place with a marker tells one number across
+    the cable; the heading of a clamp takes one of them. Lines show all places.
+    """
+    fitted = [item for item in measured if item.readable and not item.held_out]
+    if not all(sensor.marked for item in fitted for sensor in item.sensors):
+        return REST_COEFFICIENTS
+    places = np.sort(np.concatenate([item.places(np.inf) for item in fitted]))
+    count = 1 + int((np.diff(places) > SAME_PLACE * places[-1]).sum())
+    return max(1, count - (model.start, model.end).count("clamped"))
 
 
 def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float]:

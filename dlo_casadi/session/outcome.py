@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from dlo_casadi.config import Config
 from dlo_casadi.equilibrium import PoseBranch
+from dlo_casadi.estimation.band import COVERED
+from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
@@ -93,6 +97,9 @@ class PoseShape:
     stable : bool
     forces : (2, d) [N]
         Of the cable on what holds its start and its end.
+    spread : (M,) or (M, 2) or None [m]
+        Standard deviation across the curve of the next hanging, as the residual; None if it was
+        not computed.
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
     tipping : float or None [rad]
@@ -109,6 +116,7 @@ class PoseShape:
     forces: FloatArray
     measured_branch: BranchShape | None = None
     tipping: float | None = None
+    spread: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -245,6 +253,36 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
+class Repeatability:
+    """How well the cable comes back to the same shape.
+
+    Parameters
+    ----------
+    rest_curvature_std : float [1/m]
+        Of the rest curvature that each hanging has of its own; 0 where none was found.
+    expected_spread : float [m]
+        RMS distance of two hangings of a pose, at the measured points.
+    source : "repeats", "poses" or None
+        Whether a pose or two were taken again and again, so that it is how far one hanging is
+        from the mean of the others, or it is what differs between poses beyond all that they have
+        in common; None where it could not be estimated.
+    """
+
+    rest_curvature_std: float
+    expected_spread: float
+    source: Literal["repeats", "poses"] | None
+
+    @classmethod
+    def of(cls, fit: Fit) -> Self:
+        """What a fit has found."""
+        rest = fit.problem.rest_scatter.std
+        if different_poses(fit.problem.history) >= DIFFERENT:
+            return cls(rest, float(np.sqrt(2) * fit.hanging_error), "poses")
+        spread = repeatability(fit.problem.history, fit.model.cable.length)
+        return cls(rest, spread or 0.0, None if spread is None else "repeats")
+
+
+@dataclass(frozen=True)
 class Discretization:
     """Mesh of the model and the largest shape error [m] it causes, from two meshes."""
 
@@ -276,6 +314,7 @@ class Outcome:
     measurement: MeasurementSummary
     stages: tuple[Stage, ...]
     discretization: Discretization
+    repeatability: Repeatability
     timing: dict[str, float]
     fit: Fit
     verdict: Verdict | None = None
@@ -291,6 +330,25 @@ class Outcome:
     def stage(self, name: StageName) -> Stage | None:
         """Return the stage of that name, or None."""
         return next((stage for stage in self.stages if stage.name == name), None)
+
+    @property
+    def inside_band(self) -> float | None:
+        """Share of held-out points inside the last stage's 90 % band, noise of points included.
+
+        None without held-out points.
+        """
+        stage, inside = self.stages[-1], []
+        for pose in self.poses:
+            shape = stage.shapes.get(pose.name)
+            if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:
+                continue
+            places = np.linspace(0.0, self.fit.model.cable.length, len(shape.spread))
+            spread = shape.spread.reshape((len(places), -1))
+            std = np.stack([np.interp(shape.s, places, column) for column in spread.T], axis=1)
+            std = np.hypot(std, self.measurement.std)
+            score = ((shape.residual.reshape(std.shape) / std) ** 2).sum(axis=1)
+            inside.append(score <= chi2.ppf(COVERED, std.shape[1]))
+        return float(np.concatenate(inside).mean()) if inside else None
 
     def held_out(self, stage: Stage) -> HeldOut:
         """How many of the declared held-out poses a stage has predicted."""

@@ -95,6 +95,15 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
             f"others), {_beside(fit)}: repeatability limits any prediction"
         )
+    rest = fit.problem.rest_scatter
+    if rest.std > 0:
+        lines.append(
+            "the cable does not come back to the same shape: two hangings of a pose differ by "
+            f"{1e3 * np.sqrt(2) * fit.hanging_error:.2g} mm RMS, as if each had a rest curvature "
+            f"of its own of {rest.std:.2g} 1/m; the noise is {1e3 * fit.noise.std:.2g} mm. A "
+            "model predicts their mean"
+        )
+    if spread is not None or rest.std > 0:
         lines += [
             f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
         ]

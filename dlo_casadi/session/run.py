@@ -40,7 +40,14 @@ from dlo_casadi.session.fitting import (
     solved_by_ipopt,
 )
 from dlo_casadi.session.measure import measured_poses, read_inputs
-from dlo_casadi.session.outcome import Discretization, MeasurementSummary, Outcome, PoseInput, Stage
+from dlo_casadi.session.outcome import (
+    Discretization,
+    MeasurementSummary,
+    Outcome,
+    PoseInput,
+    Repeatability,
+    Stage,
+)
 from dlo_casadi.session.progress import Clock, Progress, Silent
 from dlo_casadi.session.remarks import (
     branch_warnings,
@@ -119,6 +126,7 @@ def fit_session(
         measurement=_summary(config, inputs, measured, fit),
         stages=tuple(stages),
         discretization=Discretization(fit.model.n, fit.model.element, error),
+        repeatability=Repeatability.of(fit),
         timing=clock.total(),
         fit=fit,
         warnings=tuple(warnings),
@@ -187,6 +195,7 @@ def close_the_loop(
         measurement=_summary(outcome.config, outcome.poses, measured, fit),
         stages=tuple(stages),
         discretization=mesh,
+        repeatability=Repeatability.of(fit),
         timing=clock.total(),
         verdict=diagnosis.verdict,
         effects=effect_rows(diagnosis),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.algorithm1 import Algorithm1Result
+from dlo_casadi.estimation.band import Uncertainty, spread_across
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
@@ -91,6 +93,7 @@ def _stage(
     rest_curvature: RestCurvatureEstimate,
     chi2_per_dof: float | None,
     note: str = "",
+    uncertainty: Uncertainty | None = None,
 ) -> Stage:
     predictions = predict_poses(model, p, rest, [item.pose for item in measured])
     others = measured_branches(model, p, rest, measured, predictions)
@@ -99,6 +102,11 @@ def _stage(
         for prediction, item, other in zip(predictions, measured, others, strict=True)
         if prediction is not None
     }
+    if uncertainty is not None:
+        for item, known in zip(measured, predictions, strict=True):
+            if known is not None:
+                spread = _spread(model, p, item, known, uncertainty)
+                shapes[item.pose.name] = replace(shapes[item.pose.name], spread=spread)
     lost = [item for item in measured if item.pose.name not in shapes]
     if lost:
         names = ", ".join(item.pose.name for item in lost)
@@ -120,6 +128,19 @@ def _stage(
         rms_distance(on_branch, measured, held_out=True),
         tuple(item.pose.name for item in lost if item.held_out and item.readable),
     )
+
+
+def _spread(
+    model: CableModel,
+    p: FloatArray,
+    item: MeasuredPose,
+    known: Prediction,
+    uncertainty: Uncertainty,
+) -> FloatArray:
+    """Standard deviation (M,), in space (M, 2), [m] across a curve of the next hanging."""
+    places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
+    found = spread_across(model, p, known.rest, item.pose, known.equilibrium, uncertainty, places)
+    return found if model.in_space else found[:, 0]
 
 
 def _no_rest(model: CableModel) -> RestCurvatureEstimate:
@@ -241,6 +262,7 @@ def fit_stage(
         parameters,
         rest_curvature_of(fit),
         fit.chi2_per_dof,
+        uncertainty=Uncertainty.of(fit),
     )
 
 

@@ -139,7 +139,7 @@ def bound(fit: Fit, truth: Truth) -> tuple[float, FloatArray]:
     shapes, converged = problem.sweep.solve(start, truth.p, unknowns.rest(theta))
     if not converged.all():
         raise DloError("the true parameters have no equilibria near the fitted ones")
-    problem.refresh(fit.point.feet)
+    problem.refresh(theta, shapes, fit.point.feet)
     point = problem.evaluate(theta, shapes, fit.point.feet)
     hessian = problem.normal_equations(point, problem.linearize(point)).hessian
     covariance = np.linalg.inv(hessian)

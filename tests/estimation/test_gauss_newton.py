@@ -194,7 +194,7 @@ def rich(element: str, markers: bool = False) -> tuple[BatchProblem, Point]:
     shapes = solved(problem, theta)
     seen = problem.observed(theta, shapes)
     feet = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
-    problem.refresh(feet)
+    problem.refresh(theta, shapes, feet)
     return problem, problem.evaluate(theta, shapes, feet)
 
 
@@ -209,7 +209,7 @@ def residuals(problem: BatchProblem, point: Point, theta, deviation=None) -> lis
     for j, guess in zip(problem.used, point.feet, strict=True):
         item = problem.measured[j]
         s = item.located(seen[j], guess)
-        out.append(problem.whitening(j, s) @ item.residual(seen[j], s))
+        out.append(problem.whitening(j) @ item.residual(seen[j], s))
     return out
 
 
@@ -340,7 +340,7 @@ def test_noise_free_round_trip_is_exact():
     shapes = solved(problem, theta)
     seen = problem.observed(theta, shapes)
     feet = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
-    problem.refresh(feet)
+    problem.refresh(theta, shapes, feet)
     found, converged = problem.descend(problem.evaluate(theta, shapes, feet))
     assert converged
     # A standard deviation of 1e-7 m against positions of 1 m: relative 1e-6 or better, and the
@@ -349,7 +349,7 @@ def test_noise_free_round_trip_is_exact():
 
 
 def test_a_drift_comes_back():
-    """Rate and stiffness from poses in order; in another order the rate comes out wrong."""
+    """Rate and stiffness from poses in order; in another one the cable seems not to repeat."""
     model = CableModel(CABLE, 10, effects=(RestCurvatureDrift(),), n_rest=4)
     p, coefficients = np.array([0.06, 0.2]), np.array([0.5, 1.0, 1.2, 0.6])
     measured = measured_from(model, p, coefficients, 8, STD)
@@ -358,7 +358,7 @@ def test_a_drift_comes_back():
         assert abs(fit.value(name) - exact) < 3 * fit.std(name), name
     assert fit.std("rest_curvature_drift.rate") < 0.02
     shuffled = fit_model(model, [measured[k] for k in (3, 0, 7, 5, 1, 6, 2, 4)], Tolerances(), STD)
-    assert shuffled.chi2_per_dof > 2 * fit.chi2_per_dof
+    assert shuffled.problem.rest_scatter.std > 0 == fit.problem.rest_scatter.std
 
 
 @pytest.mark.parametrize("markers", [False, True])

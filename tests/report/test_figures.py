@@ -162,6 +162,7 @@ def test_a_prediction_is_drawn(tmp_path, end):
     shape = {
         "cable": "rope",
         "points": points.tolist(),
+        "band_90": np.linspace(0.0, 0.01, 21).tolist(),
         "end": end,
         "force_on_start": [0.0, -1.0],
         "force_on_end": [0.0, 0.0],

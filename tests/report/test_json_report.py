@@ -23,6 +23,7 @@ KEYS = {
     "timing_s": dict,
     "measurement": dict,
     "stages": list,
+    "repeatability": dict,
     "discretization": dict,
     "effects": list,
     "candidates": list,

@@ -17,7 +17,6 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_file import (
-    covariance_si,
     final_rest,
     fit_dict,
     load_parameters,
@@ -132,7 +131,7 @@ def test_covariance_is_in_si_units(outcome, file):
     curvature = outcome.stage("batch").rest_curvature
     # B-splines are positive and sum to one: a curve's std is of the size of its coefficients'.
     assert np.sqrt(metadata.covariance[rest, rest]) < 20 * curvature.std.max()
-    _, covariance = covariance_si(fit)
+    _, covariance = fit.named_covariance
     assert np.array_equal(covariance, covariance.T)
 
 
@@ -258,7 +257,7 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
         (lambda d: d.update(n=20.5), "n must be a whole number, found 20.5"),
         (
             lambda d: d.update(n_rest=100_000),
-            "n_rest must be a whole number, found 100000: 4 to 64",
+            "n_rest must be a whole number, found 100000: 0 to 64",
         ),
         (
             lambda d: d["cable"].update(bending_stiffness=1e-300),

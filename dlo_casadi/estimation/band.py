@@ -1,0 +1,97 @@
+"""The band in which the next hanging of a pose is expected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from dlo_casadi.equilibrium import Equilibrium, Pose
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.floating]
+
+# Share of the next hangings inside the band, and the standard deviations to its edges.
+COVERED = 0.9
+EDGE = float(norm.isf((1 - COVERED) / 2))
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What makes a prediction uncertain.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Fitted parameters and `rest_curvature[k]`.
+    covariance : (N, N)
+        Of these, in SI units.
+    scatter : mapping of str to float
+        Standard deviation of where each fixture is, pose by pose, by the deviation's name.
+    rest_scatter : RestScatter
+    """
+
+    names: tuple[str, ...]
+    covariance: FloatArray
+    scatter: Mapping[str, float]
+    rest_scatter: RestScatter
+
+    @classmethod
+    def of(cls, fit: Fit) -> Uncertainty:
+        """What a fit has found."""
+        names, covariance = fit.named_covariance
+        used = [fit.model.deviation_names[k] for k in fit.problem.sweep.used_deviations]
+        scatter = dict(zip(used, map(float, fit.problem.deviation_std), strict=True))
+        return cls(names, covariance, scatter, fit.problem.rest_scatter)
+
+
+def spread_across(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    pose: Pose,
+    found: Equilibrium,
+    uncertainty: Uncertainty,
+    s: FloatArray,
+) -> FloatArray:
+    """Standard deviation (K, d - 1) [m] across the cable of the next hanging, at places s [m].
+
+    First order: the fitted parameters' covariance, the fixtures' scatter and the rest curvature
+    of each hanging's own, carried to the shape by the equilibrium. The noise of a measurement
+    comes on top.
+    """
+    sweep = Sweep(model, [pose])
+    shapes, size = found.shapes, len(uncertainty.names)
+    by_p, by_rest = np.zeros((len(p), size)), np.zeros((len(rest), size))
+    for k, name in enumerate(uncertainty.names):
+        if name in model.names:
+            by_p[model.names.index(name), k] = 1.0
+        else:
+            coefficient = int(name.removeprefix("rest_curvature[").removesuffix("]"))
+            by_rest[:, k] = model.rest_basis[:, coefficient]
+    along = sweep.directions(shapes, p, rest, by_p, by_rest)
+    seen = sweep.observe(shapes, p, rest, along)
+    curve = NodeCurve.of(model.cable.length, seen.z[0])
+    normals = curve.normals(s)
+
+    def across(slopes: FloatArray) -> FloatArray:
+        return np.einsum("knd,kdq->knq", normals, curve.moved(s, slopes))
+
+    way = across(seen.slopes[0])
+    fitted, own = way[..., :size], way[..., size:]
+    variance = np.einsum("knq,qr,knr->kn", fitted, uncertainty.covariance, fitted)
+    scatter = np.array([uncertainty.scatter.get(name, 0.0) for name in model.deviations])
+    variance += ((own * np.where(np.isfinite(scatter), scatter, 0.0)) ** 2).sum(axis=2)
+    if uncertainty.rest_scatter.std > 0:
+        modes = modes_in(model)
+        hanging = sweep.observe(shapes, p, rest, sweep.by_rest(shapes, p, rest, modes))
+        sizes = np.tile(uncertainty.rest_scatter.sizes, modes.shape[1] // MODES)
+        variance += ((across(hanging.slopes[0]) * sizes) ** 2).sum(axis=2)
+    return np.sqrt(np.maximum(variance, 0.0))

@@ -1,0 +1,296 @@
+"""Cables that do not come back to the same shape: every hanging has a rest curvature of its own.
+
+    kappa_j(s) = kappa_0(s) + std sum_k sqrt(v_k) c_jk f_k(s),    c_jk ~ N(0, 1)
+    f_0 = 1, f_k = sqrt(2) cos(k pi s / L),    v_k ~ exp(-(k pi l / L)^2 / 2),    sum_k v_k = 1
+
+Friction between strands and set leave it. To first order it moves the residuals of pose j by
+std E_j c_j, so that their covariance is that of the noise plus std^2 E_j E_j^T.
+
+A model that lacks something leaves residuals, too, but alike in poses that are alike. So a second
+part, correlated over the poses' shapes, takes what is systematic while the size of the random one
+is estimated:
+
+    cov(c_j, c_k) = std^2 delta_jk + systematic^2 exp(-d_jk^2 / (2 range^2))
+
+with d_jk the RMS distance of the two shapes. All sizes maximise the restricted likelihood.
+
+References
+----------
+Patterson and Thompson, Biometrika 58 (1971); Kennedy and O'Hagan, J. R. Statist. Soc. B 63 (2001).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from dlo_casadi.model import CableModel
+
+FloatArray = NDArray[np.floating]
+
+# Cosines of a rest curvature, and its correlation lengths that are tried, shares of L.
+MODES = 8
+SMOOTHNESS = (0.5, 0.25, 0.12)
+# Ranges of what is systematic that are tried, shares of the RMS distance of the poses' shapes.
+RANGES = (0.25, 1.0)
+# Decrease of -2 log likelihood from which a size is not taken as zero: 1 % of chi-square.
+TELLING = float(chi2.isf(0.01, 1))
+# Poses that are used at most, evenly picked.
+MOST_POSES = 40
+# Smallest and largest size in units of the first guess that are looked at.
+_LOWEST, _HIGHEST = np.log(1e-4), np.log(1e2)
+
+
+@dataclass(frozen=True)
+class RestScatter:
+    """Random rest curvature of every hanging.
+
+    Parameters
+    ----------
+    std : float [1/m]
+        Root mean square along the cable; 0 where the cable repeats.
+    smoothness : float
+        Correlation length as a share of the cable's.
+    dof : float
+        Degrees of freedom of chi-square with which its variance is known.
+    """
+
+    std: float = 0.0
+    smoothness: float = SMOOTHNESS[0]
+    dof: float = np.inf
+
+    @property
+    def sizes(self) -> FloatArray:
+        """Standard deviation (MODES,) [1/m] of each mode's coefficient."""
+        return self.std * np.sqrt(_shares(self.smoothness))
+
+
+def modes_of(cells: FloatArray, length: float) -> FloatArray:
+    """Means of the modes f_k over cells (n_cells, 2) [m]: (n_cells, MODES)."""
+    k = np.arange(1, MODES)
+    primitive = np.sin(np.pi / length * np.multiply.outer(cells, k)) * length / (k * np.pi)
+    waves = (primitive[:, 1] - primitive[:, 0]) / (cells[:, 1] - cells[:, 0])[:, None]
+    return np.column_stack([np.ones(len(cells)), np.sqrt(2.0) * waves])
+
+
+def modes_in(model: CableModel) -> FloatArray:
+    """The same as rest curvatures of a model's cells, axis by axis: (n_rests, axes MODES)."""
+    axes = np.eye(len(model.node.strains))[:, -len(model.node.curvatures) :]
+    return np.kron(axes, modes_of(model.chain.cells, model.cable.length))
+
+
+def _shares(smoothness: float) -> FloatArray:
+    """Shares v_k (MODES,) of the variance."""
+    share = np.exp(-((np.arange(MODES) * np.pi * smoothness) ** 2) / 2)
+    return np.asarray(share / share.sum())
+
+
+@dataclass(frozen=True)
+class ScatterSample:
+    """What one pose tells: residuals e, and what moves them, all whitened by the noise.
+
+    Parameters
+    ----------
+    e : (R,)
+    rest : (R, axes MODES)
+        By a rest curvature of 1 / m in each mode, about each axis of the section.
+    own : (R, a)
+        By what else is the pose's own, one standard deviation each.
+    shared : (R, b)
+        By the unknowns of all poses, in any units.
+    """
+
+    e: FloatArray
+    rest: FloatArray
+    own: FloatArray
+    shared: FloatArray
+
+
+@dataclass(frozen=True)
+class Variances:
+    """Most likely sizes.
+
+    Parameters
+    ----------
+    noise : float
+        Factor on the standard deviation of the noise: where that is known, for what points are
+        off beyond it, which is no rest curvature either.
+    std, systematic : float [1/m]
+    deviance : float
+        -2 log restricted likelihood, up to a constant.
+    """
+
+    noise: float
+    std: float
+    systematic: float
+    deviance: float
+
+
+class RestLikelihood:
+    """Restricted likelihood of a session's poses.
+
+    Parameters
+    ----------
+    samples : sequence of ScatterSample
+    distances : (m, m) [m]
+        Between the poses' shapes, root mean square.
+    """
+
+    def __init__(self, samples: Sequence[ScatterSample], distances: FloatArray) -> None:
+        self.m, self.modes = len(samples), samples[0].rest.shape[1]
+        self.count = sum(len(sample.e) for sample in samples)
+        shared = np.concatenate([sample.shared for sample in samples])
+        left, values, _ = np.linalg.svd(
+            shared / np.maximum(np.abs(shared).max(axis=0), 1e-300), full_matrices=False
+        )
+        left = left[:, values > 1e-6 * max(values[:1].max(initial=0.0), 1e-300)]
+        blocks = np.split(left, np.cumsum([len(sample.e) for sample in samples])[:-1])
+        self.free = self.count - left.shape[1]
+        fixed = [np.column_stack([x, s.e]) for x, s in zip(blocks, samples, strict=True)]
+        self.fixed = np.array([x.T @ x for x in fixed]).sum(axis=0)
+        random = [np.column_stack([s.rest, s.own]) for s in samples]
+        self.random = np.array([z.T @ z for z in random])
+        self.cross = np.array([z.T @ x for z, x in zip(random, fixed, strict=True)])
+        self.distances = distances
+        square = (distances**2).sum() / max(self.m * (self.m - 1), 1)
+        # Poses taken again and again are alike at any range.
+        self.apart = max(float(np.sqrt(square)), 1e-9)
+
+    def deviance(
+        self, noise: float, std: float, systematic: float, smoothness: float, range_: float
+    ) -> tuple[float, float]:
+        """-2 log restricted likelihood, and the quadratic form in it.
+
+        By Woodbury's identity, with all poses' random parts in one matrix.
+        """
+        m, q, r = self.m, self.random.shape[1], self.modes
+        root = np.full(q, 1 / noise)
+        root[:r] *= std * np.sqrt(np.tile(_shares(smoothness), r // MODES))
+        inside = self.random * root[:, None] * root
+        cross = self.cross * root[None, :, None]
+        if systematic > 0 and m > 1:
+            size = systematic / std
+            alike = np.exp(-((self.distances / range_) ** 2) / 2)
+            values, vectors = np.linalg.eigh(np.eye(m) + size**2 * alike)
+            mix = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+            whole = np.zeros((m, q, m, q))
+            for i in range(m):
+                whole[i, :, i] = np.eye(q)
+                whole[i, :r, :, :r] = np.einsum("j,ab->ajb", mix[i], np.eye(r))
+            spread = whole.reshape((m * q, m * q))
+            blocks = np.zeros((m, q, m, q))
+            for i in range(m):
+                blocks[i, :, i] = inside[i]
+            inside_all = spread @ blocks.reshape((m * q, m * q)) @ spread
+            factor = np.linalg.cholesky(np.eye(m * q) + inside_all)
+            logdet = 2 * float(np.log(np.diag(factor)).sum())
+            half = np.linalg.solve(factor, spread @ cross.reshape((m * q, -1)))
+            taken = half.T @ half
+        else:
+            factor = np.linalg.cholesky(np.eye(q) + inside)
+            logdet = 2 * float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
+            half = np.linalg.solve(factor, cross)
+            taken = np.einsum("mqa,mqb->ab", half, half)
+        gram = self.fixed - taken
+        x, y = gram[:-1, :-1], gram[:-1, -1]
+        quadratic = float(gram[-1, -1])
+        if len(x):
+            factor = np.linalg.cholesky(x + 1e-9 * np.trace(x) / len(x) * np.eye(len(x)))
+            logdet += 2 * float(np.log(np.diag(factor)).sum())
+            quadratic -= float((np.linalg.solve(factor, y) ** 2).sum())
+        quadratic /= noise**2
+        return self.free * 2 * np.log(noise) + logdet + quadratic, quadratic
+
+    def best(
+        self, smoothness: float, range_: float | None, std: bool = True, guess: float = 0.1
+    ) -> Variances:
+        """Most likely sizes for a smoothness, and a range of what is systematic, or none.
+
+        Parameters
+        ----------
+        std : bool
+            Whether there may be a random part at all.
+        guess : float [1/m]
+            Where to start.
+        """
+        free = [True, std, range_ is not None]
+        low = guess * np.exp(_LOWEST)
+
+        def sizes(q: FloatArray) -> tuple[float, float, float]:
+            full = np.array([0.0, _LOWEST, -np.inf])
+            full[free] = np.clip(q, _LOWEST, _HIGHEST)
+            noise, random, systematic = np.exp(full)
+            return float(noise), float(max(guess * random, low)), float(guess * systematic)
+
+        def deviance(q: FloatArray) -> float:
+            outside = float(((q - np.clip(q, _LOWEST, _HIGHEST)) ** 2).sum())
+            return self.deviance(*sizes(q), smoothness, range_ or 1.0)[0] + outside
+
+        count = sum(free)
+        start = np.zeros(count)
+        simplex = np.vstack([start, start - 1.5 * np.eye(count)])
+        found = minimize(
+            deviance,
+            start,
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 0.03, "fatol": 0.02, "maxfev": 80},
+        )
+        return Variances(*sizes(found.x), float(found.fun))
+
+    def degrees(self, found: Variances, smoothness: float, range_: float | None) -> float:
+        """Degrees of freedom with which the random part's variance is known.
+
+        -2 log likelihood of k degrees of freedom has the curvature 2 k by the logarithm of a std.
+        """
+        step = 0.2
+
+        def deviance(shift: float) -> float:
+            std = found.std * float(np.exp(shift))
+            sizes = (found.noise, std, found.systematic)
+            return self.deviance(*sizes, smoothness, range_ or 1.0)[0]
+
+        bend = (deviance(step) + deviance(-step) - 2 * deviance(0.0)) / step**2
+        return float(max(bend / 2, 1.0))
+
+
+@dataclass(frozen=True)
+class ScatterEstimate:
+    """What a session tells of a cable that does not repeat.
+
+    Parameters
+    ----------
+    rest : RestScatter
+    noise : float
+        Factor on the standard deviation of the noise.
+    p_systematic : float
+        Probability of as much that is alike in poses that are alike, if all is random.
+    """
+
+    rest: RestScatter
+    noise: float
+    p_systematic: float
+
+
+def estimate_rest_scatter(likelihood: RestLikelihood) -> ScatterEstimate:
+    """Sizes of maximal restricted likelihood: only what differs between poses alike is random."""
+    alone = {s: likelihood.best(s, None) for s in SMOOTHNESS}
+    smoothness = min(alone, key=lambda s: alone[s].deviance)
+    chosen, range_, guess = alone[smoothness], None, alone[smoothness].std
+    ranges = [r * likelihood.apart for r in RANGES] if likelihood.m > 2 else []
+    both = {r: likelihood.best(smoothness, r, guess=guess) for r in ranges}
+    joint = min(both, key=lambda r: both[r].deviance, default=None)
+    gain = 0.0 if joint is None else max(chosen.deviance - both[joint].deviance, 0.0)
+    # The best of the ranges; at a bound of zero half of chi-square's probability.
+    p_systematic = float(min(1.0, 0.5 * len(RANGES) * chi2.sf(gain, 1)))
+    if joint is not None and gain > TELLING:
+        chosen, range_ = both[joint], joint
+    without = likelihood.best(smoothness, range_, std=False, guess=guess)
+    if without.deviance - chosen.deviance < TELLING:
+        return ScatterEstimate(RestScatter(), without.noise, p_systematic)
+    dof = likelihood.degrees(chosen, smoothness, range_)
+    return ScatterEstimate(RestScatter(chosen.std, smoothness, dof), chosen.noise, p_systematic)

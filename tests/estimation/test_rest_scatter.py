@@ -1,0 +1,97 @@
+"""Cables that do not repeat: the restricted likelihood by two routes, and what it finds."""
+
+import numpy as np
+import pytest
+
+from dlo_casadi.estimation.rest_scatter import (
+    MODES,
+    RestLikelihood,
+    RestScatter,
+    ScatterSample,
+    estimate_rest_scatter,
+    modes_of,
+)
+
+M, ROWS = 9, 6
+
+
+def session(std: float, systematic: float = 0.0, seed: int = 0, rows: int = ROWS):
+    """Poses in a row with random sensitivities: samples, distances of their shapes."""
+    rng = np.random.default_rng(seed)
+    sizes = RestScatter(1.0, 0.5).sizes
+    place = np.linspace(0.0, 1.0, M)
+    distances = np.abs(place[:, None] - place[None])
+    common = rng.normal(size=(3, MODES))
+    waves = np.stack([np.sin(2 * place), np.cos(2 * place), place], axis=1)
+    samples = []
+    for j in range(M):
+        rest, own = rng.normal(scale=30.0, size=(rows, MODES)), rng.normal(size=(rows, 1))
+        shared = rng.normal(size=(rows, 2))
+        c = sizes * (std * rng.normal(size=MODES) + systematic * (waves[j] @ common))
+        e = rng.normal(size=rows) + rest @ c + own @ rng.normal(size=1) + shared @ [3.0, -2.0]
+        samples.append(ScatterSample(e, rest, own, shared))
+    return samples, distances
+
+
+@pytest.mark.parametrize("systematic", [0.0, 0.2])
+def test_deviance_against_the_full_covariance(systematic):
+    """Woodbury, pose by pose, and the textbook form with all rows in one matrix."""
+    samples, distances = session(0.1)
+    noise, std, smoothness, range_ = 1.3, 0.15, 0.25, 0.3
+    likelihood = RestLikelihood(samples, distances)
+    found, quadratic = likelihood.deviance(noise, std, systematic, smoothness, range_)
+    sizes = RestScatter(1.0, smoothness).sizes
+    alike = np.exp(-((distances / range_) ** 2) / 2)
+    rest = np.zeros((M * ROWS, M * MODES))
+    own = np.zeros((M * ROWS, M))
+    for j, x in enumerate(samples):
+        rows = slice(j * ROWS, (j + 1) * ROWS)
+        rest[rows, j * MODES : (j + 1) * MODES] = x.rest * sizes
+        own[rows, j] = x.own[:, 0]
+    between = np.kron(std**2 * np.eye(M) + systematic**2 * alike, np.eye(MODES))
+    covariance = noise**2 * np.eye(M * ROWS) + rest @ between @ rest.T + own @ own.T
+    x = np.concatenate([s.shared for s in samples])
+    x = np.linalg.svd(x / np.abs(x).max(axis=0), full_matrices=False)[0]
+    e = np.concatenate([s.e for s in samples])
+    weight = np.linalg.inv(covariance)
+    information = x.T @ weight @ x
+    projected = weight - weight @ x @ np.linalg.solve(information, x.T @ weight)
+    assert quadratic == pytest.approx(e @ projected @ e, rel=1e-6)
+    exact = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1] + quadratic
+    assert found == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_random_rest_curvature_is_found_beside_unknown_noise():
+    """Nine poses of six numbers: within a third, on average over twenty sessions."""
+    found = [
+        estimate_rest_scatter(RestLikelihood(*session(0.2, seed=k, rows=12))) for k in range(20)
+    ]
+    assert np.mean([x.rest.std for x in found]) == pytest.approx(0.2, rel=0.15)
+    assert np.mean([x.noise for x in found]) == pytest.approx(1.0, rel=0.15)
+    assert min(x.p_systematic for x in found) > 0.005 / 20
+
+
+def test_a_cable_that_repeats_has_none():
+    """A threshold of one percent: at most one of twenty sessions."""
+    found = [
+        estimate_rest_scatter(RestLikelihood(*session(0.0, seed=k))).rest.std for k in range(20)
+    ]
+    assert np.count_nonzero(found) <= 1
+
+
+def test_what_poses_that_are_alike_have_in_common_is_not_random():
+    """A function of the pose, as a missing effect leaves it."""
+    for seed in range(5):
+        samples, distances = session(0.0, 0.5, seed)
+        found = estimate_rest_scatter(RestLikelihood(samples, distances))
+        assert found.p_systematic < 1e-6
+        assert found.rest.std < 0.1
+
+
+def test_modes_have_the_std_along_the_cable():
+    """RMS over all hangings and places: the sum of the variances."""
+    cells = np.stack([np.arange(400), np.arange(1, 401)], axis=1) * 0.002
+    waves = modes_of(cells, 0.8)
+    for smoothness in (0.5, 0.12):
+        variance = (waves**2 @ RestScatter(0.3, smoothness).sizes ** 2).mean()
+        assert variance == pytest.approx(0.09, rel=1e-4)  # means over cells instead of values
