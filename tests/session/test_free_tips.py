@@ -124,7 +124,7 @@ def test_in_space_a_cable_is_followed_too():
     """In a vertical plane, gravity along -z and the gripper turned about y; twist has no part."""
     cable = replace(MODEL.cable, torsional_stiffness=0.02)
     model = CableModel(cable, 12, start="clamped", end="free", gravity=(0.0, 0.0, -9.81))
-    rest = np.zeros(2 * model.chain.n_cells)
+    rest = np.zeros(model.chain.n_rests)
 
     def gripper(beyond):
         half = -(UP + beyond) / 2  # counter-clockwise against y
