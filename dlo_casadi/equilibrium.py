@@ -21,7 +21,7 @@ from dlo_casadi.initial_frames import guessed_frames_of
 from dlo_casadi.model import COARSE_MESH, CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
-from dlo_casadi.rod.node import Frame
+from dlo_casadi.rod.node import Frame, quaternion_product
 from dlo_casadi.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
@@ -107,6 +107,14 @@ class Pose:
             start_orientation=orientations[0],
             end_orientation=orientations[1],
         )
+
+    def rolled(self, angle: float) -> Pose:
+        """The pose with its end clamp, in space, turned about its x axis [rad]."""
+        if self.end_orientation is None:
+            return self
+        roll = (np.sin(angle / 2), 0.0, 0.0, np.cos(angle / 2))
+        turned = quaternion_product(self.end_orientation, roll)
+        return replace(self, end_orientation=tuple(float(x) for x in turned))
 
     @property
     def vector(self) -> FloatArray:

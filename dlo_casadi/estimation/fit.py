@@ -31,6 +31,8 @@ FloatArray = NDArray[np.floating]
 
 # Decades about the prior stiffness from which fits are started.
 DECADES = (0, -1, 1, -2, 2, -3, 3)
+# Rolls of the end [rad] about which twists are counted in turn: a standard deviation to both sides.
+ROLLS = (0.0, 1.0, -1.0)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
 # Of many poses only so many, evenly picked, are searched for where to start with all.
 POSES_OF_A_SEARCH = 40
@@ -59,21 +61,28 @@ def starting_points(
     A start takes 0.02 to 0.1 s, less than a process takes to begin: they run in this one unless
     an executor is given.
     """
-    starts = [theta.copy() for _ in decades]
+    model, names = problem.unknowns.model, problem.unknowns.names
     # Bending and torsion go together: their ratio is known better than either.
-    stiffnesses = [k for k, name in enumerate(problem.unknowns.names) if name in STIFFNESSES]
-    for start, decade in zip(starts, decades, strict=True):
-        start[stiffnesses] += decade * np.log(10)
-    shapes, feet = measured_shapes(problem)
-    if not problem.has_metric:
-        problem.refresh(theta, shapes, feet)
+    stiffnesses = [k for k, name in enumerate(names) if name in STIFFNESSES]
+    rolls = ROLLS if END_ROLL in names else (0.0,)
+    looks = LOOKS_IN_SPACE if model.in_space else LOOKS
     # The roll of a cable in its end clamp is as unknown as its rest shape.
-    names = problem.unknowns.names
     held = np.array([k < problem.unknowns.n_parameters for k in range(len(names))])
     held &= np.array([name != END_ROLL for name in names])
-    looks = LOOKS_IN_SPACE if problem.unknowns.model.in_space else LOOKS
-    begin = partial(all_at_once, problem, shapes, feet, held=held, looks=looks)
-    found = map_in_order(executor or InProcess(), begin, starts)
+    found: list[Point | None] = []
+    for roll in rolls:
+        shapes, feet = measured_shapes(problem, roll)
+        if not problem.has_metric:
+            problem.refresh(theta, shapes, feet)
+        starts = [theta.copy() for _ in decades]
+        for start, decade in zip(starts, decades, strict=True):
+            start[stiffnesses] += decade * np.log(10)
+            if roll:
+                start[names.index(END_ROLL)] += (
+                    roll / problem.unknowns.scales[names.index(END_ROLL)]
+                )
+        begin = partial(all_at_once, problem, shapes, feet, held=held, looks=looks)
+        found += map_in_order(executor or InProcess(), begin, starts)
     points = [point for point in found if point is not None and np.isfinite(point.objective)]
     return sorted(points, key=lambda point: point.objective)
 

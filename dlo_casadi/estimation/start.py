@@ -28,11 +28,17 @@ SETTLED = 1e-3
 LOOKS, LOOKS_IN_SPACE = (6,), (6, 12, 20)
 
 
-def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
+def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, list[FloatArray]]:
     """Shapes of all poses: along the measured line where there is one, guessed elsewhere.
 
     Gauss-Newton on the kinematics alone, all poses in step: distances of the points, with a
     small penalty on the second differences of the headings where no point holds them.
+
+    Parameters
+    ----------
+    roll : float [rad]
+        Of the cable in its end clamp, in space: it decides which of the twists that reach the
+        clamp is the one nearest to none.
 
     Returns
     -------
@@ -53,7 +59,7 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
     for j in used:
         item = problem.measured[j]
         places = item.places(chain.length)
-        x[j] = line_nodes(item.points, item.pose, chain, places)
+        x[j] = line_nodes(item.points, item.pose.rolled(roll), chain, places)
         feet.append(places)
     shapes = problem.sweep.start_shapes(x)
     each = _each_node(sweep)
@@ -66,7 +72,12 @@ def measured_shapes(problem: BatchProblem) -> tuple[Shapes, list[FloatArray]]:
                 feet[k] = problem.measured[j].located(now, feet[k])
             if iteration < _KINEMATIC_STEPS:
                 step = _kinematic_step(
-                    problem.measured[j], model, curve, seen.slopes[j], x[j], feet[k]
+                    replace(problem.measured[j], pose=problem.measured[j].pose.rolled(roll)),
+                    model,
+                    curve,
+                    seen.slopes[j],
+                    x[j],
+                    feet[k],
                 )
                 x[j] = model.node.moved(x[j], step)
     return shapes, feet
