@@ -42,7 +42,8 @@ CLEARLY_WORSE = 2.0
 BIC_APART = 10.0
 
 # Different poses from which effects are told by how they change from pose to pose: few may differ
-# by chance, as two hangings of one do. Of five poses a missing force of 0.4 N passed for scatter.
+# by chance, as two hangings of one do. With 3 here, a missing force of 0.4 N passed for scatter in
+# five poses; 6 is a judgement above that case, its power against others not measured.
 DIFFERENT = 6
 
 # ---- what an explanation has to do -------------------------------------------------------------

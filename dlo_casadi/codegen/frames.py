@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from dlo_casadi.model import CableModel
+from dlo_casadi.rod.helix import inverse_of
 from dlo_casadi.rod.node import conjugate, quaternion_product
 
 # Keeps a quotient of two squares of an angle at a straight element finite.
@@ -192,19 +193,6 @@ def _in_frame(
         bend[:3, :3], bend[:3, 3:], bend[3:, 3:], inverse, mixed[:, :3], mixed[:, 3:], twice
     )
     return value, slope[:3], ca.reshape(by_force, body.shape), blocks
-
-
-def inverse_of(a: ca.SX) -> ca.SX:
-    """Inverse of a symmetric matrix (3, 3)."""
-    c00 = a[1, 1] * a[2, 2] - a[1, 2] ** 2
-    c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
-    c02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
-    c11 = a[0, 0] * a[2, 2] - a[0, 2] ** 2
-    c12 = a[0, 1] * a[0, 2] - a[0, 0] * a[1, 2]
-    c22 = a[0, 0] * a[1, 1] - a[0, 1] ** 2
-    scale = 1 / (a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02)
-    rows = [[c00, c01, c02], [c01, c11, c12], [c02, c12, c22]]
-    return scale * ca.vertcat(*(ca.horzcat(*row) for row in rows))
 
 
 def _at_nodes(

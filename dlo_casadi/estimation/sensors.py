@@ -7,6 +7,7 @@ fixed own unknowns.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
@@ -99,7 +100,7 @@ class Sensor(Protocol):
 
 
 @dataclass(frozen=True)
-class _Points:
+class _Points(ABC):
     """Points in the board's or the world's frame, compared where they are on the curve."""
 
     points: FloatArray
@@ -116,14 +117,14 @@ class _Points:
         """Change (R, q) of the residual along directions."""
         return -self.components(seen.curve, places, seen.curve.moved(places, along.curve))
 
+    @abstractmethod
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def per_point(self) -> int:
         """Residuals of a point."""
-        raise NotImplementedError
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) [1/m] with W cov W^T = 1; the errors of a point are independent."""

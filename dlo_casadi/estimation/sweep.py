@@ -30,7 +30,7 @@ REACH = 1.5
 # gradients cost less than one matrix. Steps longer than NEAR [rad] change the matrix too much.
 CONTRACTION = 0.2
 NEAR = 0.1
-# Iterations of a descent to a minimum: of random poses in space it takes 7 to 23.
+# Iterations of a descent to a minimum: the poses of one session in space took 7 to 23.
 DOWNHILL = 40
 
 

@@ -161,7 +161,7 @@ class BowedHelix(Helix):
     ) -> Condensed:
         """Minimum over the bow, resisted by the section alone."""
         torque, given, elastic = self._of_bow(slot, lagrangian, bending)
-        bow = -ca.mtimes(_inverse(elastic), torque)
+        bow = -ca.mtimes(inverse_of(elastic), torque)
         return Condensed(given + ca.dot(torque, bow) / 2, bow, slot.square)
 
     def expanded(self, slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]) -> ca.SX:
@@ -181,7 +181,7 @@ class BowedHelix(Helix):
         return torque, given, elastic
 
 
-def _inverse(a: ca.SX) -> ca.SX:
+def inverse_of(a: ca.SX) -> ca.SX:
     """Inverse of a symmetric matrix (3, 3), by cofactors."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] ** 2
     c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]

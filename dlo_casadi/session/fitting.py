@@ -20,8 +20,8 @@ from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.session.declared import REST_COEFFICIENTS, Declared
 from dlo_casadi.thresholds import MESH_SHARE
 
-# The search over decades of stiffness runs on this mesh; in space, where an element costs thirty
-# times as much, on half of it.
+# The search over decades of stiffness runs on this mesh; in space, where an element takes 17
+# times the operations, on half of it.
 FIRST_MESH, FIRST_MESH_IN_SPACE = 20, 10
 FINEST_MESH = 160
 # The search for missing effects, a hundred refits, runs on at most so many elements.

@@ -89,6 +89,25 @@ def test_a_planar_load_gives_the_numbers_of_the_plane():
     assert found.energy == pytest.approx(flat.energy, abs=1e-11)
 
 
+def test_a_cable_that_may_leave_its_plane_falls_out_of_it():
+    """An arch held in a plane is an equilibrium in space, too, but not the lowest."""
+    plane = CableModel(
+        Cable(LENGTH, 0.12, 0.006, EI), n=16, element="arc", start="clamped", end="clamped"
+    )
+    none = np.zeros(plane.chain.n_rests)
+    flat = solve_equilibrium(plane, plane.nominal, none, Pose((0.0, 0.0), (0.5, 0.1), 0.4, -0.3))
+    m = model(16, "arc", gravity=(0.0, -9.81, 0.0))
+    place = pose((0.5, 0.1, 0.0), (0.0, 0.0, 0.4), (0.0, 0.0, -0.3))
+    frames = Rotation.from_rotvec(np.outer(flat.phi, [0.0, 0.0, 1.0])).as_quat()
+    rest = np.zeros(m.chain.n_rests)
+    held = solve_equilibrium(m, m.nominal, rest, place, x_init=same_sign(frames))
+    np.testing.assert_allclose(held.points[:, :2], flat.points, atol=1e-9)
+    assert held.energy == pytest.approx(flat.energy, abs=1e-11)
+    fallen = solved(m, place)
+    assert fallen.energy < flat.energy
+    assert np.abs(fallen.points[:, 2]).max() > 0.1
+
+
 def test_a_helix_under_moments_alone():
     """Without forces the moment is constant in space: with EI = GJ the strain in the cable."""
     twist, bend = 3.0, 4.0
