@@ -36,9 +36,9 @@ ROLLS = (0.0, 1.0, -1.0)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
 # Of many poses only so many, evenly picked, are searched for where to start with all.
 POSES_OF_A_SEARCH = 40
-# Iterations in which a start that is not the first has to come below the best minimum. Seen in one
-# session in space: two rivals crept for 40 along a valley in which weight hardly tells. A judgement,
-# not a measured limit.
+# Iterations in which a start that is not the first has to come below the best minimum. In one
+# session in space two rivals crept for 40 along a valley in which weight hardly tells. A
+# judgement, not a measured limit.
 STEPS_OF_A_RIVAL = 10
 # Standard deviation of points in a search in space, over the length. Of three sessions in which an
 # effect is missing, one (space_flat) found its minimum at the noise, too; at 3 mm two did, and one
