@@ -12,8 +12,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkProcess
 from typing import Any
 
-# Data of one process [bytes]; processor time of an input [s], which other work on the machine does
-# not stretch; and time by the clock, for one that waits for ever.
+# Data of one process beyond what it was born with [bytes]; processor time of an input [s], which
+# other work on the machine does not stretch; and time by the clock, for one that waits for ever.
 MOST_MEMORY = 2 * 10**9
 MOST_SECONDS = 10.0
 _MOST_WAITING = 600.0
@@ -101,7 +101,8 @@ def _serve(
 ) -> None:
     other.close()
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what libraries print of a damaged picture
-    resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY, MOST_MEMORY))
+    most = _data_size() + MOST_MEMORY
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     while True:
         try:
             item = connection.recv()
@@ -112,6 +113,13 @@ def _serve(
         except MemoryError as error:
             found = "memory", str(error)
         connection.send(found)
+
+
+def _data_size() -> int:
+    """Data that this process already has, its parent's at the fork [bytes]."""
+    with open("/proc/self/status") as file:
+        (line,) = (line for line in file if line.startswith("VmData:"))
+    return int(line.split()[1]) * 1024
 
 
 def _processor_time(pid: int | None) -> float:
