@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +18,9 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import LOOKS, LOOKS_IN_SPACE, all_at_once, measured_shapes
+from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.executors import InProcess
 from dlo_casadi.model import END_ROLL, STIFFNESSES, CableModel
-from dlo_casadi.parallel import map_in_order
 from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
@@ -34,6 +30,12 @@ DECADES = (0, -1, 1, -2, 2, -3, 3)
 # Rolls of the end [rad] about which twists are counted in turn: a standard deviation to both sides.
 ROLLS = (0.0, 1.0, -1.0)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
+# Iterations of all starts, and how many more the promising ones take in space, where frames take
+# longer: at the true stiffnesses, none of three sessions in which an effect is missing had settled
+# after 6, two had after 12 to 20, one had not.
+FIRST_LOOK, MORE = 6, 14
+# Starts that are descended from, and unknowns [scaled] within which two starts are one.
+DESCENTS, ALIKE = 3, 1e-2
 # Of many poses only so many, evenly picked, are searched for where to start with all.
 POSES_OF_A_SEARCH = 40
 # Iterations in which a start that is not the first has to come below the best minimum. In one
@@ -55,37 +57,54 @@ def starting_points(
     problem: BatchProblem,
     theta: FloatArray,
     decades: Sequence[float] = DECADES,
-    executor: Executor | None = None,
 ) -> list[Point]:
     """Equilibria near the measured shapes for stiffnesses over decades, best first.
 
-    A start takes 0.02 to 0.1 s, less than a process takes to begin: they run in this one unless
-    an executor is given.
+    All starts take a few iterations, then the most promising take more, until as many as are
+    descended from have led to equilibria.
     """
-    model, names = problem.unknowns.model, problem.unknowns.names
+    names = problem.unknowns.names
     # Bending and torsion go together: their ratio is known better than either.
     stiffnesses = [k for k, name in enumerate(names) if name in STIFFNESSES]
     rolls = ROLLS if END_ROLL in names else (0.0,)
-    looks = LOOKS_IN_SPACE if model.in_space else LOOKS
     # The roll of a cable in its end clamp is as unknown as its rest shape.
     held = np.array([k < problem.unknowns.n_parameters for k in range(len(names))])
     held &= np.array([name != END_ROLL for name in names])
-    found: list[Point | None] = []
+    guesses: list[Guess] = []
     for roll in rolls:
         shapes, feet = measured_shapes(problem, roll)
         if not problem.has_metric:
             problem.refresh(theta, shapes, feet)
-        starts = [theta.copy() for _ in decades]
-        for start, decade in zip(starts, decades, strict=True):
+        for decade in decades:
+            start = theta.copy()
             start[stiffnesses] += decade * np.log(10)
             if roll:
-                start[names.index(END_ROLL)] += (
-                    roll / problem.unknowns.scales[names.index(END_ROLL)]
-                )
-        begin = partial(all_at_once, problem, shapes, feet, held=held, looks=looks)
-        found += map_in_order(executor or InProcess(), begin, starts)
-    points = [point for point in found if point is not None and np.isfinite(point.objective)]
-    return sorted(points, key=lambda point: point.objective)
+                own = names.index(END_ROLL)
+                start[own] += roll / problem.unknowns.scales[own]
+            guess = all_at_once(problem, Guess(start, shapes, feet), held, FIRST_LOOK)
+            if guess is not None:
+                guesses.append(guess)
+    found: list[Point] = []
+    for guess in _promising(guesses):
+        if len(found) == DESCENTS:
+            break
+        more = all_at_once(problem, guess, held, MORE) if problem.unknowns.model.in_space else None
+        for one in (more, guess):
+            point = None if one is None else equilibria_near(problem, one)
+            if point is not None:
+                found.append(point)
+                break
+    return sorted(found, key=lambda point: point.objective)
+
+
+def _promising(guesses: Sequence[Guess]) -> list[Guess]:
+    """Guesses that differ, the best first."""
+    ranked = sorted(guesses, key=lambda guess: guess.objective)
+    return [
+        guess
+        for k, guess in enumerate(ranked)
+        if not any(np.allclose(guess.theta, other.theta, atol=ALIKE) for other in ranked[:k])
+    ]
 
 
 def fit_model(
@@ -204,9 +223,7 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
         if found is None:
             return None
         problem.refresh(found.theta, found.shapes, found.feet)
-        return problem.descend(
-            problem.evaluate(found.theta, found.shapes, found.feet), tolerance=1e-2
-        )[0]
+        return problem.evaluate(found.theta, found.shapes, found.feet)
     return _best(problem, theta, decades)
 
 
@@ -216,7 +233,7 @@ def _best(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) ->
         problem, theta, BETWEEN_DECADES
     )
     best: Point | None = None
-    for point in points[:3]:
+    for point in points:
         steps = STEPS_OF_A_RIVAL if best else 40
         candidate, _ = problem.descend(point, steps, tolerance=1e-2)
         if best is None or _better(problem, candidate, best):

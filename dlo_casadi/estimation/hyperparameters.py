@@ -77,7 +77,9 @@ def refine(
     MacKay, Neural Computation 4 (1992).
     """
     repeats = problem.rest_scatter.std == 0 and not first
-    point, converged = problem.descend(point, tolerance=1e-2)
+    converged = False
+    if not (first and problem.unknowns.model.in_space):
+        point, converged = problem.descend(point, tolerance=1e-2)
     for round_ in range(rounds):
         lin = problem.linearize(point)
         noise, rest = problem.noise, problem.rest_scatter

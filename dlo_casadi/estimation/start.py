@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,6 @@ FloatArray = NDArray[np.floating]
 _KINEMATIC_STEPS = 8
 # A step of all nodes below this [rad] has settled what is solved for all at once.
 SETTLED = 1e-3
-# In space frames take longer: at the true stiffnesses, none of three sessions in which an effect is
-# missing had settled after 6 iterations, two had after 12 to 20, one had not.
-LOOKS, LOOKS_IN_SPACE = (6,), (6, 12, 20)
 
 
 def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, list[FloatArray]]:
@@ -131,14 +127,31 @@ def _kinematic_step(
     return (step * min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))).reshape((n, b))
 
 
+@dataclass(frozen=True)
+class Guess:
+    """Values on the way to a first point: shapes that need not be equilibria yet.
+
+    Parameters
+    ----------
+    theta : (size,)
+    shapes : Shapes
+    feet : list of (K_j,) [m]
+    objective : float
+        What the linearised balance of forces promises at this theta.
+    settled : bool
+        Whether the last step was below SETTLED.
+    """
+
+    theta: FloatArray
+    shapes: Shapes
+    feet: list[FloatArray]
+    objective: float = np.inf
+    settled: bool = False
+
+
 def all_at_once(
-    problem: BatchProblem,
-    shapes: Shapes,
-    feet: list[FloatArray],
-    theta: FloatArray,
-    held: NDArray[np.bool_],
-    looks: Sequence[int] = LOOKS,
-) -> Point | None:
+    problem: BatchProblem, guess: Guess, held: NDArray[np.bool_], iterations: int
+) -> Guess | None:
     """Gauss-Newton on shapes, multipliers and unknowns together, from inconsistent values.
 
     The force balance is linearised about the measured shapes and solved along with the fit, so
@@ -148,21 +161,20 @@ def all_at_once(
     ----------
     held : (size,) bool
         Entries of theta that stay where they are.
-    looks : sequence of int
-        Iterations after which equilibria are looked for.
 
     Returns
     -------
-    Point or None
-        The best of the equilibria found near the measured shapes, or None if there is none.
+    Guess or None
+        None if the matrices became singular or the shapes not finite.
     """
     unknowns, sweep = problem.unknowns, problem.sweep
+    theta, shapes, feet = guess.theta, guess.shapes, guess.feet
     lower, upper = unknowns.bounds
     moving = ~held
     columns = sweep.used_deviations
     own = np.diag(1 / problem.deviation_std**2 + 1e-12)
-    best: Point | None = None
-    for iteration in range(max(looks)):
+    objective, settled = guess.objective, guess.settled
+    for _ in range(0 if settled else iterations):
         p, rest = unknowns.p(theta), unknowns.rest(theta)
         slopes = unknowns.slopes(theta)
         try:
@@ -171,25 +183,29 @@ def all_at_once(
             assert along.tangent is not None
             correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
         except np.linalg.LinAlgError:
-            return best
+            return None
         point = problem.evaluate(theta, shapes, feet)
         ahead = problem.linearize_along(point, along, _only(along, correction))
         gap = theta - problem.mean
         hessian, gradient = problem.precision.copy(), problem.precision @ gap
+        objective = float(gap @ gradient) / 2
         inner = []
         rows = zip(problem.used, ahead.residuals, ahead.by_theta, ahead.by_deviation, strict=True)
         for j, e, a, b in rows:
+            now = shapes.deviation[j, columns]
             block = b.T @ b + own
-            cross, slope = b.T @ a, b.T @ e + own @ shapes.deviation[j, columns]
+            cross, slope = b.T @ a, b.T @ e + own @ now
             solved = np.linalg.solve(block, np.column_stack([cross, slope]))
             hessian += a.T @ a - cross.T @ solved[:, :-1]
             gradient += a.T @ e - cross.T @ solved[:, -1]
+            objective += float(e @ e + now @ own @ now - slope @ solved[:, -1]) / 2
             inner.append(solved)
         damped = hessian[np.ix_(moving, moving)]
         damped = damped + 1e-6 * np.diag(np.diag(damped))
         step = np.zeros_like(theta)
         step[moving] = -np.linalg.solve(damped, gradient[moving])
         step = np.clip(theta + np.clip(step, -3, 3), lower, upper) - theta
+        objective += float(gradient @ step + step @ hessian @ step / 2)
         deviation = shapes.deviation.copy()
         for j, solved in zip(problem.used, inner, strict=True):
             deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
@@ -202,17 +218,21 @@ def all_at_once(
         theta = theta + step
         feet = point.feet
         if not np.all(np.isfinite(shapes.x)):
-            return best
+            return None
         settled = size < SETTLED
-        if settled or iteration + 1 in looks:
-            p, rest = unknowns.p(theta), unknowns.rest(theta)
-            final, converged = sweep.settled(shapes, p, rest, max_iterations=40)
-            if converged.all():
-                found = problem.evaluate(theta, final, feet)
-                best = found if best is None or found.objective < best.objective else best
         if settled:
             break
-    return best
+    return Guess(theta, shapes, feet, objective, settled)
+
+
+def equilibria_near(problem: BatchProblem, guess: Guess) -> Point | None:
+    """Equilibria of all poses near a guess; None if some pose has none there."""
+    p, rest = problem.unknowns.p(guess.theta), problem.unknowns.rest(guess.theta)
+    shapes, converged = problem.sweep.settled(guess.shapes, p, rest, max_iterations=40)
+    if not converged.all():
+        return None
+    point = problem.evaluate(guess.theta, shapes, guess.feet)
+    return point if np.isfinite(point.objective) else None
 
 
 def _only(along: Directions, step: Vector) -> Directions:
