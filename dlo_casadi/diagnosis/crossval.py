@@ -119,7 +119,7 @@ def cross_validate(
     curves = _predicted(fit, shapes, thetas, executor or InProcess())
     for j, curve in zip(problem.used, curves, strict=True):
         item = problem.measured[j]
-        counts.append(len(item.points))
+        counts.append(len(item.traced.points))
         if curve is None:
             complete = False
             squares.append(np.inf)
@@ -180,7 +180,7 @@ def _stretches(fit: Fit) -> CrossValidation:
     problem, lin = fit.problem, fit.linearization
     j = problem.used[0]
     item = problem.measured[j]
-    points = np.arange(len(item.points))
+    points = np.argsort(fit.point.feet[0], kind="stable")  # a stretch of all photographs
     joint = np.concatenate([lin.by_theta[0], lin.by_deviation[0]], axis=1)
     size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
     prior = np.zeros((size + n_dev, size + n_dev))
@@ -208,5 +208,5 @@ def _stretches(fit: Fit) -> CrossValidation:
             complete = False
             continue
         curve = problem.curve_of(sweep.seen(solved, p, rest)[j])
-        squares.append(float((item.distances(curve)[left_out] ** 2).sum()))
+        squares.append(float((item.misses(curve)[left_out] ** 2).sum()))
     return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)
