@@ -135,7 +135,7 @@ def test_clamps_that_give_way_turn_by_the_moment_on_them(end):
         g = (0.0, -9.7, 0.0) if len(g) == 3 else g
         model = CableModel(cable, 10, "arc", "clamped", end, g, (effect,))
         p = model.nominal.copy()
-        p[-len(effect.sides) :] = [0.03, 0.01][: len(effect.sides)]
+        p[-len(effect.sides) :] = [0.02, 0.01][: len(effect.sides)]
         far = None if end == "free" else (0.6, 0.0, 0.0)[: len(g)]
         turned = tuple(Rotation.from_rotvec([0, 0, 0.3]).as_quat())
         flat = {"start_heading": 0.3, "end_heading": 0.0 if far else None}

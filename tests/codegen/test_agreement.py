@@ -92,7 +92,7 @@ def test_clamps_that_give_way_are_refused():
     model = CableModel(
         CABLE, 12, start="clamped", effects=(EFFECTS["clamp_compliance"](end=False),)
     )
-    with pytest.raises(DloError, match="no solver .* clamps give way"):
+    with pytest.raises(DloError, match=r"no solver .* clamps give way"):
         CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells))
 
 
