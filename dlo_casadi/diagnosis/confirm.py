@@ -15,6 +15,8 @@ from dlo_casadi.estimation.result import Fit
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)
+# Share of the gain that the score promises, from which on a refit that creeps is not tried again.
+PROMISED = 0.5
 # Gauss-Newton steps of one refit.
 MOST_STEPS = 25
 
@@ -82,6 +84,7 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
             continue
         if best is None or fit.point.objective < best.point.objective:
             best = fit
-        if best.point.objective < base.point.objective and best.converged:
+        gain = 2 * (base.point.objective - best.point.objective)
+        if gain > 0 and (best.converged or gain > PROMISED * screened.score):
             break
     return best

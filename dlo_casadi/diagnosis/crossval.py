@@ -86,14 +86,23 @@ class CrossValidation:
         return np.asarray(self.squares / self.counts - other.squares / other.counts)
 
 
-def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:
+def cross_validate(
+    fit: Fit, executor: Executor | None = None, shapes: Shapes | None = None
+) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
     All folds are predicted in one sweep, some 6 ms each. Only where a state is carried is each a
     task of its own; it runs in this process unless an executor is given.
+
+    Parameters
+    ----------
+    shapes : Shapes, optional
+        Equilibria at the fit's unknowns from which the folds are followed: the fitted ones, on
+        whichever branch a pose was measured, by default; or `predicted_shapes`.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
+    shapes = fit.point.shapes if shapes is None else shapes
     problem, lin = fit.problem, fit.linearization
     thetas = []
     total = fit.normal
@@ -107,10 +116,10 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
             g_j = g_j - cross.T @ solved[:, -1]
         thetas.append(_without(fit, total.hessian - h_j, total.gradient - g_j))
     squares, counts, complete = [], [], True
-    curves = _predicted(fit, thetas, executor or InProcess())
+    curves = _predicted(fit, shapes, thetas, executor or InProcess())
     for j, curve in zip(problem.used, curves, strict=True):
         item = problem.measured[j]
-        counts.append(len(item.points))
+        counts.append(len(item.traced.points))
         if curve is None:
             complete = False
             squares.append(np.inf)
@@ -137,11 +146,12 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> FloatArray:
     return np.clip(fit.point.theta + step, lower, upper)
 
 
-def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[NodeCurve | None]:
+def _predicted(
+    fit: Fit, shapes: Shapes, thetas: list[FloatArray], executor: Executor
+) -> list[NodeCurve | None]:
     """Curve of each fitted pose at its own unknowns, from the declared end conditions."""
     problem, sweep = fit.problem, fit.problem.sweep
     unknowns, model = problem.unknowns, fit.model
-    shapes = fit.point.shapes
     plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
     if model.has_state:
         folds = map_in_order(executor, partial(_predict_all, fit, plain), thetas)
@@ -170,7 +180,7 @@ def _stretches(fit: Fit) -> CrossValidation:
     problem, lin = fit.problem, fit.linearization
     j = problem.used[0]
     item = problem.measured[j]
-    points = np.arange(len(item.points))
+    points = np.argsort(fit.point.feet[0], kind="stable")  # a stretch of all photographs
     joint = np.concatenate([lin.by_theta[0], lin.by_deviation[0]], axis=1)
     size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
     prior = np.zeros((size + n_dev, size + n_dev))
@@ -198,5 +208,5 @@ def _stretches(fit: Fit) -> CrossValidation:
             complete = False
             continue
         curve = problem.curve_of(sweep.seen(solved, p, rest)[j])
-        squares.append(float((item.distances(curve)[left_out] ** 2).sum()))
+        squares.append(float((item.misses(curve)[left_out] ** 2).sum()))
     return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)

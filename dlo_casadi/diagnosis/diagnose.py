@@ -27,8 +27,14 @@ from dlo_casadi.diagnosis.structure import (
 )
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.fit import (
+    far_from_noise,
+    fit_model,
+    fitted_closely,
+    fitted_loosely,
+)
 from dlo_casadi.estimation.hyperparameters import errors_of, settle
+from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
@@ -161,9 +167,10 @@ def diagnose(
         seconds each; in this process by default.
     """
     search = _Search(fit, center, exclude, significance, max_effects, step, executor or InProcess())
+    begun = search.from_afar() if far_from_noise(fit) else None
     # Where left-out poses are not even reached no effect can be followed: first what pulls.
-    pull = estimate_pull(fit, search.executor) if search.astray else None
-    found = search.run(pull)
+    pull = estimate_pull(fit, search.executor) if begun is None and search.astray else None
+    found = search.run(pull, begun)
     if found.unexplained and pull is not None:
         found = search.run()
     elif found.unexplained:
@@ -262,7 +269,31 @@ class _Search:
         """Score tests in the declared model."""
         return screen(self.declared, self.center, self.exclude)
 
-    def run(self, pull: Pull | None = None) -> _Found:
+    def from_afar(self) -> _Found | None:
+        """Effects that are found, and fitted, while points are taken for less sure than they are.
+
+        None if there are none, or they do not explain the points as sure as they are better than
+        the declared model does.
+        """
+        loose = fitted_loosely(self.declared)
+        if loose is None:
+            return None
+        found = replace(self, declared=loose).run()
+        if not found.added:
+            return None
+        try:
+            close = fitted_closely(self.declared, found.fit)
+        except EstimationError:
+            return None
+        validation = cross_validate(close)
+        if close.residual_rms > self.declared.residual_rms:
+            return None
+        added = list(found.added)
+        added[0] = replace(added[0], before=self.validation)
+        added[-1] = replace(added[-1], after=validation)
+        return replace(found, fit=close, added=tuple(added), validation=validation)
+
+    def run(self, pull: Pull | None = None, begun: _Found | None = None) -> _Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
 
         Parameters
@@ -270,11 +301,16 @@ class _Search:
         pull : Pull, optional
             Whose causes are tried in the first step; else all effects, followed from the
             declared model.
+        begun : _Found, optional
+            What has been found already; by default the declared model.
         """
         current, validation = self.declared, self.validation
         added: list[AddedEffect] = []
         ranked: list[Ranked] = []
-        for k in range(self.max_effects):
+        if begun is not None:
+            current, validation = begun.fit, begun.validation
+            added, ranked = list(begun.added), list(begun.ranked)
+        for k in range(len(added), self.max_effects):
             self.step("search for a missing effect", k, self.max_effects)
             screened = self.first if k == 0 else screen(current, self.center, self.exclude)
             p_values = {
@@ -288,7 +324,11 @@ class _Search:
             if k == 0:
                 ranked = _ranking(screened, p_values, confirmed)
             # What a second effect explains may be what the first one, if wrong, has left.
-            chosen = _choose(confirmed, np.inf if added else BIC_APART)
+            apart = np.inf if added else BIC_APART
+            chosen = _choose(confirmed, apart)
+            while chosen and _misleads(chosen[0].fit, current, validation):
+                confirmed.remove(chosen[0])
+                chosen = _choose(confirmed, apart)
             if chosen is None:
                 break
             winner, rivals = chosen
@@ -474,6 +514,21 @@ def _choose(
     winner = max(close, key=lambda item: item.bic)
     rivals = [item for item in close if item is not winner and item.bic > winner.bic - apart]
     return winner, sorted(rivals, key=lambda item: -item.bic)
+
+
+def _misleads(fit: Fit, before: Fit, validation: CrossValidation) -> bool:
+    """Whether a fit with an effect tells a user, who knows the ends alone, worse than one without.
+
+    `validation` follows the branches on which poses were measured, without the effect.
+    """
+    told = _told(fit)
+    return told > validation.rmse and told > _told(before)
+
+
+def _told(fit: Fit) -> float:
+    """Cross-validated error [m] of poses of which nothing but the ends is known."""
+    shapes = predicted_shapes(fit.problem, fit.point.shapes, fit.p, fit.rest)
+    return cross_validate(fit, shapes=shapes).rmse
 
 
 def _ranking(

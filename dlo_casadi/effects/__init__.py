@@ -5,6 +5,7 @@ from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening
 from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamp_angle import ClampAngle
+from dlo_casadi.effects.clamp_compliance import ClampCompliance
 from dlo_casadi.effects.clamp_rotation import ClampRotation
 from dlo_casadi.effects.edge_bias import EdgeBias
 from dlo_casadi.effects.effect import (
@@ -60,6 +61,7 @@ EFFECTS: dict[str, type[Effect]] = {
         EndSpring,
         ClampAngle,
         ClampRotation,
+        ClampCompliance,
         EndOffset,
         RestCurvatureDrift,
         PlasticSet,
@@ -89,6 +91,7 @@ __all__ = [
     "Cable",
     "CameraFrame",
     "ClampAngle",
+    "ClampCompliance",
     "ClampRotation",
     "EdgeBias",
     "Effect",

@@ -175,7 +175,8 @@ def fit_model(
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta, decades)
-    if different_poses(measured) >= DIFFERENT and fit.beyond_noise:
+    searched_loosely = model.in_space
+    if not searched_loosely and different_poses(measured) >= DIFFERENT and fit.beyond_noise:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every hanging had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
@@ -213,18 +214,70 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
     In space the search takes the points for less sure than they are: where an effect is missing,
     shapes that are held to a fraction of a millimetre allow no way to the minimum.
     """
-    model = problem.unknowns.model
-    sure = NoiseModel(SEARCH_STD * model.cable.length)
-    if model.in_space and sure.std > problem.noise.std:
-        doubtful = problem.changed(
-            sure, problem.roughness_std, problem.scatter, problem.rest_scatter
-        )
-        found = _best(doubtful, theta, decades)
-        if found is None:
-            return None
-        problem.refresh(found.theta, found.shapes, found.feet)
-        return problem.evaluate(found.theta, found.shapes, found.feet)
-    return _best(problem, theta, decades)
+    if not problem.unknowns.model.in_space or problem.noise.std >= _loose_noise(problem).std:
+        return _best(problem, theta, decades)
+    rest = problem.rest_scatter
+    loose = problem.changed(_loose_noise(problem), problem.roughness_std, problem.scatter, rest)
+    found = _best(loose, theta, decades)
+    if found is None:
+        return None
+    problem.refresh(found.theta, found.shapes, found.feet)
+    return problem.evaluate(found.theta, found.shapes, found.feet)
+
+
+def _loose_noise(problem: BatchProblem) -> NoiseModel:
+    """Noise of a search in space."""
+    return NoiseModel(SEARCH_STD * problem.unknowns.model.cable.length, source="declared")
+
+
+def far_from_noise(fit: Fit) -> bool:
+    """Whether a fit in space misses by more than its search has taken for noise."""
+    return fit.model.in_space and fit.residual_rms > _loose_noise(fit.problem).std
+
+
+def fitted_loosely(fit: Fit) -> Fit | None:
+    """Fit the same model, from starts of its own, as if its points were known to SEARCH_STD alone.
+
+    Where an effect is missing, a fit to a fraction of a millimetre bends all that it may bend and
+    ends in folds of single poses; to some millimetres it stays near the truth, so that what is
+    missing can be added there. On the coarse mesh of a search; None without a start.
+    """
+    problem = fit.problem
+    model = fit.model.coarse
+    unknowns = replace(problem.unknowns, model=model)
+    scatter = problem.tolerances.deviation(model.node)
+    loose = BatchProblem(
+        unknowns,
+        problem.history,
+        _loose_noise(problem),
+        problem.tolerances,
+        ROUGHNESS_START,
+        scatter,
+    )
+    theta = unknowns.pack(unknowns.fixed, np.zeros(model.n_coefficients))
+    found = _best(loose, theta, DECADES)
+    if found is None:
+        return None
+    loose.refresh(found.theta, found.shapes, found.feet)
+    point = loose.evaluate(found.theta, found.shapes, found.feet)
+    return Fit(loose, *loose.descend(point))
+
+
+def fitted_closely(declared: Fit, loose: Fit) -> Fit:
+    """Fit the model of a loose fit to the points as sure as they are, on the declared fit's mesh.
+
+    Raises
+    ------
+    EstimationError
+        As `fit_model`.
+    """
+    model = loose.model.with_mesh(declared.model.n)
+    std = declared.noise.std if declared.noise.known else None
+    free = [name for name, chosen in zip(model.names, loose.free_in(model), strict=True) if chosen]
+    problem = declared.problem
+    return fit_model(
+        model, problem.history, problem.tolerances, std, free=free, values=loose.p, decades=(0,)
+    )
 
 
 def _best(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Point | None:

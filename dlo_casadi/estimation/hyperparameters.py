@@ -77,8 +77,8 @@ def refine(
     MacKay, Neural Computation 4 (1992).
     """
     repeats = problem.rest_scatter.std == 0 and not first
-    converged = False
-    if not (first and problem.unknowns.model.in_space):
+    rough, converged = first and problem.unknowns.model.in_space, False
+    if not rough:
         point, converged = problem.descend(point, tolerance=1e-2)
     for round_ in range(rounds):
         lin = problem.linearize(point)
@@ -101,6 +101,9 @@ def refine(
         point = problem.evaluate(point.theta, point.shapes, point.feet)
         point, converged = problem.descend(point)
         if moved < 0.1 and changed < 0.02 and same:
+            break
+        if rough and not converged:
+            # What is missing is no noise: to estimate that once more leads farther astray.
             break
     return problem, point, converged
 

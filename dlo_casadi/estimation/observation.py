@@ -30,11 +30,15 @@ class MeasuredPose:
         Empty if the pose could not be read.
     held_out : bool
         Whether the pose is kept for the final test.
+    line : (M, d) [m], optional
+        The cable's line that the sensors show together, where their points are no line by
+        themselves; without points where they show none.
     """
 
     pose: Pose
     sensors: tuple[Sensor, ...] = ()
     held_out: bool = False
+    line: FloatArray | None = None
 
     @classmethod
     def of_points(
@@ -59,6 +63,19 @@ class MeasuredPose:
     def readable(self) -> bool:
         """Whether there is anything to compare with."""
         return len(self.sensors) > 0
+
+    @property
+    def has_line(self) -> bool:
+        """Whether it is known where in space points of the cable lie."""
+        return self.readable and (self.line is None or len(self.line) > 0)
+
+    @cached_property
+    def traced(self) -> MeasuredPose:
+        """The same pose with its line alone; about where its points lie if they show none."""
+        if self.line is None:
+            return self
+        line = self.line if len(self.line) else self.points
+        return MeasuredPose.of_points(self.pose, line, held_out=self.held_out)
 
     @cached_property
     def points(self) -> FloatArray:
@@ -89,8 +106,14 @@ class MeasuredPose:
         return out
 
     def slow_rows(self, modes: FloatArray) -> FloatArray:
-        """Displacements (K, count) along the cable, in each of the residuals' directions."""
-        blocks = [np.kron(modes[points], np.eye(x.per_point)) for x, points, _ in self.slices]
+        """Displacements (K, count) along the cable, in each of the residuals' directions.
+
+        Beside them what the residuals of a sensor share.
+        """
+        blocks = [
+            np.hstack([np.kron(modes[points], np.eye(x.per_point)), _scaled(x.together)])
+            for x, points, _ in self.slices
+        ]
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
 
     def _parts(self, per_point: FloatArray) -> list[FloatArray]:
@@ -134,10 +157,26 @@ class MeasuredPose:
         return np.concatenate([sensor.nearest(curve) for sensor in self.sensors])
 
     def distances(self, curve: NodeCurve) -> FloatArray:
-        """Distance (K,) [m] of each point from where a curve has it."""
-        return np.linalg.norm(self.points - curve.at(self.nearest(curve)), axis=1)
+        """Distance [m] of each point of the line from where a curve has it.
+
+        Of photographs that show none together: of each pixel, across its line of sight.
+        """
+        if not self.has_line:
+            return self.misses(curve)
+        item = self.traced
+        return np.linalg.norm(item.points - curve.at(item.nearest(curve)), axis=1)
+
+    def misses(self, curve: NodeCurve) -> FloatArray:
+        """Size (K,) [m] of the residuals of each point of a sensor."""
+        residual = self.residual(Observed(curve, np.zeros(0)), self.nearest(curve))
+        return np.sqrt(np.bincount(self.point_of, residual**2))
 
     def weighing(self, weight: FloatArray) -> Self:
         """The same pose with other relative standard deviations (K,) of its points."""
         parts = zip(self.sensors, self._parts(weight), strict=True)
         return replace(self, sensors=tuple(sensor.weighing(w) for sensor, w in parts))
+
+
+def _scaled(columns: FloatArray) -> FloatArray:
+    """Columns (R, c) whose largest entry is one."""
+    return columns / np.abs(columns).max(axis=0, initial=1e-300)

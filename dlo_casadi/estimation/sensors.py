@@ -64,6 +64,11 @@ class Sensor(Protocol):
         """Whether the arc lengths of the points are known."""
         ...
 
+    @property
+    def together(self) -> FloatArray:
+        """Errors (R, c) that its residuals share, a standard deviation of each."""
+        ...
+
     def places(self, pose: Pose, length: float) -> FloatArray:
         """First guess of the points' arc lengths (K,) [m], without a curve."""
         ...
@@ -125,6 +130,11 @@ class _Points(ABC):
     @abstractmethod
     def per_point(self) -> int:
         """Residuals of a point."""
+
+    @property
+    def together(self) -> FloatArray:
+        """None: the errors of points have no common cause."""
+        return np.zeros((len(self.points) * self.per_point, 0))
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) [1/m] with W cov W^T = 1; the errors of a point are independent."""

@@ -9,13 +9,14 @@ import numpy as np
 
 from dlo_casadi import vision
 from dlo_casadi.config import Camera as DeclaredCamera
-from dlo_casadi.config import Config
+from dlo_casadi.config import Config, Images
 from dlo_casadi.config import Pose as DeclaredPose
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.measurements import read_points
 from dlo_casadi.session.outcome import PoseInput, ViewInput
+from dlo_casadi.session.pixels import pixel_std, pixels_of
 
 # Points kept of one centre-line; more only repeat their neighbours' noise.
 MOST_POINTS = 240
@@ -74,19 +75,27 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
     MeasurementError
         If no fit pose could be read; its text lists the reasons.
     """
-    if not any(len(item.points) and item.role == "fit" for item in inputs):
+    if not any(item.readable and item.role == "fit" for item in inputs):
         reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
         raise MeasurementError(f"no fit pose could be read:\n{reasons}")
+    views = [view for item in inputs for view in item.views]
+    std = pixel_std(views) if views else 0.0
     return tuple(
-        MeasuredPose.of_points(
-            replace(conditions(pose), camera_center=item.camera_center),
-            item.points,
-            item.weight,
-            pose.role == "held_out",
-            item.s,
-        )
+        _measured(pose, item, std)
         for pose, item in zip(config.experiment.poses, inputs, strict=True)
     )
+
+
+def _measured(pose: DeclaredPose, item: PoseInput, std: float) -> MeasuredPose:
+    """A pose with its sensors; pixels have the standard deviation `std` [m] at weight one."""
+    held = replace(conditions(pose), camera_center=item.camera_center)
+    if not item.views:
+        return MeasuredPose.of_points(
+            held, item.points, item.weight, pose.role == "held_out", item.s
+        )
+    found = [pixels_of(view, std) for view in item.views]
+    sensors = tuple(sensor for sensor in found if sensor is not None)
+    return MeasuredPose(held, sensors, pose.role == "held_out", item.points)
 
 
 def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
@@ -135,8 +144,7 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
     """Photographs of a cable in space; those that cannot be used are told of."""
     measurement = config.experiment.measurement
     assert measurement.kind == "images"
-    if measurement.camera is None:
-        raise MeasurementError("photographs of a cable in space need measurement.camera.matrix")
+    assert measurement.camera is not None  # found before, see `camera.calibrated`
     images, problems = {}, []
     for name, path in pose.photographs.items():
         try:
@@ -145,7 +153,7 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
             problems.append(f"{name}: {error.message}")
     views = vision.measure_views(
         images,
-        _board(config),
+        board_of(measurement),
         _camera(measurement.camera),
         start=pose.start,
         end=pose.end,
@@ -153,21 +161,20 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
         length=config.cable.length,
     )
     problems += views.problems.values()
-    if not views.sights or views.line is None:
+    if not views.sights:
         raise MeasurementError(" ".join([*problems, *views.messages]))
-    kept = slice(None, None, max(1, -(-len(views.line.points) // MOST_POINTS)))
-    std = views.line.std[kept]
+    points = np.zeros((0, 3)) if views.line is None else views.line.points
     numbers = [set(sight.viewpoint.numbers) for sight in views.sights.values()]
     return PoseInput(
         pose.name,
         pose.role,
-        views.line.points[kept],
-        weight=std / np.median(std),
+        points[:: max(1, -(-len(points) // MOST_POINTS))],
         confidence=min(sight.confidence for sight in views.sights.values()),
         messages=(*problems, *views.messages),
         markers=tuple(sorted(set.intersection(*numbers))),
         views=tuple(
-            ViewInput(name, path, views.sights.get(name)) for name, path in pose.photographs.items()
+            ViewInput(name, pose.photographs[name], sight, views.places[name])
+            for name, sight in views.sights.items()
         ),
     )
 
@@ -281,12 +288,11 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
         _check_reference(reference.pixels, image.shape)
         return vision.from_reference(reference, image.shape)
     camera = None if measurement.camera is None else _camera(measurement.camera)
-    return vision.locate_board(image, _board(config), camera)
+    return vision.locate_board(image, board_of(measurement), camera)
 
 
-def _board(config: Config) -> vision.Board:
-    measurement = config.experiment.measurement
-    assert measurement.kind == "images"
+def board_of(measurement: Images) -> vision.Board:
+    """The board as the camera step has it."""
     declared = measurement.board
     assert declared is not None
     return vision.Board(

@@ -21,6 +21,8 @@ from dlo_casadi.vision import Sight
 FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
 Verdict = Literal["complete", "effect_found", "unexplained"]
+# Stages that a batch estimate must not be worse than.
+SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,14 @@ class PoseShape:
     tipping: float | None = None
     spread: FloatArray | None = None
 
+    def expected(self, length: float, noise: float) -> FloatArray:
+        """Standard deviations of the residual (K,), in space (K, 2), [m], noise included."""
+        assert self.spread is not None
+        places = np.linspace(0.0, length, len(self.spread))
+        spread = self.spread.reshape((len(places), -1))
+        std = np.stack([np.interp(self.s, places, column) for column in spread.T], axis=1)
+        return np.hypot(std, noise).reshape(self.residual.shape)
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -165,11 +175,23 @@ class Stage:
 
 @dataclass(frozen=True)
 class ViewInput:
-    """One of the photographs of a pose in space, and what is seen in it; None if nothing is."""
+    """One of several photographs of a pose in space.
+
+    Parameters
+    ----------
+    name : str
+        File stem.
+    image : Path
+    sight : Sight
+        What is seen in it.
+    places : (K, 3) [m]
+        About where its pixels lie in space; nan for those that are not of the cable.
+    """
 
     name: str
     image: Path
-    sight: Sight | None
+    sight: Sight
+    places: FloatArray
 
 
 @dataclass(frozen=True)
@@ -210,8 +232,8 @@ class PoseInput:
     s : (K,), optional [m]
         Known arc lengths of markers.
     views : tuple of ViewInput
-        Photographs of a cable in space; `points` are the line that they show together, none where
-        fewer than two agree.
+        Usable photographs of a cable in space; `points` are the line that they show together, none
+        where fewer than two agree.
     """
 
     name: str
@@ -231,6 +253,11 @@ class PoseInput:
     messages: tuple[str, ...] = ()
     s: FloatArray | None = None
     views: tuple[ViewInput, ...] = ()
+
+    @property
+    def readable(self) -> bool:
+        """Whether there is anything to compare with."""
+        return len(self.points) > 0 or len(self.views) > 0
 
 
 @dataclass(frozen=True)
@@ -315,6 +342,9 @@ class Outcome:
         As in report.json ("dlo-report/1"), ready to be written.
     verdict : Verdict or None
         None where no diagnosis was made: nothing is claimed then.
+    doubts : tuple of str
+        Why the last stage's numbers do not hold, see `doubts_of`; with them no verdict is
+        `complete` or `effect_found`.
     structure : dict or None
         Tests of the residual "before" and "after", see `diagnosis.structure.Structure`.
     fit : Fit
@@ -332,6 +362,7 @@ class Outcome:
     timing: dict[str, float]
     fit: Fit
     verdict: Verdict | None = None
+    doubts: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     effects: tuple[dict[str, Any], ...] = ()
     candidates: tuple[dict[str, Any], ...] = ()
@@ -356,12 +387,9 @@ class Outcome:
             shape = stage.shapes.get(pose.name)
             if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:
                 continue
-            places = np.linspace(0.0, self.fit.model.cable.length, len(shape.spread))
-            spread = shape.spread.reshape((len(places), -1))
-            std = np.stack([np.interp(shape.s, places, column) for column in spread.T], axis=1)
-            std = np.hypot(std, self.measurement.std)
-            score = ((shape.residual.reshape(std.shape) / std) ** 2).sum(axis=1)
-            inside.append(score <= chi2.ppf(COVERED, std.shape[1]))
+            std = shape.expected(self.fit.model.cable.length, self.measurement.std)
+            score = ((shape.residual / std) ** 2).reshape((len(std), -1)).sum(axis=1)
+            inside.append(score <= chi2.ppf(COVERED, std.size // len(std)))
         return float(np.concatenate(inside).mean()) if inside else None
 
     def held_out(self, stage: Stage) -> HeldOut:

@@ -51,9 +51,10 @@ def pose_shape(
     gap: FloatArray = np.zeros((0, curve.d))
     rmse = branch = None
     if item.readable:
-        s = item.nearest(curve)
-        gap = item.points - curve.at(s)
-        rmse = float(np.sqrt((gap**2).sum(axis=1).mean()))
+        rmse = float(np.sqrt((item.distances(curve) ** 2).mean()))
+    if item.has_line:
+        s = item.traced.nearest(curve)
+        gap = item.traced.points - curve.at(s)
     if item.readable and other is not None:
         distances = item.distances(other.prediction.curve)
         branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)
@@ -94,9 +95,10 @@ def _stage(
     chi2_per_dof: float | None,
     note: str = "",
     uncertainty: Uncertainty | None = None,
+    fitted: Mapping[str, FloatArray] | None = None,
 ) -> Stage:
     predictions = predict_poses(model, p, rest, [item.pose for item in measured])
-    others = measured_branches(model, p, rest, measured, predictions)
+    others = measured_branches(model, p, rest, measured, predictions, fitted)
     shapes = {
         item.pose.name: pose_shape(prediction, item, other)
         for prediction, item, other in zip(predictions, measured, others, strict=True)
@@ -263,6 +265,7 @@ def fit_stage(
         rest_curvature_of(fit),
         fit.chi2_per_dof,
         uncertainty=Uncertainty.of(fit),
+        fitted={fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used},
     )
 
 

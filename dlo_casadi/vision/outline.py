@@ -73,8 +73,9 @@ def project_outline(
     B = np.maximum(np.linalg.norm(b[:, :2], axis=1), 1e-9)
     g = np.sum(e[:, :2] * b[:, :2], axis=1) / B
     radius, sin = 0.5 * diameter, 0.5 * diameter / d
-    squares = B**2 * (1.0 - sin**2) - (g * sin) ** 2
-    off = radius * g * sin / p[:, 2] / squares
+    # A cable seen on end shows its section, whose middle is the axis to a radius.
+    squares = np.maximum(B**2 * (1.0 - sin**2) - (g * sin) ** 2, sin**2)
+    off = np.clip(radius * g * sin / squares, -radius, radius) / p[:, 2]
     half = radius * B * np.sqrt(1.0 - sin**2) / p[:, 2] / squares
     across = b[:, :2] / B[:, None]
     # d(pixel)/d(ray) = p_z d(pixel)/d(p_xy), and a step along the ray's plane moves no depth
@@ -91,7 +92,11 @@ def project_outline(
 
 
 def compare_pixels(
-    viewpoint: Viewpoint, pixels: Array, points: Array, tangents: Array, diameter: float
+    viewpoint: Viewpoint,
+    pixels: ArrayLike,
+    points: ArrayLike,
+    tangents: ArrayLike,
+    diameter: float,
 ) -> tuple[Array, Array]:
     """Pixels measured minus those of a curve, across it.
 
@@ -112,5 +117,5 @@ def compare_pixels(
     Distances (K,) [px], and their slopes d(distance)/d(point) (K, 3) [px/m].
     """
     seen = project_outline(viewpoint, points, tangents, diameter)
-    distance = np.sum((pixels - seen.pixels) * seen.normals, axis=1)
+    distance = np.sum((np.asarray(pixels, float) - seen.pixels) * seen.normals, axis=1)
     return distance, -np.einsum("ki,kij->kj", seen.normals, seen.slopes)

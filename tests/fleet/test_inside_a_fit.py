@@ -10,7 +10,7 @@ from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import screen
 from dlo_casadi.diagnosis.pull import estimate_pull
 from dlo_casadi.effects import RestCurvatureDrift
-from dlo_casadi.estimation.fit import fit_model, starting_points
+from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.parallel import map_in_order, open_executor
 from dlo_casadi.session import run_session
 
@@ -36,14 +36,6 @@ class _Confirm:
     def __call__(self, screened):
         found = confirm(self.fit, screened)
         return None if found is None else (found.fit.p, found.validation.squares, found.bic)
-
-
-def test_starts(fit, pool):
-    theta = fit.problem.unknowns.prior_mean()
-    here = starting_points(fit.problem, theta, (-1, 0, 1))
-    there = starting_points(fit.problem, theta, (-1, 0, 1), pool)
-    assert len(here) > 0
-    assert [point.objective for point in here] == [point.objective for point in there]
 
 
 def test_folds_where_a_state_is_carried(fit, pool):
