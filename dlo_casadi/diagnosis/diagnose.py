@@ -27,12 +27,7 @@ from dlo_casadi.diagnosis.structure import (
 )
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import (
-    far_from_noise,
-    fit_model,
-    fitted_closely,
-    fitted_loosely,
-)
+from dlo_casadi.estimation.fit import fit_model, fitted_closely
 from dlo_casadi.estimation.hyperparameters import errors_of, settle
 from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.repeats import different_poses
@@ -167,10 +162,9 @@ def diagnose(
         seconds each; in this process by default.
     """
     search = _Search(fit, center, exclude, significance, max_effects, step, executor or InProcess())
-    begun = search.from_afar() if far_from_noise(fit) else None
     # Where left-out poses are not even reached no effect can be followed: first what pulls.
-    pull = estimate_pull(fit, search.executor) if begun is None and search.astray else None
-    found = search.run(pull, begun)
+    pull = estimate_pull(fit, search.executor) if search.astray else None
+    found = search.run(pull)
     if found.unexplained and pull is not None:
         found = search.run()
     elif found.unexplained:
@@ -269,31 +263,7 @@ class _Search:
         """Score tests in the declared model."""
         return screen(self.declared, self.center, self.exclude)
 
-    def from_afar(self) -> _Found | None:
-        """Effects that are found, and fitted, while points are taken for less sure than they are.
-
-        None if there are none, or they do not explain the points as sure as they are better than
-        the declared model does.
-        """
-        loose = fitted_loosely(self.declared)
-        if loose is None:
-            return None
-        found = replace(self, declared=loose).run()
-        if not found.added:
-            return None
-        try:
-            close = fitted_closely(self.declared, found.fit)
-        except EstimationError:
-            return None
-        validation = cross_validate(close)
-        if close.residual_rms > self.declared.residual_rms:
-            return None
-        added = list(found.added)
-        added[0] = replace(added[0], before=self.validation)
-        added[-1] = replace(added[-1], after=validation)
-        return replace(found, fit=close, added=tuple(added), validation=validation)
-
-    def run(self, pull: Pull | None = None, begun: _Found | None = None) -> _Found:
+    def run(self, pull: Pull | None = None) -> _Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
 
         Parameters
@@ -301,16 +271,11 @@ class _Search:
         pull : Pull, optional
             Whose causes are tried in the first step; else all effects, followed from the
             declared model.
-        begun : _Found, optional
-            What has been found already; by default the declared model.
         """
         current, validation = self.declared, self.validation
         added: list[AddedEffect] = []
         ranked: list[Ranked] = []
-        if begun is not None:
-            current, validation = begun.fit, begun.validation
-            added, ranked = list(begun.added), list(begun.ranked)
-        for k in range(len(added), self.max_effects):
+        for k in range(self.max_effects):
             self.step("search for a missing effect", k, self.max_effects)
             screened = self.first if k == 0 else screen(current, self.center, self.exclude)
             p_values = {
@@ -336,8 +301,8 @@ class _Search:
             if k == 0 and pull is not None:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = _corrected(single, len(screened))
-            closed = settle(winner.fit)
-            if not closed.errors_known:
+            closed = _closed(winner.fit)
+            if not closed.errors_known and current.noise.source != "misfit":
                 again = _p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
             if p_value > self.significance:
@@ -385,6 +350,7 @@ class _Search:
             limit = max(limit, UNSEEN_LEFT * self.error)
         unpredicted = (bool(added) or self.several) and validation.rmse > limit
         unexplained = structure.p_noise < self.significance or unpredicted
+        unexplained |= fit.noise.source == "misfit"
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
 
     def with_cause_of(self, pull: Pull | None, found: _Found) -> _Found:
@@ -438,6 +404,16 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
     )
     listed = candidates(fit.model, setup, exclude)
     return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
+
+
+def _closed(fit: Fit) -> Fit:
+    """A fit with an effect added, as that of a model that may be complete now."""
+    if fit.noise.source != "misfit":
+        return settle(fit)
+    try:
+        return fitted_closely(fit)
+    except EstimationError:
+        return fit
 
 
 def _corrected(p_value: float, tried: int) -> float:

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 
 FloatArray = NDArray[np.floating]
 Kernel = Literal["exponential", "matern", "gaussian"]
-Source = Literal["declared", "repeats", "estimated"]
+Source = Literal["declared", "repeats", "estimated", "misfit"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 # Slow sines per pose in which a missing effect would show.
 SLOW_MODES = 6
@@ -51,11 +51,14 @@ class NoiseModel:
     length : float [m]
         Correlation length.
     kernel : "exponential", "matern" or "gaussian"
-    source : "declared", "repeats" or "estimated"
+    source : "declared", "repeats", "estimated" or "misfit"
         Whether it was declared, is how poses repeat that were taken more than once, or was
-        estimated from the residual.
+        estimated from the residual; or is no noise at all, but what a model misses that lacks
+        something, by which a fit of it weighs the points.
     slow_dof : float
         Degrees of freedom of chi-square with which the variance of slow modes is known.
+    declared : float, optional [m]
+        Of a misfit: the standard deviation of the points that was declared.
     """
 
     std: float
@@ -64,6 +67,12 @@ class NoiseModel:
     kernel: Kernel = "matern"
     source: Source = "estimated"
     slow_dof: float = np.inf
+    declared: float | None = None
+
+    @property
+    def of_points(self) -> float:
+        """Standard deviation [m] of the points themselves, as far as it is known."""
+        return self.std if self.declared is None else self.declared
 
     @property
     def known(self) -> bool:

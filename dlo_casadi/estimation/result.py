@@ -106,6 +106,11 @@ class Fit:
         """Sum of squares of the whitened residuals per degree of freedom."""
         return self.point.data / self.degrees_of_freedom
 
+    @property
+    def chi2_of_points(self) -> float:
+        """`chi2_per_dof` by the noise of the points where the fit weighs them by its misfit."""
+        return self.chi2_per_dof * (self.noise.std / self.noise.of_points) ** 2
+
     @cached_property
     def residual_rms(self) -> float:
         """Root mean square residual of the fitted points [m]."""

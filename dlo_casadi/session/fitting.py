@@ -75,6 +75,8 @@ def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float
     Where an effect is missing, the mesh need not be finer than what is missing.
     """
     while True:
+        if fit.noise.source == "misfit":
+            return fit, mesh_error(fit)
         if n != fit.model.n:
             fit = refine_mesh(fit, n, modes)
         error = mesh_error(fit)

@@ -179,6 +179,11 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
             f"others), {_beside(fit)}: repeatability limits any prediction"
         )
+    if fit.noise.source == "misfit":
+        lines.append(
+            f"the model misses the points by {1e3 * fit.residual_rms:.2g} mm RMS, far more than "
+            f"their noise: the fit weighs them as if that were {1e3 * fit.noise.std:.2g} mm"
+        )
     rest = fit.problem.rest_scatter
     if rest.std > 0:
         lines.append(

@@ -305,8 +305,10 @@ def _summary(
         poses_fit=sum(not item.held_out for item in readable),
         poses_held_out=sum(item.held_out for item in readable),
         points=sum(len(item.points) for item in readable),
-        std=fit.noise.std,
-        std_source="declared" if fit.noise.source == "declared" else "estimated",
+        std=fit.noise.of_points,
+        std_source="declared"
+        if fit.noise.declared or fit.noise.source == "declared"
+        else "estimated",
         correlation_length=fit.noise.length if fit.noise.share > 0 else 0.0,
         held_out_missing=held_out_missing(inputs, config.skipped),
     )

@@ -60,5 +60,7 @@ def _from_simpler(fit: Fit, stiffness: float, better: bool) -> Fit:
     point, converged = problem.descend(point)
     if point.objective >= fit.point.objective:
         return fit
+    if fit.noise.source == "misfit":
+        return Fit(problem, point, converged)
     problem, point, converged = refine(problem, point, estimate=not fit.noise.known)
     return Fit(problem, point, converged)

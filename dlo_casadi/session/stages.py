@@ -263,7 +263,7 @@ def fit_stage(
         measured,
         parameters,
         rest_curvature_of(fit),
-        fit.chi2_per_dof,
+        fit.chi2_of_points,
         uncertainty=Uncertainty.of(fit),
         fitted={fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used},
     )
