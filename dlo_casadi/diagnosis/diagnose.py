@@ -163,7 +163,8 @@ def diagnose(
     """
     search = _Search(fit, center, exclude, significance, max_effects, step, executor or InProcess())
     # Where left-out poses are not even reached no effect can be followed: first what pulls.
-    pull = estimate_pull(fit, search.executor) if search.astray else None
+    lost = search.astray and fit.noise.source != "misfit"
+    pull = estimate_pull(fit, search.executor) if lost else None
     found = search.run(pull)
     if found.unexplained and pull is not None:
         found = search.run()
@@ -285,13 +286,14 @@ class _Search:
                 tried = self._causes(pull, screened)
             else:
                 tried = self._leading(current, screened, p_values)
-            confirmed = _improving(tried, validation, self.doubt)
+            explaining = _explaining(current, tried)
+            confirmed = explaining or _improving(tried, validation, self.doubt)
             if k == 0:
                 ranked = _ranking(screened, p_values, confirmed)
             # What a second effect explains may be what the first one, if wrong, has left.
-            apart = np.inf if added else BIC_APART
+            apart = np.inf if added and not explaining else BIC_APART
             chosen = _choose(confirmed, apart)
-            while chosen and _misleads(chosen[0].fit, current, validation):
+            while chosen and not explaining and _misleads(chosen[0].fit, current, validation):
                 confirmed.remove(chosen[0])
                 chosen = _choose(confirmed, apart)
             if chosen is None:
@@ -301,7 +303,7 @@ class _Search:
             if k == 0 and pull is not None:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = _corrected(single, len(screened))
-            closed = _closed(winner.fit)
+            closed = winner.fit if explaining else _closed(winner.fit)
             if not closed.errors_known and current.noise.source != "misfit":
                 again = _p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
@@ -321,7 +323,9 @@ class _Search:
         significant = [
             item for item in screened if p_values[item.candidate.name] < self.significance
         ]
-        leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
+        leading = sorted(significant, key=lambda item: -item.score)
+        if current.noise.source != "misfit":  # beside which scores are no order
+            leading = leading[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         return list(map_in_order(self.executor, partial(confirm, current), worthy))
 
@@ -404,6 +408,29 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
     )
     listed = candidates(fit.model, setup, exclude)
     return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
+
+
+def _explaining(current: Fit, tried: Iterable[Confirmed | None]) -> list[Confirmed]:
+    """Candidates that leave none of a misfit once the points are taken as sure as they are.
+
+    Beside a misfit their gains tell little; they are compared by their evidence.
+    """
+    if current.noise.source != "misfit":
+        return []
+    most = current.point.objective / 2
+    likely = [item for item in tried if item is not None and item.fit.point.objective < most]
+    fits = [(item, _closed(item.fit)) for item in likely]
+    close = [(item, fit) for item, fit in fits if fit.noise.source != "misfit"]
+    least = min((fit.log_evidence for _, fit in close), default=0.0)
+    return [
+        replace(
+            item,
+            fit=fit,
+            validation=cross_validate(fit),
+            bic=2 * (fit.log_evidence - least),
+        )
+        for item, fit in close
+    ]
 
 
 def _closed(fit: Fit) -> Fit:
