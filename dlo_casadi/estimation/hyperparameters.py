@@ -77,9 +77,10 @@ def refine(
     MacKay, Neural Computation 4 (1992).
     """
     repeats = problem.rest_scatter.std == 0 and not first
-    rough, converged = first and problem.unknowns.model.in_space, False
-    if not rough:
-        point, converged = problem.descend(point, tolerance=1e-2)
+    rough = first and problem.unknowns.model.in_space
+    near, converged = problem.descend(point, tolerance=1e-2)
+    if converged or not rough:
+        point = near
     for round_ in range(rounds):
         lin = problem.linearize(point)
         noise, rest = problem.noise, problem.rest_scatter
