@@ -349,6 +349,8 @@ class Outcome:
         Tests of the residual "before" and "after", see `diagnosis.structure.Structure`.
     fit : Fit
         The last stage's fit, from which parameters.yaml is written.
+    hidden_weight : dict or None
+        A weight that the shapes do not tell from stiffness, see `HiddenWeight`.
     diagnosis : object or None
         The diagnosis's own result, for figures.
     """
@@ -369,6 +371,7 @@ class Outcome:
     unexplained: dict[str, Any] | None = None
     next_pose: dict[str, Any] | None = None
     structure: dict[str, dict[str, Any]] | None = None
+    hidden_weight: dict[str, Any] | None = None
     diagnosis: Any = None
     versions: dict[str, str] = field(default_factory=dict)
 
