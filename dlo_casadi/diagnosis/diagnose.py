@@ -263,10 +263,9 @@ class _Search:
     @property
     def doubt(self) -> float | None:
         """What a gain has to be held against where a pose or two were taken again and again."""
-        count = different_poses(self.declared.problem.history)
-        return (
-            self.significance if count < min(DIFFERENT, len(self.declared.problem.used)) else None
-        )
+        problem = self.declared.problem
+        count = different_poses(problem.history, problem.unknowns.model.cable.length)
+        return self.significance if count < min(DIFFERENT, len(problem.used)) else None
 
     @cached_property
     def first(self) -> list[Screened]:

@@ -317,7 +317,7 @@ class Repeatability:
     def of(cls, fit: Fit) -> Self:
         """What a fit has found."""
         rest = fit.problem.rest_scatter.std
-        if different_poses(fit.problem.history) >= DIFFERENT:
+        if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
             return cls(rest, float(np.sqrt(2) * fit.hanging_error), "poses")
         spread = repeatability(fit.problem.history, fit.model.cable.length)
         return cls(rest, spread or 0.0, None if spread is None else "repeats")
