@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.descent import Minima, descend
+from dlo_casadi.ends import reaction_rows
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, arc_into_clamps, limited, wrapped
 from dlo_casadi.initial_frames import guessed_frames_of
@@ -147,8 +148,8 @@ class Equilibrium:
     lam_start : (dimension,) [N]
         Force of the cable on whatever holds its start.
     moments : (2, increment) [N m]
-        Of the cable on its clamps (start, end), in space about the world's axes; zero at pins.
-        In a plane (2,).
+        Of the cable on what holds its start and its end, in space about the world's axes; at pins
+        what springs there hold. In a plane (2,).
     multipliers : (n_border,)
         Of the end conditions, places and pulls of springs: in the order of `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
@@ -626,14 +627,15 @@ def _equilibrium(
     strain = assembly.strain(shapes, given)[0]
     n_cells = model.chain.n_cells
     curvature = model.chain.curvatures(strain).ravel()
-    end_force, moments = split_multipliers(model, shapes.x[0], shapes.lam[0])
+    on_fixtures, rows = assembly.reactions(shapes, given)[0], reaction_rows(model.node)
+    lam_start, start_moment, lam, end_moment = (on_fixtures[at] for at in rows.values())
     return Equilibrium(
         x=shapes.x[0],
         points=assembly.nodes(shapes, given)[0],
         energy=float(assembly.energy(shapes, given)[0]),
-        lam=end_force,
-        lam_start=assembly.start_force(shapes, given)[0],
-        moments=moments,
+        lam=lam,
+        lam_start=lam_start,
+        moments=np.squeeze(np.array([start_moment, end_moment])),
         multipliers=shapes.lam[0],
         bound_multipliers=bound_lam,
         curvature=curvature,
@@ -792,22 +794,6 @@ def _bordered(
     gap = (_bends(model, shapes)[held] - bound)[None, :, None]
     whole = Vector(force.x + (arms @ pulls)[..., None], np.concatenate([force.y, gap], axis=1))
     return whole, matrix.with_border(arms)
-
-
-def split_multipliers(
-    model: CableModel, x: FloatArray, lam: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Force on the end's holder (dimension,) [N] and moments on the clamps (start, end) [N m].
-
-    The moments are (2,) in a plane, (2, 3) about the world's axes in space.
-    """
-    node, named = model.node, dict(zip(model.border_names, lam, strict=True))
-    force = np.array([named.get(f"end_position_{axis}", 0.0) for axis in node.axes])
-    moments = [
-        node.to_world(frame, np.array([named.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
-        for side, frame in (("start", x[0]), ("end", x[-1]))
-    ]
-    return force, np.squeeze(np.array(moments))
 
 
 def total_dead_load(model: CableModel, p: FloatArray) -> FloatArray:

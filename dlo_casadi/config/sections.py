@@ -30,6 +30,7 @@ from dlo_casadi.config.limits import (
     implausible_sizes,
 )
 from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean, show
+from dlo_casadi.ends import REACTIONS
 from dlo_casadi.errors import well_formed
 from dlo_casadi.thresholds import SIGNIFICANCE
 
@@ -51,6 +52,15 @@ def _place(value: object) -> object:
             f"two numbers [x, y] belong here, in space three [x, y, z], found {show(value)}"
         )
     return value
+
+
+def _moment(value: object) -> object:
+    if isinstance(value, list | tuple):
+        if len(value) == 3:
+            return value
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        return (value,)
+    raise ValueError(f"one number belongs here, in space three [mx, my, mz], found {show(value)}")
 
 
 def _quaternion(value: object) -> object:
@@ -78,6 +88,10 @@ Place = Annotated[
     BeforeValidator(
         _place, json_schema_input_type=tuple[Number, Number] | tuple[Number, Number, Number]
     ),
+]
+Moment = Annotated[
+    tuple[Number, ...],
+    BeforeValidator(_moment, json_schema_input_type=Number | tuple[Number, Number, Number]),
 ]
 Quaternion = Annotated[
     tuple[Number, ...],
@@ -261,13 +275,22 @@ class Reference(Section):
         return self
 
 
-class Images(Section):
+class Measurement(Section):
+    """How well was measured."""
+
+    std: Positive | None = None
+    """Standard deviation of one centre-line coordinate [m]; estimated when absent."""
+    force_std: Positive | None = None
+    """Standard deviation of one component of a force on a fixture [N]; estimated when absent."""
+    moment_std: Positive | None = None
+    """Standard deviation of one component of a moment on a fixture [N m]; estimated when absent."""
+
+
+class Images(Measurement):
     """Photographs of the cable, with a board or two known points."""
 
     kind: Literal["images"] = "images"
     """images."""
-    std: Positive | None = None
-    """Standard deviation of one centre-line coordinate [m]; estimated when absent."""
     camera: Camera | None = None
     """The camera; without it the board's plane is mapped by a homography."""
     board: Board | None = None
@@ -290,13 +313,11 @@ class Images(Section):
         return self
 
 
-class Centerlines(Section):
+class Centerlines(Measurement):
     """Centre-lines that were measured elsewhere, one CSV file a pose."""
 
     kind: Literal["centerlines"] = "centerlines"
     """centerlines."""
-    std: Positive | None = None
-    """Standard deviation of one centre-line coordinate [m]; estimated when absent."""
 
 
 class Tolerances(Section):
@@ -318,6 +339,10 @@ class Tolerances(Section):
     """Of the frame of a measurement in space against the fixtures, about each axis [rad]."""
     camera_translation: Positive = 1.0e-3
     """Of the frame of a measurement in space against the fixtures, along each axis [m]."""
+    force_bias: Positive = 0.02
+    """Of a constant offset of a sensor's force, each component [N]."""
+    moment_bias: Positive = 2.0e-3
+    """Of a constant offset of a sensor's moment, each component [N m]."""
 
 
 class Pose(Section):
@@ -342,6 +367,16 @@ class Pose(Section):
     """Full turns of twist at the end about its x axis, beside the roll nearest to none."""
     role: Literal["fit", "held_out"] = "fit"
     """fit, or held_out to check the prediction."""
+    start_force: Place | None = None
+    """Force [N] that the cable exerts on its start fixture, in the frame of gravity; what hangs
+    between sensor and cable is taken off before."""
+    start_moment: Moment | None = None
+    """Moment [N m] that the cable exerts on its start fixture, about `start`, counter-clockwise;
+    in space [mx, my, mz] about axes parallel to the world's."""
+    end_force: Place | None = None
+    """Force [N] that the cable exerts on its end fixture, as start_force."""
+    end_moment: Moment | None = None
+    """Moment [N m] that the cable exerts on its end fixture, about `end`, as start_moment."""
     branch: Literal["ccw", "cw", "previous"] | None = None
     """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
 
@@ -349,6 +384,12 @@ class Pose(Section):
     def name(self) -> str:
         """Name of the pose: its file without folder and ending."""
         return well_formed(self.file.stem)
+
+    @property
+    def readings(self) -> dict[str, tuple[float, ...]]:
+        """Forces and moments on the fixtures that were measured, by their keys."""
+        found = {name: getattr(self, name) for name in REACTIONS}
+        return {name: value for name, value in found.items() if value is not None}
 
     @field_validator("file", mode="before")
     @classmethod

@@ -32,7 +32,7 @@ class MassError(Load):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where forces are measured, and the cable has weight."""
-        return super().applies(setup) and setup.readings and any(setup.gravity)
+        return super().applies(setup) and bool(setup.readings) and any(setup.gravity)
 
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Weight of the part beyond s, over the declared one."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -13,7 +14,15 @@ from scipy.linalg import block_diag
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.sensors import Centerline, Markers, Observed, ObservedChange, Sensor
+from dlo_casadi.estimation.sensors import (
+    Centerline,
+    Markers,
+    Observed,
+    ObservedChange,
+    Sensor,
+    Wrench,
+)
+from dlo_casadi.rod.node import Frame, Heading
 
 FloatArray = NDArray[np.floating]
 
@@ -27,7 +36,7 @@ class MeasuredPose:
     pose : Pose
         End conditions as declared.
     sensors : tuple of Sensor
-        Empty if the pose could not be read.
+        Those of points first; empty if the pose could not be read.
     held_out : bool
         Whether the pose is kept for the final test.
     """
@@ -44,16 +53,21 @@ class MeasuredPose:
         weight: FloatArray | None = None,
         held_out: bool = False,
         s: FloatArray | None = None,
+        readings: Mapping[str, Sequence[float]] | None = None,
     ) -> Self:
         """A pose with one line of points (K, d) [m], or markers where arc lengths s are known.
 
-        Without points the pose could not be read. `weight` (K,) is one by default.
+        Without points the pose could not be read. `weight` (K,) is one by default. `readings` are
+        forces and moments on the fixtures by their names, of `ends.REACTIONS`.
         """
         if not len(points):
             return cls(pose, (), held_out)
         weight = np.ones(len(points)) if weight is None else weight
         sensor = Centerline(points, weight) if s is None else Markers(points, weight, s)
-        return cls(pose, (sensor,), held_out)
+        if not readings:
+            return cls(pose, (sensor,), held_out)
+        node = Frame if len(pose.start) == 3 else Heading
+        return cls(pose, (sensor, Wrench.of(readings, node)), held_out)
 
     @property
     def readable(self) -> bool:
@@ -63,34 +77,63 @@ class MeasuredPose:
     @cached_property
     def points(self) -> FloatArray:
         """All measured points (K, d) [m]."""
-        if not self.sensors:
-            return np.zeros((0, len(self.pose.start)))
-        return np.concatenate([sensor.points for sensor in self.sensors])
+        none = np.zeros((0, len(self.pose.start)))
+        return np.concatenate([none, *(x.points for x in self.sensors if len(x.points))])
 
     @cached_property
     def relative_std(self) -> FloatArray:
         """Relative standard deviation of each point (K,)."""
         return np.concatenate([sensor.weight for sensor in self.sensors])
 
+    @property
+    def n_residuals(self) -> int:
+        """Number R of residuals."""
+        return sum(sensor.n_residuals for sensor in self.sensors)
+
     @cached_property
     def point_of(self) -> NDArray[np.intp]:
-        """Index (R,) of the point to which each residual belongs."""
+        """Index of the point to which each residual of points belongs: they come first."""
         per_point = [np.full(len(x.points), x.per_point) for x in self.sensors]
         return np.repeat(np.arange(len(self.points)), np.concatenate(per_point))
 
+    @cached_property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
+        return np.concatenate([sensor.kinds for sensor in self.sensors])
+
+    @property
+    def on_points(self) -> NDArray[np.bool_]:
+        """Which residuals (R,) are of points; the others are of readings."""
+        return np.asarray(self.kinds == "point")
+
+    @property
+    def reactions(self) -> tuple[str, ...]:
+        """Which forces and moments on the fixtures were measured, of `ends.REACTIONS`."""
+        return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.names)
+
+    def units(self, noise: NoiseModel) -> FloatArray:
+        """What a unit of each residual (R,) counts as [m], see `Sensor`."""
+        return np.concatenate([sensor.units(noise) for sensor in self.sensors])
+
     @property
     def slices(self) -> list[tuple[Sensor, slice, slice]]:
-        """Each sensor that has points, which of the points and which of the residuals are its."""
+        """Each sensor of points, which of the points and which of the residuals are its."""
         out, point, row = [], 0, 0
         for sensor in self.sensors:
-            count, rows = len(sensor.points), len(sensor.points) * sensor.per_point
-            out.append((sensor, slice(point, point + count), slice(row, row + rows)))
+            count, rows = len(sensor.points), sensor.n_residuals
+            if count:
+                out.append((sensor, slice(point, point + count), slice(row, row + rows)))
             point, row = point + count, row + rows
         return out
 
     def slow_rows(self, modes: FloatArray) -> FloatArray:
-        """Displacements (K, count) along the cable, in each of the residuals' directions."""
+        """Displacements (K, count) along the cable, in each of the residuals' directions.
+
+        Of what is measured at no point each residual is a mode of its own.
+        """
         blocks = [np.kron(modes[points], np.eye(x.per_point)) for x, points, _ in self.slices]
+        if others := int((~self.on_points).sum()):
+            blocks.append(np.eye(others))
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
 
     def _parts(self, per_point: FloatArray) -> list[FloatArray]:
@@ -136,6 +179,11 @@ class MeasuredPose:
     def distances(self, curve: NodeCurve) -> FloatArray:
         """Distance (K,) [m] of each point from where a curve has it."""
         return np.linalg.norm(self.points - curve.at(self.nearest(curve)), axis=1)
+
+    def misread(self, seen: Observed, noise: NoiseModel) -> FloatArray:
+        """Errors of the readings [m] as `units` have them; empty without any."""
+        rows = [x.residual(seen, np.zeros(0)) for x in self.sensors if not len(x.points)]
+        return np.concatenate([np.zeros(0), *rows]) * self.units(noise)[~self.on_points]
 
     def weighing(self, weight: FloatArray) -> Self:
         """The same pose with other relative standard deviations (K,) of its points."""

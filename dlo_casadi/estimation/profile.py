@@ -46,7 +46,9 @@ def threshold(fit: Fit) -> float:
         if fit.noise.source != "declared":
             break
         item = fit.problem.measured[j]
-        constant = SYSTEMATIC_SHARE * fit.noise.std * item.relative_std[item.point_of]
+        constant = np.zeros(item.n_residuals)
+        constant[item.on_points] = item.relative_std[item.point_of]
+        constant *= SYSTEMATIC_SHARE * fit.noise.std
         square += float(((fit.problem.whitening(j) @ constant) ** 2).sum())
     return (NORMAL_95 + np.sqrt(square)) ** 2 * fit.inflation**2
 

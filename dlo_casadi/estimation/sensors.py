@@ -8,40 +8,49 @@ fixed own unknowns.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.ends import reaction_rows
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.chords import chord_places
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.rod.node import Node
 
 FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class Observed:
-    """What a model says of one pose: its curve, and its multipliers (n_border,) [N, N m]."""
+    """What a model says of one pose: its curve, and `readings` (n_reactions,) [N, N m].
+
+    Readings are what forces and moments on the fixtures a sensor would show, see `ends.REACTIONS`.
+    """
 
     curve: NodeCurve
-    lam: FloatArray
+    readings: FloatArray
 
 
 @dataclass(frozen=True)
 class ObservedChange:
-    """How that changes along q directions: `curve` (n + 1, d or 2 d, q), `lam` (n_border, q)."""
+    """How that changes along q directions.
+
+    `curve` (n + 1, d or 2 d, q), `readings` (n_reactions, q).
+    """
 
     curve: FloatArray
-    lam: FloatArray
+    readings: FloatArray
 
 
 class Sensor(Protocol):
-    """One measurement of one pose, of R residuals, at K points of the cable (K = 0: of no point).
+    """One measurement of one pose: `per_point` residuals of each of its K points, point by point.
 
-    The residuals of points come first, `per_point` of each, point by point.
+    Or of no point at all (K = 0), but of R residuals beside the curve.
     """
 
     @property
@@ -60,8 +69,22 @@ class Sensor(Protocol):
         ...
 
     @property
+    def n_residuals(self) -> int:
+        """R."""
+        ...
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
+        ...
+
+    def units(self, noise: NoiseModel) -> FloatArray:
+        """What a unit of each residual (R,) counts as [m]: one of its stds as one of a point's."""
+        ...
+
+    @property
     def marked(self) -> bool:
-        """Whether the arc lengths of the points are known."""
+        """Whether the arc lengths of all its points are known."""
         ...
 
     def places(self, pose: Pose, length: float) -> FloatArray:
@@ -125,6 +148,20 @@ class _Points(ABC):
     @abstractmethod
     def per_point(self) -> int:
         """Residuals of a point."""
+
+    @property
+    def n_residuals(self) -> int:
+        """K per_point."""
+        return len(self.points) * self.per_point
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: a point."""
+        return np.full(self.n_residuals, "point")
+
+    def units(self, noise: NoiseModel) -> FloatArray:
+        """Ones (R,): these are metres."""
+        return np.ones(self.n_residuals)
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) [1/m] with W cov W^T = 1; the errors of a point are independent."""
@@ -213,3 +250,95 @@ class Markers(_Points):
     def nearest(self, curve: NodeCurve) -> FloatArray:
         """The known arc lengths (K,) [m]."""
         return self.s
+
+
+@dataclass(frozen=True)
+class Wrench:
+    """Forces and moments on the fixtures, component by component.
+
+    Parameters
+    ----------
+    values : (R,) [N] or [N m]
+        Of the cable on whatever holds it, world axes, moments about the fixture.
+    rows : (R,)
+        Which of the model's readings they are.
+    kinds : (R,)
+        What each of them is: force or moment.
+    names : tuple of str
+        Which of `ends.REACTIONS` they are together.
+    """
+
+    values: FloatArray
+    rows: NDArray[np.intp]
+    kinds: NDArray[np.str_]
+    names: tuple[str, ...]
+    per_point = 0
+    marked = True
+
+    @classmethod
+    def of(cls, given: Mapping[str, Sequence[float]], node: type[Node]) -> Self:
+        """From readings by their names, of `ends.REACTIONS`."""
+        at = reaction_rows(node)
+        names = tuple(name for name in at if name in given)
+        return cls(
+            np.concatenate([np.atleast_1d(np.asarray(given[name], float)) for name in names]),
+            np.concatenate([np.arange(at[name].start, at[name].stop) for name in names]),
+            np.concatenate(
+                [np.full(at[name].stop - at[name].start, name.split("_")[1]) for name in names]
+            ),
+            names,
+        )
+
+    @property
+    def points(self) -> FloatArray:
+        """None."""
+        return np.zeros((0, 1))
+
+    @property
+    def weight(self) -> FloatArray:
+        """None."""
+        return np.zeros(0)
+
+    @property
+    def n_residuals(self) -> int:
+        """Components."""
+        return len(self.values)
+
+    def units(self, noise: NoiseModel) -> FloatArray:
+        """Standard deviation of points over that of each component (R,) [m/N] or [1/N]."""
+        own = noise.readings
+        return noise.std / np.where(self.kinds == "moment", own.moment, own.force)
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """None (0,)."""
+        return np.zeros(0)
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """None (0,)."""
+        return places
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """None (0,)."""
+        return np.zeros(0)
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """Zeros (R, q): no point of theirs moves."""
+        return np.zeros((self.n_residuals, moved.shape[2]))
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,)."""
+        return self.values - seen.readings[self.rows]
+
+    def residual_along(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> FloatArray:
+        """Change (R, q) of the residual along directions."""
+        return -along.readings[self.rows]
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) with W cov W^T = 1; all components are independent."""
+        return np.diag(self.units(noise) / noise.std)
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same readings."""
+        return self

@@ -14,7 +14,6 @@ from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import Vector
@@ -67,9 +66,9 @@ def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, l
     for iteration in range(_KINEMATIC_STEPS + 1):
         seen = sweep.observe(shapes, problem.unknowns.fixed, flat, each)
         for k, j in enumerate(used):
-            curve = problem.curve_of(seen.z[j])
+            now, _ = seen.pose(j, chain.length)
+            curve = now.curve
             if iteration > 1:
-                now = Observed(curve, shapes.lam[j])
                 feet[k] = problem.measured[j].located(now, feet[k])
             if iteration < _KINEMATIC_STEPS:
                 step = _kinematic_step(

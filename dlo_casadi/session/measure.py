@@ -83,6 +83,7 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
             item.weight,
             pose.role == "held_out",
             item.s,
+            pose.readings,
         )
         for pose, item in zip(config.experiment.poses, inputs, strict=True)
     )
