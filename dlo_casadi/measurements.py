@@ -144,8 +144,13 @@ def write_points(path: str | Path, points: npt.ArrayLike, s: npt.ArrayLike | Non
     header = AXES[: array.shape[1]]
     if s is not None:
         header, array = [PLACE, *header], np.column_stack([np.asarray(s, dtype=float), array])
-    lines = [",".join(header), *(",".join(map(repr, row)) for row in array.tolist())]
-    write_file(target, "\n".join(lines) + "\n")
+    write_table(target, header, array)
+
+
+def write_table(path: Path, header: Sequence[str], rows: npt.NDArray[np.float64]) -> None:
+    """Write numbers (K, columns) under their names as CSV, whole or not at all."""
+    lines = [",".join(header), *(",".join(map(repr, row)) for row in rows.tolist())]
+    write_file(path, "\n".join(lines) + "\n")
 
 
 def _parse(source: Path, dimension: int) -> tuple[npt.NDArray[np.float64], bool]:

@@ -39,6 +39,7 @@ from dlo_casadi.parameters import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.rest import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
 from dlo_casadi.rod.element import Cell, Slot, Stiffness
+from dlo_casadi.rod.in_frame import Forces, SlotDerivatives, SlotInFrame
 from dlo_casadi.rod.node import Node
 
 StartKind = Literal["pinned", "clamped"]
@@ -94,6 +95,17 @@ class _SlotTerms:
     lagrangian: ca.SX
     advance: ca.SX
     ratio: ca.SX
+
+
+@dataclass(frozen=True)
+class SlotNumbers:
+    """What a slot depends on beside its nodes and multipliers."""
+
+    p: ca.SX
+    rest: ca.SX
+    place: ca.SX
+    deviation: ca.SX
+    shares: ca.SX
 
 
 @dataclass(frozen=True)
@@ -324,8 +336,8 @@ class CableModel:
         return self.chain.kind.local(*ca.vertsplit(self._nodes[0], self.node.coordinates))
 
     @cached_property
-    def _local_slopes(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Derivative of the local increments by the nodes', weights, and their weighed Hessian."""
+    def _local_slope(self) -> ca.SX:
+        """Derivative (2b, 2b) of the local increments by the nodes'."""
         kind, (x, delta) = self.chain.kind, self._nodes
         pairs = zip(
             ca.vertsplit(x, self.node.coordinates),
@@ -333,12 +345,8 @@ class CableModel:
             strict=True,
         )
         moved = kind.local(*(self.node.retract(own, step) for own, step in pairs))
-        gap = kind.local_gap(self._local_of_nodes, moved)
-        weights = ca.SX.sym("weight", gap.numel())
-        bend, _ = ca.hessian(ca.dot(weights, gap), delta)
-        still = ca.SX.zeros(delta.shape)
-        slope, bend = ca.substitute([ca.jacobian(gap, delta), bend], [delta], [still])
-        return slope, weights, bend
+        slope = ca.jacobian(kind.local_gap(self._local_of_nodes, moved), delta)
+        return ca.substitute(slope, delta, ca.SX.zeros(delta.shape))
 
     @cached_property
     def _rest(self) -> ca.SX:
@@ -639,10 +647,36 @@ class CableModel:
         # The curve whose end the Lagrangian's derivative by the multipliers holds.
         return _SlotTerms(lagrangian, kind.advance(true), stretched)
 
+    def in_frame(self, x: ca.SX, pulls: ca.SX, numbers: SlotNumbers) -> SlotInFrame:
+        """A slot in space, written in the frame in its middle.
+
+        Parameters
+        ----------
+        x : (8,)
+            Frames of both nodes.
+        pulls : (3, 1 + n_springs) [N]
+            Force on the end's holder, then the springs' pulls.
+        numbers : SlotNumbers
+        """
+        spread, dead = len(self.chain.kind.rule[0]), len(self._forces)
+        weights = np.zeros((spread + dead + self.n_springs, pulls.shape[1]))
+        weights[:spread, 0] = -1.0
+        weights[spread + dead :, 1:] = -np.eye(self.n_springs)
+        loads = self.slot_forces(numbers.p, numbers.place, numbers.deviation)
+        own = numbers.p, numbers.rest, numbers.place, numbers.deviation, numbers.shares
+
+        def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
+            local = ca.vertcat(ca.DM(self.node.identity), phi)
+            return ca.SX(self.slot_in_frame(local, inner, forces, *own))
+
+        total = ca.SX(loads) + pulls @ ca.DM(weights.T)
+        return SlotInFrame(self.chain.kind, energy, x, Forces(total, weights))
+
     @cached_property
     def slot_forces(self) -> ca.Function:
         """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `slot_in_frame`."""
         forces = self._slot_forces(self._slot(self._stretch, self._inner, ca.SX(0)))
+        forces += [ca.SX.zeros(self.node.dimension)] * self.n_springs
         arguments = [self._p, self._place, self._deviation]
         return ca.Function("slot_forces", arguments, [ca.horzcat(*forces)])
 
@@ -651,13 +685,13 @@ class CableModel:
         """(local, inner, forces, p, rest, place, deviation, shares) -> energy [J] of a slot.
 
         Its minimum over the inner unknowns is that of `slot_by_share`. Forces are arguments, so
-        that a slot and the forces on it may be turned together: the energy stays. The multiplier
-        of the end's place is such a force, too, against those that are spread.
+        that a slot and the forces on it may be turned together: the energy stays. The multipliers
+        of the end's place and of the springs' are such forces, too, see `in_frame`.
         """
         kind, h = self.chain.kind, self.chain.h
         ratio, inner = ca.SX.sym("ratio"), self._inner
         slot = self._slot(ratio, inner, inner**2)
-        count = len(self._slot_forces(slot))
+        count = len(self._slot_forces(slot)) + self.n_springs
         forces = ca.SX.sym("force", self.node.dimension, count)
         energy = self._bending_energy(slot) - self._work(slot, ca.horzsplit(forces))
         tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
@@ -754,25 +788,57 @@ class CableModel:
     @property
     def _to_local(self) -> ca.SX:
         """Derivative of local increments and multipliers by the nodes' and multipliers."""
-        return ca.diagcat(self._local_slopes[0], ca.SX.eye(self.n_border))
+        return ca.diagcat(self._local_slope, ca.SX.eye(self.n_border))
 
     @cached_property
     def slot(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
+        if self.in_space:
+            found, spread = self._about_nodes, self._of_pulls
+            outputs = [found.value, spread @ found.gradient, spread @ found.hessian @ spread.T]
+            return self._here("slot", self._slot_arguments, outputs)
         value = self._terms.lagrangian
         hessian, gradient = ca.hessian(value, self._by_slot)
-        _, weights, bend = self._local_slopes
-        bend = ca.substitute(bend, weights, gradient[: weights.numel()])
-        by_nodes = self._to_local.T @ hessian @ self._to_local
-        by_nodes += ca.diagcat(bend, ca.SX(self.n_border, self.n_border))
-        outputs = [value, self._to_local.T @ gradient, by_nodes]
-        return self._here("slot", self._slot_arguments, outputs)
+        return self._here("slot", self._slot_arguments, [value, gradient, hessian])
 
     @cached_property
     def slot_slope(self) -> ca.Function:
         """As `slot` -> its gradient alone, for a small part of the operations."""
-        gradient = ca.gradient(self._terms.lagrangian, self._by_slot)
-        return self._here("slot_slope", self._slot_arguments, [self._to_local.T @ gradient])
+        if self.in_space:
+            gradient = self._of_pulls @ self._about_nodes.gradient
+        else:
+            gradient = ca.gradient(self._terms.lagrangian, self._by_slot)
+        return self._here("slot_slope", self._slot_arguments, [gradient])
+
+    @cached_property
+    def _framed(self) -> SlotInFrame:
+        """The slot in space, at this model's own symbols."""
+        starts = [] if self.end == "free" else [0]
+        starts += [self.n_conditions + 6 * k + 3 for k in range(self.n_springs)]
+        pulls = [self._lam[k : k + 3] for k in starts]
+        if self.end == "free":
+            pulls = [ca.SX.zeros(3), *pulls]
+        shares = ca.SX(self.shares(self._p, self._place))
+        numbers = SlotNumbers(self._p, self._rest, self._place, self._deviation, shares)
+        return self.in_frame(self._nodes[0], ca.horzcat(*pulls), numbers)
+
+    @cached_property
+    def _about_nodes(self) -> SlotDerivatives:
+        """Derivatives by rotations about the nodes' own axes."""
+        framed = self._framed
+        return framed.derivatives().about(*framed.node_turns)
+
+    @property
+    def _of_pulls(self) -> ca.DM:
+        """Matrix from both nodes and the pulls to both nodes and all multipliers."""
+        rows = np.zeros((2 * self.node.increment + self.n_border, 6 + 3 * (1 + self.n_springs)))
+        rows[:6, :6] = np.eye(6)
+        if self.end != "free":
+            rows[6:9, 6:9] = np.eye(3)
+        for k in range(self.n_springs):
+            at = 6 + self.n_conditions + 6 * k + 3
+            rows[at : at + 3, 9 + 3 * k : 12 + 3 * k] = np.eye(3)
+        return ca.sparsify(ca.DM(rows))
 
     @cached_property
     def at_ends(self) -> ca.Function:
@@ -784,8 +850,13 @@ class CableModel:
     def slot_sensitivity(self) -> ca.Function:
         """As `slot` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
         by = ca.vertcat(self._p, self._rest, self._deviation)
-        mixed = ca.jacobian(ca.gradient(self._terms.lagrangian, self._by_slot), by)
-        return self._here("slot_sensitivity", self._slot_arguments, [self._to_local.T @ mixed])
+        if self.in_space:
+            first, last, pulled = self._framed.by_numbers(by)
+            turns = self._framed.node_turns
+            mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
+        else:
+            mixed = ca.jacobian(ca.gradient(self._terms.lagrangian, self._by_slot), by)
+        return self._here("slot_sensitivity", self._slot_arguments, [mixed])
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
@@ -808,8 +879,17 @@ class CableModel:
     def slot_curve_slopes(self) -> ca.Function:
         """As `slot` -> the same, derivatives by increments and lam, and by p, rest, deviation."""
         others = ca.vertcat(self._p, self._rest, self._deviation)
-        by_nodes = ca.jacobian(self._advanced, self._by_slot) @ self._to_local
-        blocks = [by_nodes, ca.jacobian(self._advanced, others)]
+        if self.in_space:
+            # The advance is the Lagrangian's derivative by the force on the end's holder.
+            found, spread = self._about_nodes, self._of_pulls
+            by_nodes = (spread @ found.hessian)[:, 6:9].T
+            advance = [by_nodes, self._framed.by_numbers(others)[2][:3, :]]
+            stretched = self._terms.ratio
+            by_nodes = ca.jacobian(stretched, self._by_slot) @ self._to_local
+            ratio = [by_nodes, ca.jacobian(stretched, others)]
+            blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
+        else:
+            blocks = [ca.jacobian(self._advanced, by) for by in (self._by_slot, others)]
         return self._here("slot_curve_slopes", self._slot_arguments, [self._advanced, *blocks])
 
     @cached_property
@@ -876,7 +956,7 @@ class CableModel:
         rest = ca.SX.sym("mean", own.numel())
         mean = ca.substitute(mean, own, rest)
         slopes = [ca.jacobian(mean, symbols) for symbols in (self._local[1], rest, self._p)]
-        slopes[0] = slopes[0] @ self._local_slopes[0]
+        slopes[0] = slopes[0] @ self._local_slope
         mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
         return self._here("slot_state", self._slot_arguments, [mean, *slopes])
 

@@ -202,7 +202,7 @@ def test_a_configuration_cannot_be_changed(tmp_path):
         # poses
         ("b.csv", "a.csv", 13, r"pose 2 \(a.csv\): pose 1 is called 'a' too"),
         ("a.csv", "a.jpg", 12, "a photograph is not a CSV; measurement kind: images?"),
-        ("file: a.csv, ", "", 12, "'file' is missing in pose 1"),
+        ("file: a.csv, ", "", 12, "pose 1: 'file' is missing"),
         ("role: fit", "role: held_out", 11, "no pose has role: fit"),
     ],
 )
@@ -516,6 +516,56 @@ def test_what_photographs_need(tmp_path):
         load_images(tmp_path, CAMERA, BOARD, REFERENCE)
     with pytest.raises(ConfigError, match=r"board.standoff: 0.012 m need a camera"):
         load_images(tmp_path, BOARD)
+
+
+IN_SPACE = (
+    ("[0, -9.81]", "[0, -9.81, 0]"),
+    ("start: [0, 0]", "start: [0, 0, 0.1]"),
+    (".1], role", ".1, 0.2], role"),
+    ("{kind: centerlines, std: 3e-4}", f"{{kind: images, {CAMERA}, {BOARD}}}"),
+)
+
+
+@pytest.mark.parametrize(
+    ("files", "name"),
+    [
+        ("[pose_01_a.jpg, pose_01_b.jpg]", "pose_01"),
+        ("[pose_1a.jpg]", "pose_1"),
+        ("[IMG_12.jpg, IMG_13.jpg]", "IMG_12"),
+        ("[left.jpg, low.jpg]", "left"),
+    ],
+)
+def test_several_photographs_of_a_pose(tmp_path, files, name):
+    """One that is there is enough; lines and markers may stand beside them."""
+    (tmp_path / files.strip("[]").split(",")[0]).touch()
+    config = load(tmp_path, *IN_SPACE, ("file: a.csv", f"files: {files}"))
+    first, second, _ = config.experiment.poses
+    assert (first.name, len(first.paths)) == (name, files.count(".jpg"))
+    assert not config.skipped
+    assert second.paths == (second.file,)
+
+
+@pytest.mark.parametrize(
+    ("new", "message"),
+    [
+        ("file: a.csv, files: [a.jpg]", r"pose 1 \(a.csv\).files: give file or files, found both"),
+        ("files: []", r"files: file names \[a.jpg, b.jpg\] belong here, found \[\]"),
+        ("files: a.jpg", "belong here, found 'a.jpg'"),
+        ("files: [a.jpg, 1/a.png]", "each photograph needs a name of its own, found a.jpg, a.png"),
+        ("files: [x.jpg, y.jpg]", "x.jpg does not exist.*y.jpg does not exist"),
+    ],
+)
+def test_mistakes_in_files(tmp_path, new, message):
+    only = [("file: b.csv", "file: gone.csv")] if "x.jpg" in new else []
+    with pytest.raises(ConfigError, match=message):
+        load(tmp_path, *IN_SPACE, ("file: a.csv", new), *only)
+
+
+def test_several_photographs_are_of_space(tmp_path):
+    with pytest.raises(ConfigError, match="several photographs are of a cable in space"):
+        load(tmp_path, ("file: a.csv", "files: [a.jpg, b.jpg]"))
+    with pytest.raises(ConfigError, match="in space need a board of markers"):
+        load(tmp_path, *IN_SPACE, (f"{CAMERA}, {BOARD}", REFERENCE))
 
 
 @pytest.mark.parametrize(

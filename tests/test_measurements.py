@@ -31,7 +31,7 @@ def test_centerlines_of_the_repository(path):
     if not isinstance(config.experiment.measurement, Centerlines):
         pytest.skip("photographs")
     for pose in config.experiment.poses:
-        read = read_points(pose.file, pose.start, pose.end)
+        read = read_points(pose.paths[0], pose.start, pose.end)
         points, before = read.points, 0.0 if read.s is None else read.s[0]
         assert points.shape[1] == len(pose.start)
         assert np.linalg.norm(points[0] - pose.start) < before + 0.03 * config.cable.length

@@ -1,5 +1,6 @@
 """A rod in space against closed forms, the plane, turned worlds, and itself on finer meshes."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.linalg import null_space
@@ -7,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.descent import descend
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.equilibrium import EquilibriumError, Pose, solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.initial_frames import same_sign
@@ -235,3 +236,46 @@ def test_descents_from_far_away_are_minima():
     _, force, matrix = m.assembly.balance(found.shapes, given)
     assert np.abs(force.x[found.converged]).max() < 1e-9
     assert np.all(matrix.negative()[found.converged] == m.n_multipliers)
+
+
+@pytest.mark.parametrize("end", ["clamped", "free"])
+@pytest.mark.parametrize("element", ["arc", "quadratic"])
+def test_a_slot_is_differentiated_as_by_casadi_in_one_go(element, end):
+    """Loads, a spring to a fixed point, a stretching cable and a softening section at once."""
+    effects = [EFFECTS[name]() for name in ("tether", "axial_stretch", "bending_softening")]
+    cable = Cable(LENGTH, 0.12, 0.006, EI, torsional_stiffness=GJ)
+    m = CableModel(cable, 12, element, "clamped", end, DOWN, (*effects, EFFECTS["point_force"]()))
+    node = m.node
+    x, lam, p = (
+        ca.SX.sym(name, k) for name, k in (("x", 8), ("lam", m.n_border), ("p", len(m.names)))
+    )
+    rest, deviation, delta = (
+        ca.SX.sym("rest", 9),
+        ca.SX.sym("d", len(m.deviation_names)),
+        ca.SX.sym("i", 6),
+    )
+    place = m.chain.layout.slots[4]
+    nodes = ca.vertcat(node.retract(x[:4], delta[:3]), node.retract(x[4:], delta[3:]))
+    value, advance = m.slot_by_share(nodes, lam, p, rest, place, deviation, m.shares(p, place))
+    by = ca.vertcat(delta, lam)
+    hessian, gradient = ca.hessian(value, by)
+    others = ca.vertcat(p, rest, deviation)
+    outputs = [value, gradient, hessian, ca.jacobian(gradient, others)]
+    outputs += [ca.jacobian(advance, by), ca.jacobian(advance, others)]
+    outputs = ca.substitute(outputs, [delta], [ca.SX.zeros(6)])
+    plain = ca.Function("plain", [x, lam, p, rest, deviation], outputs)
+
+    rng = np.random.default_rng(0)
+    frames = Rotation.from_rotvec([[0.2, 1.0, -0.5], [0.5, 0.7, -0.3]]).as_quat().ravel()
+    scales = np.array([q.nominal if q.log else q.scale for q in m.parameters])
+    numbers = m.nominal + 0.1 * scales * rng.uniform(0.5, 1.0, len(scales))
+    forces, own = rng.normal(size=m.n_border), rng.normal(size=9)
+    moved = 0.01 * rng.normal(size=len(m.deviation_names))
+    expected = plain(frames, forces, numbers, own, moved)
+    arguments = (frames, forces, numbers, own, place, moved)
+    slopes = m.slot_curve_slopes(*arguments)
+    found = [*m.slot(*arguments), m.slot_sensitivity(*arguments)]
+    found += [slopes[1][:3, :], slopes[2][:3, :]]
+    for one, other in zip(found, expected, strict=True):
+        size = np.abs(np.array(other)).max()
+        assert np.array(one) == pytest.approx(np.array(other), rel=1e-11, abs=1e-13 * size)

@@ -77,7 +77,7 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
     """Write the steps' pictures of all poses; return the files."""
     if config.experiment.measurement.kind != "images":
         raise DloError("--show draws photographs; this configuration has centre-lines")
-    poses = [pose for pose in config.measured_poses if pose.file.is_file()]
+    poses = [pose for pose in config.measured_poses if pose.paths[0].is_file()]
     written = []
     make_folder(folder)
     for k, pose in enumerate(poses):

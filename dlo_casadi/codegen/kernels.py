@@ -14,10 +14,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.codegen.frames import SlotNumbers, slot_in_space
 from dlo_casadi.ends import EndConditions
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import CableModel, SlotNumbers
 
 FloatArray = NDArray[np.floating]
 
@@ -214,11 +213,53 @@ def _in_plane(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Functio
 
 
 def _in_space(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:
-    """(x (8,), lam (3,), row, p) -> what frames.slot_in_space tells, in one vector."""
+    """(x (8,), lam (3,), row, p) -> what `_told_in_space` tells, in one vector."""
     x, lam = ca.SX.sym("x", 8), ca.SX.sym("lam", 3)
-    outputs = ca.vertcat(*slot_in_space(model, x, lam, numbers))
+    outputs = ca.vertcat(*_told_in_space(model, x, lam, numbers))
     arguments = [x, lam, row, _symbols(numbers.p)]
     return ca.Function("kernel", arguments, ca.cse([ca.densify(outputs)]))
+
+
+def _told_in_space(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SlotNumbers) -> list[ca.SX]:
+    """A slot's Lagrangian and its derivatives by increments about the world's axes.
+
+    Parameters
+    ----------
+    x : (8,)
+        Frames of both nodes.
+    lam : (3,) [N]
+        Force on the end's holder; also where that is free, for its derivative is the advance.
+
+    Returns
+    -------
+    list
+        Value; by lam: advance (3,) [m]; phi (3,) [rad]; slopes (3,) by the first, last node;
+        Hessian by first-first, first-last, last-last, first-lam, last-lam, lam-lam: rows one after
+        another (9,), of symmetric blocks the upper triangle column by column (6,).
+    """
+    found = model.in_frame(x, lam, numbers).derivatives()
+    found = found.about(found.turn, found.turn)
+    (first, between, last), (first_lam, last_lam) = found.bends, found.mixed
+    return [
+        found.value,
+        found.by_lam,
+        found.phi,
+        *found.slopes,
+        _triangle(first),
+        _rows(between),
+        _triangle(last),
+        _rows(first_lam),
+        _rows(last_lam),
+        _triangle(found.lam_lam),
+    ]
+
+
+def _rows(a: ca.SX) -> ca.SX:
+    return ca.vec(a.T)
+
+
+def _triangle(a: ca.SX) -> ca.SX:
+    return ca.vertcat(*(a[: k + 1, k] for k in range(3)))
 
 
 def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:

@@ -33,8 +33,9 @@ def _label(place: Place, data: Any) -> str:
         elif isinstance(data, list) and isinstance(part, int) and part < len(data):
             data = data[part]
             if words == ["experiment", "poses"]:
-                file = data.get("file") if isinstance(data, dict) else None
-                words = [f"pose {part + 1}" + (f" ({file})" if isinstance(file, str) else "")]
+                file = data.get("file", data.get("files")) if isinstance(data, dict) else None
+                said = ", ".join(map(str, file)) if isinstance(file, list) else file
+                words = [f"pose {part + 1}" + (f" ({said})" if isinstance(said, str) else "")]
             else:
                 words[-1] += f"[{part}]"
     return ".".join(words) or "the top of the file"

@@ -172,4 +172,4 @@ def impossible_values(experiment: Experiment, length: float) -> Iterator[Problem
         for key in ("start", "end"):
             for k, value in enumerate(getattr(pose, key) or ()):
                 for place, message in COORDINATE.problems((*at, "poses", i, key, k), value):
-                    yield Problem(place, f"pose {i + 1} ({pose.file.name}) {key}: {message}")
+                    yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")

@@ -118,13 +118,16 @@ _LARGEST_HEADINGS = {"start": 6.3, "end": 25.0}
 def _contradictions(experiment: Experiment) -> list[Problem]:
     """Find poses that do not fit the boundary, the kind of measurement, or each other."""
     problems: list[Problem] = []
-    held = experiment.boundary
+    held, measurement = experiment.boundary, experiment.measurement
+    if experiment.in_space and measurement.kind == "images" and measurement.board is None:
+        text = "photographs of a cable in space need a board of markers; a reference is of a plane"
+        problems.append(Problem(("experiment", "measurement"), text))
     names: dict[str, int] = {}
     for i, pose in enumerate(experiment.poses):
 
         def wrong(message: str, i: int = i, pose: Pose = pose, key: str | None = None) -> None:
             at = ("experiment", "poses", i) if key is None else ("experiment", "poses", i, key)
-            problems.append(Problem(at, f"pose {i + 1} ({pose.file.name}): {message}"))
+            problems.append(Problem(at, f"pose {i + 1} ({pose.shown_by}): {message}"))
 
         if len(pose.name.encode()) > _LONGEST_NAME:
             wrong(f"results are named after the file, at most {_LONGEST_NAME} bytes long")
@@ -151,11 +154,15 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
             for key in ("end", "end_heading", "end_orientation"):
                 if getattr(pose, key) is not None:
                     wrong(f"a free end has no {key}; boundary.end: pinned or clamped?")
-        ending = pose.file.suffix.lower()
-        if experiment.measurement.kind == "images" and ending == ".csv":
+        endings = {path.suffix.lower() for path in pose.paths}
+        # In space photographs, lines and markers may stand in one session.
+        mixed = experiment.in_space and pose.file is not None
+        if experiment.measurement.kind == "images" and ".csv" in endings and not mixed:
             wrong("a CSV is not a photograph; measurement kind: centerlines?")
-        if experiment.measurement.kind == "centerlines" and ending in _IMAGE_ENDINGS:
+        if experiment.measurement.kind == "centerlines" and endings & _IMAGE_ENDINGS:
             wrong("a photograph is not a CSV; measurement kind: images?")
+        if len(pose.files) > 1 and not experiment.in_space:
+            wrong("several photographs are of a cable in space; gravity: two numbers", key="files")
     if not any(pose.role == "fit" for pose in experiment.poses):
         at = ("experiment", "poses")
         problems.append(Problem(at, "no pose has role: fit, there is nothing to fit to"))
@@ -217,18 +224,25 @@ def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) ->
 
 
 def _missing(poses: Iterable[Pose]) -> dict[str, str]:
-    """Find poses whose file does not exist."""
+    """Find poses of which no file exists."""
     reasons: dict[str, str] = {}
     for pose in poses:
-        try:
-            if stat.S_ISREG(pose.file.stat().st_mode):
-                continue
-            reasons[pose.name] = f"{pose.file} is no file; a photograph or a CSV belongs here"
-        except (FileNotFoundError, NotADirectoryError):
-            reasons[pose.name] = f"{pose.file} does not exist; {_near(pose.file)}"
-        except OSError as error:
-            reasons[pose.name] = f"{show(str(pose.file))} cannot be read: {error.strerror}"
+        found = [_absent(path) for path in pose.paths]
+        if all(found):
+            reasons[pose.name] = "; ".join(found)
     return reasons
+
+
+def _absent(file: Path) -> str:
+    """Why there is no such file to be read; empty if there is."""
+    try:
+        if stat.S_ISREG(file.stat().st_mode):
+            return ""
+        return f"{file} is no file; a photograph or a CSV belongs here"
+    except (FileNotFoundError, NotADirectoryError):
+        return f"{file} does not exist; {_near(file)}"
+    except OSError as error:
+        return f"{show(str(file))} cannot be read: {error.strerror}"
 
 
 def _near(file: Path) -> str:
@@ -245,7 +259,7 @@ def _no_fit_pose(poses: Sequence[Pose], skipped: Mapping[str, str]) -> list[Prob
     return [
         Problem(
             ("experiment", "poses", i),
-            f"pose {i + 1} ({pose.file.name}): {skipped[pose.name]}",
+            f"pose {i + 1} ({pose.shown_by}): {skipped[pose.name]}",
         )
         for i, pose in enumerate(poses)
         if pose.role == "fit" and pose.name in skipped

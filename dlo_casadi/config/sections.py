@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -345,11 +346,17 @@ class Tolerances(Section):
     """Of a constant offset of a sensor's moment, each component [N m]."""
 
 
-class Pose(Section):
-    """One measured shape: where the ends were held, and the file that shows it."""
+# pose_01_a -> pose_01: a digit, and letters after it.
+_TOLD_APART = re.compile(r"(.*[0-9])[-_. ]?[A-Za-z]+")
 
-    file: Path
+
+class Pose(Section):
+    """One measured shape: where the ends were held, and the file or files that show it."""
+
+    file: Path | None = None
     """Photograph or CSV, found relative to the YAML; an absolute path once loaded."""
+    files: tuple[Path, ...] = ()
+    """Photographs from several places [a.jpg, b.jpg, ...] of a cable in space, instead of file."""
     start: Place
     """Where the start is held [x, y] [m], in space [x, y, z]."""
     end: Place | None = None
@@ -381,9 +388,31 @@ class Pose(Section):
     """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
 
     @property
+    def paths(self) -> tuple[Path, ...]:
+        """All its files."""
+        return self.files if self.file is None else (self.file,)
+
+    @property
+    def shown_by(self) -> str:
+        """Names of its files, for messages."""
+        return ", ".join(path.name for path in self.paths)
+
+    @property
+    def photographs(self) -> dict[str, Path]:
+        """Its files by their names without folder and ending."""
+        return {well_formed(path.stem): path for path in self.paths}
+
+    @property
     def name(self) -> str:
-        """Name of the pose: its file without folder and ending."""
-        return well_formed(self.file.stem)
+        """Name of the pose: its file without folder and ending.
+
+        Of several files it is what their names have in common, where letters follow that tell
+        them apart (pose_01 of pose_01_a.jpg and pose_01_b.jpg), else the first one's.
+        """
+        stems = list(self.photographs)
+        common = {found[1] for stem in stems if (found := _TOLD_APART.fullmatch(stem))}
+        every = all(_TOLD_APART.fullmatch(stem) for stem in stems)
+        return common.pop() if self.files and every and len(common) == 1 else stems[0]
 
     @property
     def readings(self) -> dict[str, tuple[float, ...]]:
@@ -398,6 +427,26 @@ class Pose(Section):
             raise ValueError(f"a file name belongs here, found {show(value)}")
         folder = (info.context or {}).get("folder", Path())
         return (folder / value).absolute()
+
+    @field_validator("files", mode="before")
+    @classmethod
+    def _all_absolute(cls, value: object, info: ValidationInfo) -> object:
+        if not isinstance(value, list | tuple) or not value:
+            raise ValueError(f"file names [a.jpg, b.jpg] belong here, found {show(value)}")
+        return tuple(cls._absolute(item, info) for item in value)
+
+    @model_validator(mode="after")
+    def _shown(self) -> Pose:
+        if self.file is None and not self.files:
+            text = "'file' is missing: a photograph or CSV; or files: [a.jpg, b.jpg] of photographs"
+            raise Contradiction(Problem((), text))
+        if self.file is not None and self.files:
+            raise Contradiction(Problem(("files",), "give file or files, found both"))
+        twice = [path.name for path in self.files if len(self.photographs) < len(self.files)]
+        if twice:
+            text = f"each photograph needs a name of its own, found {', '.join(twice)}"
+            raise Contradiction(Problem(("files",), text))
+        return self
 
 
 class Experiment(Section):

@@ -106,7 +106,7 @@ def backgrounds(
     """
     if config.experiment.in_space:
         return [in_room(room) for room in rooms(config, poses, stages)]
-    files = {pose.name: pose.file for pose in config.experiment.poses}
+    files = {pose.name: pose.paths[0] for pose in config.experiment.poses}
     photographed = config.experiment.measurement.kind == "images"
     budget = PHOTOGRAPHS // max(1, len(poses))
     predicted = [shape.curve for stage in stages for shape in stage.shapes.values()]

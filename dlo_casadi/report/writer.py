@@ -11,7 +11,7 @@ from typing import Self
 from dlo_casadi.config import Config
 from dlo_casadi.durable import FolderDraft, is_marked, make_folder, refuse_foreign, write_file
 from dlo_casadi.errors import DloError, OutputError
-from dlo_casadi.measurements import write_points
+from dlo_casadi.measurements import write_points, write_table
 from dlo_casadi.report.figures import write_figures
 from dlo_casadi.report.json_report import report_text
 from dlo_casadi.report.page import GENERATOR, report_page
@@ -108,6 +108,10 @@ def write_numbers(folder: Path, outcome: Outcome) -> None:
     for pose in outcome.poses:
         if len(pose.points):
             write_points(lines / f"{pose.name}.csv", pose.points, pose.s)
+        for k, view in enumerate(pose.views, 1):
+            if view.sight is not None:
+                which = view.name.removeprefix(pose.name).lstrip("-_. ") or str(k)
+                write_table(lines / f"{pose.name}_{which}.csv", ["u_px", "v_px"], view.sight.pixels)
 
 
 def draw(folder: Path, outcome: Outcome) -> None:

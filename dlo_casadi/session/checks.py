@@ -160,7 +160,7 @@ def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
     if photographs and experiment.boundary.end != "free":
         fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
         sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
-        doubtful = [pose for pose in poses if pose.name not in sound and pose.file.is_file()]
+        doubtful = [pose for pose in poses if pose.name not in sound and pose.paths[0].is_file()]
         if len(doubtful) > 1:
             again = {pose.name: line_without_end(config, pose) for pose in doubtful}
             points |= {name: line for name, line in again.items() if line is not None}

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from dlo_casadi import vision
+from dlo_casadi.config import Camera as DeclaredCamera
 from dlo_casadi.config import Config
 from dlo_casadi.config import Pose as DeclaredPose
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.measurements import read_points
-from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.outcome import PoseInput, ViewInput
 
 # Points kept of one centre-line; more only repeat their neighbours' noise.
 MOST_POINTS = 240
@@ -51,11 +52,11 @@ def read_inputs(config: Config, step: Callable[[str, int, int], None]) -> tuple[
     poses = config.experiment.poses
     inputs = []
     for k, pose in enumerate(poses):
-        step(pose.file.name, k, len(poses))
+        step(pose.shown_by, k, len(poses))
         try:
             if pose.name in skipped:
                 raise MeasurementError(skipped[pose.name])
-            item = _read_image(config, pose) if _is_photograph(config) else _read_csv(config, pose)
+            item = _reader(config, pose)(config, pose)
         except MeasurementError as error:
             item = PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=error.message)
         inputs.append(item)
@@ -95,7 +96,7 @@ def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
     It ends where the cable does, and not where the configuration says.
     """
     try:
-        image = vision.read_image(pose.file)
+        image = vision.read_image(pose.paths[0])
         free = pose.model_copy(update={"end": None})
         return _extract(config, free, image, view_of(config, image)).points
     except MeasurementError:
@@ -117,19 +118,63 @@ def conditions(pose: DeclaredPose) -> Pose:
     )
 
 
-def _is_photograph(config: Config) -> bool:
-    return config.experiment.measurement.kind == "images"
+def _reader(config: Config, pose: DeclaredPose) -> Callable[[Config, DeclaredPose], PoseInput]:
+    """How the files of a pose are read."""
+    if config.experiment.measurement.kind != "images" or pose.paths[0].suffix.lower() == ".csv":
+        return _read_csv
+    return _read_views if config.experiment.in_space else _read_image
 
 
 def _read_csv(config: Config, pose: DeclaredPose) -> PoseInput:
-    read = read_points(pose.file, pose.start, pose.end, config.cable.length)
+    read = read_points(pose.paths[0], pose.start, pose.end, config.cable.length)
     kept = slice(None, None, max(1, -(-len(read.points) // MOST_POINTS)))
     s = None if read.s is None else read.s[kept]
     return PoseInput(pose.name, pose.role, read.points[kept], s=s)
 
 
+def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
+    """Photographs of a cable in space; those that cannot be used are told of."""
+    measurement = config.experiment.measurement
+    assert measurement.kind == "images"
+    if measurement.camera is None:
+        raise MeasurementError("photographs of a cable in space need measurement.camera.matrix")
+    images, problems = {}, []
+    for name, path in pose.photographs.items():
+        try:
+            images[name] = vision.read_image(path)
+        except MeasurementError as error:
+            problems.append(f"{name}: {error.message}")
+    views = vision.measure_views(
+        images,
+        _board(config),
+        _camera(measurement.camera),
+        start=pose.start,
+        end=pose.end,
+        diameter=config.cable.diameter,
+        length=config.cable.length,
+    )
+    problems += views.problems.values()
+    if not views.sights or views.line is None:
+        raise MeasurementError(" ".join([*problems, *views.messages]))
+    kept = slice(None, None, max(1, -(-len(views.line.points) // MOST_POINTS)))
+    std = views.line.std[kept]
+    numbers = [set(sight.viewpoint.numbers) for sight in views.sights.values()]
+    return PoseInput(
+        pose.name,
+        pose.role,
+        views.line.points[kept],
+        weight=std / np.median(std),
+        confidence=min(sight.confidence for sight in views.sights.values()),
+        messages=(*problems, *views.messages),
+        markers=tuple(sorted(set.intersection(*numbers))),
+        views=tuple(
+            ViewInput(name, path, views.sights.get(name)) for name, path in pose.photographs.items()
+        ),
+    )
+
+
 def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
-    image = vision.read_image(pose.file)
+    image = vision.read_image(pose.paths[0])
     try:
         view = view_of(config, image)
         line = _extract(config, pose, image, view)
@@ -141,7 +186,7 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
         pose.name,
         pose.role,
         line.points[kept],
-        image=pose.file,
+        image=pose.paths[0],
         pixels=line.pixels[kept],
         to_pixels=view.to_pixels,
         center=tuple(view.to_board([[image.shape[1] / 2, image.shape[0] / 2]])[0]),
@@ -181,7 +226,7 @@ def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
     VisionError
         If the photograph cannot be read.
     """
-    image = vision.read_image(pose.file)
+    image = vision.read_image(pose.paths[0])
     view, line, workings = None, None, vision.Workings()
     try:
         view = view_of(config, image)
@@ -236,17 +281,22 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
         )
         _check_reference(reference.pixels, image.shape)
         return vision.from_reference(reference, image.shape)
-    assert measurement.board is not None
+    camera = None if measurement.camera is None else _camera(measurement.camera)
+    return vision.locate_board(image, _board(config), camera)
+
+
+def _board(config: Config) -> vision.Board:
+    measurement = config.experiment.measurement
+    assert measurement.kind == "images"
     declared = measurement.board
-    board = vision.Board(
+    assert declared is not None
+    return vision.Board(
         declared.dictionary, declared.marker_size, declared.standoff, declared.marker_centers
     )
-    camera = None
-    if measurement.camera is not None:
-        camera = vision.Camera(
-            np.array(measurement.camera.matrix), np.array(measurement.camera.distortion)
-        )
-    return vision.locate_board(image, board, camera)
+
+
+def _camera(declared: DeclaredCamera) -> vision.Camera:
+    return vision.Camera(np.array(declared.matrix), np.array(declared.distortion))
 
 
 def _check_reference(pixels: np.ndarray, shape: tuple[int, ...]) -> None:

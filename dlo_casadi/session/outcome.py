@@ -16,6 +16,7 @@ from dlo_casadi.estimation.band import COVERED
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.thresholds import DIFFERENT
+from dlo_casadi.vision import Sight
 
 FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
@@ -163,6 +164,15 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class ViewInput:
+    """One of the photographs of a pose in space, and what is seen in it; None if nothing is."""
+
+    name: str
+    image: Path
+    sight: Sight | None
+
+
+@dataclass(frozen=True)
 class PoseInput:
     """One pose as it was measured.
 
@@ -199,6 +209,9 @@ class PoseInput:
         What the camera step noticed.
     s : (K,), optional [m]
         Known arc lengths of markers.
+    views : tuple of ViewInput
+        Photographs of a cable in space; `points` are the line that they show together, none where
+        fewer than two agree.
     """
 
     name: str
@@ -217,6 +230,7 @@ class PoseInput:
     markers: tuple[int, ...] | None = None
     messages: tuple[str, ...] = ()
     s: FloatArray | None = None
+    views: tuple[ViewInput, ...] = ()
 
 
 @dataclass(frozen=True)

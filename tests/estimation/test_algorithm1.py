@@ -41,7 +41,7 @@ def session(name: str) -> tuple[Cable, list[MeasuredPose]]:
     poses = [
         MeasuredPose.of_points(
             Pose(item.start, item.end, branch=item.branch, name=item.name),
-            read_points(item.file, item.start, item.end).points,
+            read_points(item.paths[0], item.start, item.end).points,
             held_out=item.role == "held_out",
         )
         for item in config.experiment.poses

@@ -1,0 +1,326 @@
+"""A slot between two frames, differentiated in stages: fewer operations than in one go.
+
+The Lagrangian of a slot is the same however the slot and the forces on it are turned together. So
+it is written in the frame R in its middle, by the rotation vector phi from node to node and the
+forces c = R^T F; CasADi differentiates it there by phi, the inner unknowns and c, the inner
+unknowns are eliminated, and the chain rule to the nodes is in closed form. With increments alpha,
+beta of both nodes about the axes of R,
+
+    sigma = (alpha + beta) / 2,   epsilon = beta - alpha,
+    R -> R exp(mu),               phi -> phi + psi,
+    mu  = sigma - z x epsilon / 2 + O(2),    psi = K epsilon + O(2),
+
+z = tan(|phi| / 4) n, K = kappa (1 - n n^T) + n n^T, kappa = (|phi| / 2) / sin(|phi| / 2), n along
+phi.
+
+References
+----------
+Second-order terms: composition of unit quaternions to second order, e.g. Murray, Li and Sastry, A
+Mathematical Introduction to Robotic Manipulation, 1994.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.rod.element import Element
+from dlo_casadi.rod.helix import inverse_of
+from dlo_casadi.rod.node import conjugate, quaternion_product
+
+FloatArray = NDArray[np.floating]
+
+# Energy [J] of a slot of the rotation vector phi (3,), inner unknowns and forces (3, m).
+Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
+
+# Keeps a quotient of two squares of an angle at a straight element finite.
+_TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Forces on a slot (3, m) [N] in world axes, of `weights` (m, q) times q multipliers (3,)."""
+
+    total: ca.SX
+    weights: FloatArray
+
+
+@dataclass(frozen=True)
+class SlotDerivatives:
+    """A slot's Lagrangian and its derivatives by rotations of its nodes and by multipliers.
+
+    Rotations are about the axes of the middle frame, or what `about` has made of them;
+    multipliers are in world axes, q vectors one after the other.
+
+    Parameters
+    ----------
+    value : scalar [J]
+    turn : (3, 3)
+        From the axes of the middle frame to the world's.
+    phi : (3,) [rad]
+    slopes : tuple of (3,)
+        By the first node, by the last.
+    by_lam : (3 q,)
+    bends : tuple of (3, 3)
+        By first-first, first-last, last-last.
+    mixed : tuple of (3, 3 q)
+        By first-lam, last-lam.
+    lam_lam : (3 q, 3 q)
+    """
+
+    value: ca.SX
+    turn: ca.SX
+    phi: ca.SX
+    slopes: tuple[ca.SX, ca.SX]
+    by_lam: ca.SX
+    bends: tuple[ca.SX, ca.SX, ca.SX]
+    mixed: tuple[ca.SX, ca.SX]
+    lam_lam: ca.SX
+
+    def about(self, first: ca.SX, last: ca.SX) -> SlotDerivatives:
+        """The same by rotations about other axes: matrices (3, 3) that lead to them."""
+        (g, h), (aa, ab, bb), (al, bl) = self.slopes, self.bends, self.mixed
+        return SlotDerivatives(
+            self.value,
+            self.turn,
+            self.phi,
+            (first @ g, last @ h),
+            self.by_lam,
+            (first @ aa @ first.T, first @ ab @ last.T, last @ bb @ last.T),
+            (first @ al, last @ bl),
+            self.lam_lam,
+        )
+
+    @property
+    def gradient(self) -> ca.SX:
+        """By both nodes and the multipliers (6 + 3 q,)."""
+        return ca.vertcat(*self.slopes, self.by_lam)
+
+    @property
+    def hessian(self) -> ca.SX:
+        """By both nodes and the multipliers (6 + 3 q, 6 + 3 q)."""
+        (aa, ab, bb), (al, bl) = self.bends, self.mixed
+        return ca.vertcat(
+            ca.horzcat(aa, ab, al), ca.horzcat(ab.T, bb, bl), ca.horzcat(al.T, bl.T, self.lam_lam)
+        )
+
+
+class SlotInFrame:
+    """A slot, written in the frame in its middle.
+
+    Parameters
+    ----------
+    kind : Element
+        A helix.
+    energy : callable
+        Whose minimum over the inner unknowns is the slot's Lagrangian.
+    x : (8,)
+        Frames of both nodes.
+    forces : Forces
+    """
+
+    def __init__(self, kind: Element, energy: Energy, x: ca.SX, forces: Forces) -> None:
+        self._forces = forces
+        self._moved = _kinematics(kind, x)
+        self._body = self._moved.turn.T @ forces.total
+        phi, inner = ca.SX.sym("phi", 3), ca.SX.sym("inner", kind.n_inner)
+        c = ca.SX.sym("force", *forces.total.shape)
+        self._symbols = [phi, inner, c]
+        self._value = energy(phi, inner, c)
+        self._by_frame = ca.gradient(self._value, ca.vertcat(phi, ca.vec(c)))
+        self._by_inner = ca.gradient(self._value, inner)
+        resisting = ca.jacobian(self._by_inner, inner)
+        start = [self._moved.phi, ca.SX.zeros(inner.shape), self._body]
+        torque, resisting = ca.substitute([self._by_inner, resisting], self._symbols, start)
+        # Of the second order in the inner unknowns: one Newton step from zero is the minimum.
+        self._inverse = inverse_of(resisting) if inner.numel() else ca.SX(0, 0)
+        self._there = [self._moved.phi, -self._inverse @ torque, self._body]
+
+    def _at(self, expressions: list[ca.SX]) -> list[ca.SX]:
+        """At the slot's own rotation vector and forces, the inner unknowns at their minimum."""
+        return list(ca.substitute(expressions, self._symbols, self._there))
+
+    @property
+    def node_turns(self) -> tuple[ca.SX, ca.SX]:
+        """Matrices from the axes of the middle frame to those of the first and the last node."""
+        return self._moved.node_turns
+
+    def derivatives(self) -> SlotDerivatives:
+        """Value, gradient and Hessian, by rotations about the axes of the middle frame."""
+        phi, inner, c = self._symbols
+        both = ca.vertcat(phi, inner)
+        flat = ca.vec(c)
+        slope, by_force = self._by_frame[:3], self._by_frame[3:]
+        bend = ca.jacobian(ca.vertcat(slope, self._by_inner), both)
+        mixed, twice = ca.jacobian(by_force, both), ca.jacobian(by_force, flat)
+        value, slope, by_force, bend, mixed, twice = self._at(
+            [self._value, slope, by_force, bend, mixed, twice]
+        )
+        turn, body, weights = self._moved.turn, self._body, self._forces.weights
+        to_lam = ca.kron(ca.DM(weights), ca.DM.eye(3))
+        by_force = ca.reshape(by_force, body.shape)
+        pairs = list(zip(ca.horzsplit(by_force), ca.horzsplit(body), strict=True))
+        # A turn mu of the frame turns the forces by -mu: c + c x mu + (c x mu) x mu / 2.
+        by_mu = _crossed(by_force, body)
+        form = sum((a @ b.T for a, b in pairs), start=ca.SX.zeros(3, 3))
+        turned = ca.vertcat(*(ca.skew(b) for b in ca.horzsplit(body)))
+        force_phi, force_inner = mixed[:, :3], mixed[:, 3:]
+        mu_mu = (form + form.T) / 2 - ca.trace(form) * ca.SX.eye(3) + turned.T @ twice @ turned
+        mu_phi = turned.T @ force_phi
+        force_lam = twice @ to_lam
+        by_each = ca.vertsplit(to_lam.T @ ca.vec(by_force), 3) if weights.shape[1] else []
+        mu_lam = ca.horzcat(ca.SX(3, 0), *(ca.skew(a) for a in by_each)) + turned.T @ force_lam
+        lam_phi, lam_lam = to_lam.T @ force_phi, to_lam.T @ force_lam
+        phi_phi = bend[:3, :3]
+        if inner.numel():
+            # The inner unknowns follow.
+            phi_inner, mu_inner = bend[:3, 3:], turned.T @ force_inner
+            lam_inner = to_lam.T @ force_inner
+            solved = [self._inverse @ row.T for row in (mu_inner, phi_inner, lam_inner)]
+            mu_mu -= mu_inner @ solved[0]
+            mu_phi -= mu_inner @ solved[1]
+            mu_lam -= mu_inner @ solved[2]
+            lam_phi -= lam_inner @ solved[1]
+            lam_lam -= lam_inner @ solved[2]
+            phi_phi -= phi_inner @ solved[1]
+        lever, k = self._moved.lever, self._moved.stretch
+        g_s, g_e = self._to_nodes(by_mu, slope)
+        half = mu_mu @ lever
+        se = half + mu_phi @ k
+        across = lever.T @ mu_phi @ k
+        ee = lever.T @ half + across + across.T + k @ phi_phi @ k
+        second_se, second_ee = _second_order(self._moved, by_mu, slope)
+        se, ee = se + second_se, ee + second_ee
+        to_world = ca.kron(ca.DM.eye(weights.shape[1]), turn)
+        s_lam = mu_lam @ to_world.T
+        e_lam = (lam_phi @ k + mu_lam.T @ lever).T @ to_world.T
+        mean, skew = mu_mu / 4 + ee, (se + se.T) / 2
+        return SlotDerivatives(
+            value,
+            turn,
+            self._moved.phi,
+            (g_s / 2 - g_e, g_s / 2 + g_e),
+            to_world @ ca.vertcat(ca.SX(0, 1), *by_each),
+            (mean - skew, mu_mu / 4 - ee + (se - se.T) / 2, mean + skew),
+            (s_lam / 2 - e_lam, s_lam / 2 + e_lam),
+            to_world @ lam_lam @ to_world.T,
+        )
+
+    def by_numbers(self, numbers: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Derivatives by numbers (a,) of the slopes (3, a), of both nodes, and of by_lam (3 q, a).
+
+        Rotations are about the axes of the middle frame.
+        """
+        _, inner, c = self._symbols
+        flat = ca.vec(c)
+        pulls = self._moved.turn.T
+        moved = ca.kron(ca.DM.eye(c.shape[1]), pulls) @ ca.jacobian(
+            ca.vec(self._forces.total), numbers
+        )
+        rows = ca.vertcat(self._by_frame, self._by_inner)
+        blocks = [ca.jacobian(rows, symbols) for symbols in (numbers, flat, inner)]
+        direct, by_force, by_inner = self._at(blocks)
+        change = direct + by_force @ moved
+        held = 3 + flat.numel()
+        if inner.numel():
+            change = change[:held, :] - by_inner[:held, :] @ self._inverse @ change[held:, :]
+        (slope,) = self._at([self._by_frame])
+        body = self._body
+        by_mu = ca.SX.zeros(3, numbers.numel())
+        for j in range(c.shape[1]):
+            rows_of = slice(3 * j, 3 * j + 3)
+            by_mu += ca.skew(slope[3 + 3 * j : 6 + 3 * j]) @ moved[rows_of, :]
+            by_mu -= ca.skew(body[:, j]) @ change[3 + 3 * j : 6 + 3 * j, :]
+        g_s, g_e = self._to_nodes(by_mu, change[:3, :])
+        weights = self._forces.weights
+        to_lam = ca.kron(ca.DM(weights), ca.DM.eye(3))
+        to_world = ca.kron(ca.DM.eye(weights.shape[1]), self._moved.turn)
+        return g_s / 2 - g_e, g_s / 2 + g_e, to_world @ to_lam.T @ change[3:held, :]
+
+    def _to_nodes(self, by_mu: ca.SX, by_phi: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Slopes by the mean and the difference of the nodes' rotations."""
+        return by_mu, self._moved.lever.T @ by_mu + self._moved.stretch @ by_phi
+
+
+@dataclass(frozen=True)
+class _Kinematics:
+    """What moves with the nodes of a slot, and how.
+
+    `phi` (3,) [rad]; `turn` (3, 3): R; `node_turns`: from it to the nodes' axes; `z` (3,);
+    `stretch` (3, 3): K; `along`: 1 / |phi|^2; `second`: a, b, of the second order of psi, see
+    `_second_order`.
+    """
+
+    phi: ca.SX
+    turn: ca.SX
+    node_turns: tuple[ca.SX, ca.SX]
+    z: ca.SX
+    stretch: ca.SX
+    along: ca.SX
+    second: tuple[ca.SX, ca.SX]
+
+    @property
+    def lever(self) -> ca.SX:
+        """Derivative (3, 3) of mu by epsilon."""
+        return -ca.skew(self.z) / 2
+
+
+def _kinematics(kind: Element, x: ca.SX) -> _Kinematics:
+    first, last = x[:4], x[4:]
+    local = kind.local(first, last)
+    middle, phi = local[:4], local[4:]
+    *vector, w = quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(last))
+    v, square = ca.vertcat(*vector), ca.sumsqr(phi)
+    kappa = (ca.dot(phi, v) + 2 * _TINY) / (2 * (ca.sumsqr(v) + _TINY))
+    along = 1 / (square + _TINY)
+    k = (1 - kappa) * along
+    stretch = kappa * ca.SX.eye(3) + k * (phi @ phi.T)
+    a = (4 * kappa**2 * k - 1 / (1 + w)) / (8 * kappa)
+    b = (1 / (1 + w) + 4 * w * kappa**2 * k) / (4 * kappa)
+    half = ca.vertcat(*quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(middle)))
+    ahead = _rotation(half)
+    return _Kinematics(
+        phi, _rotation(middle), (ahead, ahead.T), v / (1 + w), stretch, along, (a, b)
+    )
+
+
+def _rotation(q: ca.SX) -> ca.SX:
+    """Matrix (3, 3) of a unit quaternion."""
+    x, y, z, w = ca.vertsplit(q)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return ca.vertcat(*(ca.horzcat(*row) for row in rows))
+
+
+def _crossed(a: ca.SX, b: ca.SX) -> ca.SX:
+    """Sum (3,) of the cross products of columns (3, m)."""
+    pairs = zip(ca.horzsplit(a), ca.horzsplit(b), strict=True)
+    return sum((ca.cross(one, other) for one, other in pairs), start=ca.SX.zeros(3))
+
+
+def _second_order(moved: _Kinematics, by_mu: ca.SX, by_phi: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Second derivatives of by_mu . mu + by_phi . psi by (sigma, epsilon), (epsilon, epsilon).
+
+        mu_2  = (z.e) s / 4 + (z.e) e x z / 8 - (s.e) z / 4
+        psi_2 = |phi| (a |e - (n.e) n|^2 n + b (n.e) (e - (n.e) n)) - K (s x e) / 2
+
+    with s, e for sigma, epsilon.
+    """
+    phi, z = moved.phi, moved.z
+    a, b = moved.second
+    eye = ca.SX.eye(3)
+    se = (by_mu @ z.T - ca.dot(by_mu, z) * eye) / 4
+    se += ca.skew(moved.stretch @ by_phi) / 2
+    lever = ca.cross(z, by_mu) / 8
+    ee = z @ lever.T + lever @ z.T
+    part = ca.dot(by_phi, phi)
+    ee += 2 * a * part * eye + b * (phi @ by_phi.T + by_phi @ phi.T)
+    ee -= 2 * (a + b) * part * moved.along * (phi @ phi.T)
+    return se, ee
