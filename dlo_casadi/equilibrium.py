@@ -148,8 +148,8 @@ class Equilibrium:
     lam_start : (dimension,) [N]
         Force of the cable on whatever holds its start.
     moments : (2, increment) [N m]
-        Of the cable on what holds its start and its end, in space about the world's axes; at pins
-        what springs there hold. In a plane (2,).
+        Of the cable on its clamps (start, end), in space about the world's axes; zero at pins.
+        In a plane (2,).
     multipliers : (n_border,)
         Of the end conditions, places and pulls of springs: in the order of `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
@@ -628,14 +628,13 @@ def _equilibrium(
     n_cells = model.chain.n_cells
     curvature = model.chain.curvatures(strain).ravel()
     on_fixtures, rows = assembly.reactions(shapes, given)[0], reaction_rows(model.node)
-    lam_start, start_moment, lam, end_moment = (on_fixtures[at] for at in rows.values())
     return Equilibrium(
         x=shapes.x[0],
         points=assembly.nodes(shapes, given)[0],
         energy=float(assembly.energy(shapes, given)[0]),
-        lam=lam,
-        lam_start=lam_start,
-        moments=np.squeeze(np.array([start_moment, end_moment])),
+        lam=on_fixtures[rows["end_force"]],
+        lam_start=on_fixtures[rows["start_force"]],
+        moments=clamp_moments(model, shapes.x[0], shapes.lam[0]),
         multipliers=shapes.lam[0],
         bound_multipliers=bound_lam,
         curvature=curvature,
@@ -794,6 +793,16 @@ def _bordered(
     gap = (_bends(model, shapes)[held] - bound)[None, :, None]
     whole = Vector(force.x + (arms @ pulls)[..., None], np.concatenate([force.y, gap], axis=1))
     return whole, matrix.with_border(arms)
+
+
+def clamp_moments(model: CableModel, x: FloatArray, lam: FloatArray) -> FloatArray:
+    """Moments [N m] on the clamps (start, end): (2,), in space (2, 3) about the world's axes."""
+    node, named = model.node, dict(zip(model.border_names, lam, strict=True))
+    moments = [
+        node.to_world(frame, np.array([named.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
+        for side, frame in (("start", x[0]), ("end", x[-1]))
+    ]
+    return np.squeeze(np.array(moments))
 
 
 def total_dead_load(model: CableModel, p: FloatArray) -> FloatArray:

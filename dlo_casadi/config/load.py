@@ -151,7 +151,7 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
         if pose.branch == "previous" and i == 0:
             wrong("the first pose continues none; branch: ccw or cw?", key="branch")
         if held.end == "free":
-            for key in ("end", "end_heading", "end_orientation"):
+            for key in ("end", "end_heading", "end_orientation", "end_force", "end_moment"):
                 if getattr(pose, key) is not None:
                     wrong(f"a free end has no {key}; boundary.end: pinned or clamped?")
         endings = {path.suffix.lower() for path in pose.paths}
@@ -191,6 +191,13 @@ def _frame_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, s
         if heading is not None and space:
             text = "is for a cable in a plane; gravity has three numbers. Try: "
             yield f"{key}_heading {text}{key}_orientation", f"{key}_heading"
+        for kind, count, what in (
+            ("force", len(experiment.gravity), "[fx, fy, fz]" if space else "[fx, fy]"),
+            ("moment", 3 if space else 1, "[mx, my, mz]" if space else "one number"),
+        ):
+            reading = getattr(pose, f"{key}_{kind}")
+            if reading is not None and len(reading) != count:
+                yield f"{key}_{kind}: {what} belongs here ({numbers})", f"{key}_{kind}"
         if getattr(held, key) != "clamped":
             continue
         if space and orientation is None:

@@ -67,7 +67,8 @@ class MeasuredPose:
         if not readings:
             return cls(pose, (sensor,), held_out)
         node = Frame if len(pose.start) == 3 else Heading
-        return cls(pose, (sensor, Wrench.of(readings, node)), held_out)
+        known = {name: np.array(value, dtype=float) for name, value in readings.items()}
+        return cls(pose, (sensor, Wrench(known, node)), held_out)
 
     @property
     def readable(self) -> bool:
@@ -77,8 +78,8 @@ class MeasuredPose:
     @cached_property
     def points(self) -> FloatArray:
         """All measured points (K, d) [m]."""
-        none = np.zeros((0, len(self.pose.start)))
-        return np.concatenate([none, *(x.points for x in self.sensors if len(x.points))])
+        found = [sensor.points for sensor in self.sensors if len(sensor.points)]
+        return np.concatenate(found) if found else np.zeros((0, len(self.pose.start)))
 
     @cached_property
     def relative_std(self) -> FloatArray:
@@ -109,7 +110,12 @@ class MeasuredPose:
     @property
     def reactions(self) -> tuple[str, ...]:
         """Which forces and moments on the fixtures were measured, of `ends.REACTIONS`."""
-        return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.names)
+        return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.measured)
+
+    def readings_beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """These, measured and as a model says, by their names."""
+        found = (x.beside(seen) for x in self.sensors if isinstance(x, Wrench))
+        return {name: pair for parts in found for name, pair in parts.items()}
 
     def units(self, noise: NoiseModel) -> FloatArray:
         """What a unit of each residual (R,) counts as [m], see `Sensor`."""

@@ -8,7 +8,6 @@ fixed own unknowns.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
@@ -254,39 +253,35 @@ class Markers(_Points):
 
 @dataclass(frozen=True)
 class Wrench:
-    """Forces and moments on the fixtures, component by component.
+    """Forces and moments on the fixtures, component by component: R residuals [N], [N m].
 
     Parameters
     ----------
-    values : (R,) [N] or [N m]
-        Of the cable on whatever holds it, world axes, moments about the fixture.
-    rows : (R,)
-        Which of the model's readings they are.
-    kinds : (R,)
-        What each of them is: force or moment.
-    names : tuple of str
-        Which of `ends.REACTIONS` they are together.
+    measured : dict
+        Of the cable on whatever holds it, in world axes, moments about the fixture, by their names,
+        of `ends.REACTIONS`: (dimension,) [N], (increment,) [N m].
+    node : type of Node
     """
 
-    values: FloatArray
-    rows: NDArray[np.intp]
-    kinds: NDArray[np.str_]
-    names: tuple[str, ...]
+    measured: dict[str, FloatArray]
+    node: type[Node]
     per_point = 0
     marked = True
 
-    @classmethod
-    def of(cls, given: Mapping[str, Sequence[float]], node: type[Node]) -> Self:
-        """From readings by their names, of `ends.REACTIONS`."""
-        at = reaction_rows(node)
-        names = tuple(name for name in at if name in given)
-        return cls(
-            np.concatenate([np.atleast_1d(np.asarray(given[name], float)) for name in names]),
-            np.concatenate([np.arange(at[name].start, at[name].stop) for name in names]),
-            np.concatenate(
-                [np.full(at[name].stop - at[name].start, name.split("_")[1]) for name in names]
-            ),
-            names,
+    @property
+    def _rows(self) -> dict[str, slice]:
+        """Where those that were measured stand among the model's readings."""
+        return {name: at for name, at in reaction_rows(self.node).items() if name in self.measured}
+
+    def beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Measured and the model's, by their names."""
+        return {name: (self.measured[name], seen.readings[at]) for name, at in self._rows.items()}
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: a force or a moment."""
+        return np.concatenate(
+            [np.full(at.stop - at.start, name.split("_")[1]) for name, at in self._rows.items()]
         )
 
     @property
@@ -302,7 +297,7 @@ class Wrench:
     @property
     def n_residuals(self) -> int:
         """Components."""
-        return len(self.values)
+        return len(self.kinds)
 
     def units(self, noise: NoiseModel) -> FloatArray:
         """Standard deviation of points over that of each component (R,) [m/N] or [1/N]."""
@@ -327,13 +322,13 @@ class Wrench:
 
     def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Measured minus model (R,)."""
-        return self.values - seen.readings[self.rows]
+        return np.concatenate([known - model for known, model in self.beside(seen).values()])
 
     def residual_along(
         self, seen: Observed, places: FloatArray, along: ObservedChange
     ) -> FloatArray:
         """Change (R, q) of the residual along directions."""
-        return -along.readings[self.rows]
+        return -np.concatenate([along.readings[at] for at in self._rows.values()])
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) with W cov W^T = 1; all components are independent."""

@@ -279,6 +279,8 @@ def _summary(
     config: Config, inputs: Sequence[PoseInput], measured: Sequence[MeasuredPose], fit: Fit
 ) -> MeasurementSummary:
     readable = [item for item in measured if item.readable]
+    readings = [name for item in readable for name in item.reactions]
+    kinds, noise = {name.split("_")[1] for name in readings}, fit.noise.readings
     return MeasurementSummary(
         kind=config.experiment.measurement.kind,
         poses_fit=sum(not item.held_out for item in readable),
@@ -287,5 +289,8 @@ def _summary(
         std=fit.noise.std,
         std_source="declared" if fit.noise.source == "declared" else "estimated",
         correlation_length=fit.noise.length if fit.noise.share > 0 else 0.0,
+        readings=len(readings),
+        force_std=noise.force if "force" in kinds else None,
+        moment_std=noise.moment if "moment" in kinds else None,
         held_out_missing=held_out_missing(inputs, config.skipped),
     )

@@ -28,6 +28,7 @@ from dlo_casadi.session.outcome import (
     BranchShape,
     ParameterEstimate,
     PoseShape,
+    ReadingErrors,
     RestCurvatureEstimate,
     Stage,
     StageName,
@@ -68,7 +69,28 @@ def pose_shape(
         np.stack([eq.lam_start, eq.lam]),
         branch,
         None if item.pose.branch else eq.tipping,
+        readings=item.readings_beside(prediction.seen),
     )
+
+
+def _reading_errors(
+    measured: Sequence[MeasuredPose], shapes: Mapping[str, PoseShape], held_out: bool
+) -> ReadingErrors:
+    """Errors of the readings of one role; none where one of its poses has no prediction."""
+    poses = [item for item in measured if item.held_out is held_out and item.reactions]
+    if any(item.pose.name not in shapes for item in poses):
+        return ReadingErrors()
+
+    def rms(kind: str) -> float | None:
+        squares = [
+            float(((known - model) ** 2).sum())
+            for item in poses
+            for name, (known, model) in shapes[item.pose.name].readings.items()
+            if name.endswith(kind)
+        ]
+        return float(np.sqrt(np.mean(squares))) if squares else None
+
+    return ReadingErrors(rms("force"), rms("moment"))
 
 
 def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArray:
@@ -127,6 +149,8 @@ def _stage(
         rms_distance(on_branch, measured, held_out=False),
         rms_distance(on_branch, measured, held_out=True),
         tuple(item.pose.name for item in lost if item.held_out and item.readable),
+        _reading_errors(measured, shapes, held_out=False),
+        _reading_errors(measured, shapes, held_out=True),
     )
 
 
