@@ -44,8 +44,8 @@ class CrossValidation:
     Parameters
     ----------
     squares : (folds,) [m^2]
-        Sum of squared errors of each fold: distances of its points, and readings as `Sensor.units`
-        count them.
+        Sum of squared errors of each fold: distances of its points, and readings as
+        `NoiseModel.units` count them.
     counts : (folds,)
         Number of points and components of readings of each fold.
     complete : bool
@@ -190,7 +190,7 @@ def _stretches(fit: Fit) -> CrossValidation:
     problem, lin = fit.problem, fit.linearization
     j = problem.used[0]
     item = problem.measured[j]
-    points = np.arange(len(item.points))
+    points = np.argsort(fit.point.feet[0], kind="stable")  # a stretch of all photographs
     joint = np.concatenate([lin.by_theta[0], lin.by_deviation[0]], axis=1)
     size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
     prior = np.zeros((size + n_dev, size + n_dev))
@@ -217,5 +217,5 @@ def _stretches(fit: Fit) -> CrossValidation:
             errors.append(None)
             continue
         curve = sweep.seen(solved, p, rest)[j].curve
-        errors.append((item.distances(curve)[left_out], np.zeros(0)))
+        errors.append((item.misses(curve)[left_out], np.zeros(0)))
     return _validation(errors)

@@ -94,6 +94,14 @@ class NoiseModel:
             unit += self.share * correlation(self.kernel, distance / self.length)
         return self.std**2 * unit * np.outer(weight, weight)
 
+    def units(self, kinds: NDArray[np.str_]) -> FloatArray:
+        """What a unit of each residual counts as [m] (R,): one of its stds as one of a point's.
+
+        One of points, m/N of forces, 1/N of moments.
+        """
+        own = {"point": self.std, "force": self.readings.force, "moment": self.readings.moment}
+        return self.std / np.array([own[kind] for kind in kinds])
+
     def doubted(self, std: float) -> NoiseModel:
         """White noise of that size [m] where it is larger, that of readings grown with it."""
         factor, own = std / self.std, self.readings

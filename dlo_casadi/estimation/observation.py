@@ -39,11 +39,15 @@ class MeasuredPose:
         Those of points first; empty if the pose could not be read.
     held_out : bool
         Whether the pose is kept for the final test.
+    line : (M, d) [m], optional
+        The cable's line that the sensors show together, where their points are no line by
+        themselves; without points where they show none.
     """
 
     pose: Pose
     sensors: tuple[Sensor, ...] = ()
     held_out: bool = False
+    line: FloatArray | None = None
 
     @classmethod
     def of_points(
@@ -53,27 +57,45 @@ class MeasuredPose:
         weight: FloatArray | None = None,
         held_out: bool = False,
         s: FloatArray | None = None,
-        readings: Mapping[str, Sequence[float]] | None = None,
     ) -> Self:
         """A pose with one line of points (K, d) [m], or markers where arc lengths s are known.
 
-        Without points the pose could not be read. `weight` (K,) is one by default. `readings` are
-        forces and moments on the fixtures by their names, of `ends.REACTIONS`.
+        Without points the pose could not be read. `weight` (K,) is one by default.
         """
         if not len(points):
             return cls(pose, (), held_out)
         weight = np.ones(len(points)) if weight is None else weight
         sensor = Centerline(points, weight) if s is None else Markers(points, weight, s)
-        if not readings:
-            return cls(pose, (sensor,), held_out)
-        node = Frame if len(pose.start) == 3 else Heading
+        return cls(pose, (sensor,), held_out)
+
+    def with_readings(self, readings: Mapping[str, Sequence[float]]) -> Self:
+        """The same pose with forces and moments on its fixtures, by names of `ends.REACTIONS`.
+
+        A pose that could not be read stays so.
+        """
+        if not readings or not self.readable:
+            return self
+        node = Frame if len(self.pose.start) == 3 else Heading
         known = {name: np.array(value, dtype=float) for name, value in readings.items()}
-        return cls(pose, (sensor, Wrench(known, node)), held_out)
+        return replace(self, sensors=(*self.sensors, Wrench(known, node)))
 
     @property
     def readable(self) -> bool:
         """Whether there is anything to compare with."""
         return len(self.sensors) > 0
+
+    @property
+    def has_line(self) -> bool:
+        """Whether it is known where in space points of the cable lie."""
+        return self.readable and (self.line is None or len(self.line) > 0)
+
+    @cached_property
+    def traced(self) -> MeasuredPose:
+        """The same pose with its line alone; about where its points lie if they show none."""
+        if self.line is None:
+            return self
+        line = self.line if len(self.line) else self.points
+        return MeasuredPose.of_points(self.pose, line, held_out=self.held_out)
 
     @cached_property
     def points(self) -> FloatArray:
@@ -89,7 +111,7 @@ class MeasuredPose:
     @property
     def n_residuals(self) -> int:
         """Number R of residuals."""
-        return sum(sensor.n_residuals for sensor in self.sensors)
+        return len(self.kinds)
 
     @cached_property
     def point_of(self) -> NDArray[np.intp]:
@@ -117,16 +139,12 @@ class MeasuredPose:
         found = (x.beside(seen) for x in self.sensors if isinstance(x, Wrench))
         return {name: pair for parts in found for name, pair in parts.items()}
 
-    def units(self, noise: NoiseModel) -> FloatArray:
-        """What a unit of each residual (R,) counts as [m], see `Sensor`."""
-        return np.concatenate([sensor.units(noise) for sensor in self.sensors])
-
     @property
     def slices(self) -> list[tuple[Sensor, slice, slice]]:
         """Each sensor of points, which of the points and which of the residuals are its."""
         out, point, row = [], 0, 0
         for sensor in self.sensors:
-            count, rows = len(sensor.points), sensor.n_residuals
+            count, rows = len(sensor.points), len(sensor.kinds)
             if count:
                 out.append((sensor, slice(point, point + count), slice(row, row + rows)))
             point, row = point + count, row + rows
@@ -135,9 +153,13 @@ class MeasuredPose:
     def slow_rows(self, modes: FloatArray) -> FloatArray:
         """Displacements (K, count) along the cable, in each of the residuals' directions.
 
-        Of what is measured at no point each residual is a mode of its own.
+        Beside them what the residuals of a sensor share. Of what is measured at no point each
+        residual is a mode of its own.
         """
-        blocks = [np.kron(modes[points], np.eye(x.per_point)) for x, points, _ in self.slices]
+        blocks = [
+            np.hstack([np.kron(modes[points], np.eye(x.per_point)), _scaled(x.together)])
+            for x, points, _ in self.slices
+        ]
         if others := int((~self.on_points).sum()):
             blocks.append(np.eye(others))
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
@@ -183,15 +205,33 @@ class MeasuredPose:
         return np.concatenate([sensor.nearest(curve) for sensor in self.sensors])
 
     def distances(self, curve: NodeCurve) -> FloatArray:
-        """Distance (K,) [m] of each point from where a curve has it."""
-        return np.linalg.norm(self.points - curve.at(self.nearest(curve)), axis=1)
+        """Distance [m] of each point of the line from where a curve has it.
+
+        Of photographs that show none together: of each pixel, across its line of sight.
+        """
+        if not self.has_line:
+            return self.misses(curve)
+        item = self.traced
+        return np.linalg.norm(item.points - curve.at(item.nearest(curve)), axis=1)
+
+    def misses(self, curve: NodeCurve) -> FloatArray:
+        """Size (K,) [m] of the residuals of each point of a sensor."""
+        seen, places = Observed(curve, np.zeros(0)), self.nearest(curve)
+        rows = [sensor.residual(seen, places[points]) for sensor, points, _ in self.slices]
+        return np.sqrt(np.bincount(self.point_of, np.concatenate(rows) ** 2))
 
     def misread(self, seen: Observed, noise: NoiseModel) -> FloatArray:
-        """Errors of the readings [m] as `units` have them; empty without any."""
+        """Errors of the readings [m] as `NoiseModel.units` have them; empty without any."""
         rows = [x.residual(seen, np.zeros(0)) for x in self.sensors if not len(x.points)]
-        return np.concatenate([np.zeros(0), *rows]) * self.units(noise)[~self.on_points]
+        kinds = self.kinds[~self.on_points]
+        return np.concatenate([np.zeros(0), *rows]) * noise.units(kinds)
 
     def weighing(self, weight: FloatArray) -> Self:
         """The same pose with other relative standard deviations (K,) of its points."""
         parts = zip(self.sensors, self._parts(weight), strict=True)
         return replace(self, sensors=tuple(sensor.weighing(w) for sensor, w in parts))
+
+
+def _scaled(columns: FloatArray) -> FloatArray:
+    """Columns (R, c) whose largest entry is one."""
+    return columns / np.abs(columns).max(axis=0, initial=1e-300)

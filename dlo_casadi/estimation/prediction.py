@@ -126,7 +126,7 @@ def measured_elsewhere(
         line_nodes(item.points, item.pose, model.chain, item.places(model.cable.length))
         if item.readable
         else None
-        for item in measured
+        for item in (one.traced for one in measured)
     ]
     solved = predict_poses(model, p, rest, [item.pose for item in measured], starts)
     return [

@@ -87,7 +87,7 @@ def _groups(measured: Sequence[MeasuredPose]) -> list[list[MeasuredPose]]:
     groups: dict[tuple[float, ...], list[MeasuredPose]] = {}
     for item in measured:
         if item.readable and not item.held_out:
-            groups.setdefault(tuple(item.pose.ends), []).append(item)
+            groups.setdefault(tuple(item.pose.ends), []).append(item.traced)
     return [group for group in groups.values() if len(group) > 1]
 
 

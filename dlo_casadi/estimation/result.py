@@ -177,7 +177,7 @@ class Fit:
     def expected_error(self) -> float:
         """RMS error [m] of a pose that is only predicted, if nothing is missing.
 
-        Of distances of points, and of readings as `Sensor.units` count them. Noise, scatter of
+        Of distances of points, and of readings as `NoiseModel.units` count them. Noise, scatter of
         the fixtures, uncertain parameters, and how the cable repeats.
         """
         problem = self.problem
@@ -186,7 +186,7 @@ class Fit:
         for k, j in enumerate(problem.used):
             by = self.linearization.raw_directions[k][:, :size]
             variance = ((by @ covariance) * by).sum(axis=1) + self._by_fixtures[k]
-            units = problem.measured[j].units(self.noise)
+            units = self.noise.units(problem.measured[j].kinds)
             square += float((units**2 * (variance + self._by_rest[k])).sum())
             count += int((~self._on_points[k]).sum())
         return float(np.sqrt(square / count))

@@ -68,22 +68,18 @@ class Sensor(Protocol):
         ...
 
     @property
-    def n_residuals(self) -> int:
-        """R."""
-        ...
-
-    @property
     def kinds(self) -> NDArray[np.str_]:
         """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
-        ...
-
-    def units(self, noise: NoiseModel) -> FloatArray:
-        """What a unit of each residual (R,) counts as [m]: one of its stds as one of a point's."""
         ...
 
     @property
     def marked(self) -> bool:
         """Whether the arc lengths of all its points are known."""
+        ...
+
+    @property
+    def together(self) -> FloatArray:
+        """Errors (R, c) that its residuals share, a standard deviation of each."""
         ...
 
     def places(self, pose: Pose, length: float) -> FloatArray:
@@ -121,8 +117,24 @@ class Sensor(Protocol):
         ...
 
 
+class OfPoints(ABC):
+    """What sensors of points have in common."""
+
+    points: FloatArray
+
+    @property
+    @abstractmethod
+    def per_point(self) -> int:
+        """Residuals of a point."""
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: a point."""
+        return np.full(len(self.points) * self.per_point, "point")
+
+
 @dataclass(frozen=True)
-class _Points(ABC):
+class _Points(OfPoints):
     """Points in the board's or the world's frame, compared where they are on the curve."""
 
     points: FloatArray
@@ -144,23 +156,9 @@ class _Points(ABC):
         """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
 
     @property
-    @abstractmethod
-    def per_point(self) -> int:
-        """Residuals of a point."""
-
-    @property
-    def n_residuals(self) -> int:
-        """K per_point."""
-        return len(self.points) * self.per_point
-
-    @property
-    def kinds(self) -> NDArray[np.str_]:
-        """What each residual (R,) is of: a point."""
-        return np.full(self.n_residuals, "point")
-
-    def units(self, noise: NoiseModel) -> FloatArray:
-        """Ones (R,): these are metres."""
-        return np.ones(self.n_residuals)
+    def together(self) -> FloatArray:
+        """None: the errors of points have no common cause."""
+        return np.zeros((len(self.points) * self.per_point, 0))
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) [1/m] with W cov W^T = 1; the errors of a point are independent."""
@@ -295,14 +293,9 @@ class Wrench:
         return np.zeros(0)
 
     @property
-    def n_residuals(self) -> int:
-        """Components."""
-        return len(self.kinds)
-
-    def units(self, noise: NoiseModel) -> FloatArray:
-        """Standard deviation of points over that of each component (R,) [m/N] or [1/N]."""
-        own = noise.readings
-        return noise.std / np.where(self.kinds == "moment", own.moment, own.force)
+    def together(self) -> FloatArray:
+        """None: their bias is the session's."""
+        return np.zeros((len(self.kinds), 0))
 
     def places(self, pose: Pose, length: float) -> FloatArray:
         """None (0,)."""
@@ -318,7 +311,7 @@ class Wrench:
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """Zeros (R, q): no point of theirs moves."""
-        return np.zeros((self.n_residuals, moved.shape[2]))
+        return np.zeros((len(self.kinds), moved.shape[2]))
 
     def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Measured minus model (R,)."""
@@ -332,7 +325,7 @@ class Wrench:
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) with W cov W^T = 1; all components are independent."""
-        return np.diag(self.units(noise) / noise.std)
+        return np.diag(noise.units(self.kinds) / noise.std)
 
     def weighing(self, weight: FloatArray) -> Self:
         """The same readings."""

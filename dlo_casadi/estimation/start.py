@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.equilibrium import first_nodes
 from dlo_casadi.estimation.chords import line_nodes
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import Vector
@@ -56,8 +56,10 @@ def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, l
         [first_nodes(model, model.nominal, flat, item.pose)[0] for item in problem.measured]
     )
     feet: list[FloatArray] = []
+    lines = {}
     for j in used:
-        item = problem.measured[j]
+        item = problem.measured[j].traced
+        lines[j] = item if problem.measured[j].has_line else problem.measured[j]
         places = item.places(chain.length)
         x[j] = line_nodes(item.points, item.pose.rolled(roll), chain, places)
         feet.append(places)
@@ -66,20 +68,21 @@ def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, l
     for iteration in range(_KINEMATIC_STEPS + 1):
         seen = sweep.observe(shapes, problem.unknowns.fixed, flat, each)
         for k, j in enumerate(used):
-            now, _ = seen.pose(j, chain.length)
-            curve = now.curve
+            now, change = seen.pose(j, chain.length)
             if iteration > 1:
-                feet[k] = problem.measured[j].located(now, feet[k])
+                feet[k] = lines[j].located(now, feet[k])
             if iteration < _KINEMATIC_STEPS:
                 step = _kinematic_step(
-                    replace(problem.measured[j], pose=problem.measured[j].pose.rolled(roll)),
+                    replace(lines[j], pose=lines[j].pose.rolled(roll)),
                     model,
-                    curve,
-                    seen.slopes[j],
+                    now,
+                    change,
                     x[j],
                     feet[k],
                 )
                 x[j] = model.node.moved(x[j], step)
+            elif lines[j] is not problem.measured[j]:
+                feet[k] = problem.measured[j].nearest(now.curve)
     return shapes, feet
 
 
@@ -97,22 +100,27 @@ def _each_node(sweep: Sweep) -> Directions:
 def _kinematic_step(
     item: MeasuredPose,
     model: CableModel,
-    curve: NodeCurve,
-    slopes: FloatArray,
+    now: Observed,
+    change: ObservedChange,
     x: FloatArray,
     s: FloatArray,
 ) -> FloatArray:
     """Increments (n_nodes, b) towards the measured points, at most half a radian."""
     chain, node = model.chain, model.node
     n, b, d = len(x), node.increment, node.dimension
-    gap = item.points - curve.at(s)
+    curve, slopes = now.curve, change.curve
     bends = node.difference(x[:-1], x[1:])
     # 3 mm of noise a point against bends that change by 0.3 turns per length from cell to cell.
     weight = 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
     rough = weight * np.kron(np.diff(np.eye(n), n=2, axis=0), np.eye(b))
-    moved = curve.moved(s, slopes)
-    system: list[FloatArray] = [*moved.transpose((1, 0, 2)), rough]
-    target: list[FloatArray] = [*gap.T, -weight * np.diff(bends, axis=0).ravel()]
+    if item.has_line:
+        towards = [*curve.moved(s, slopes).transpose((1, 0, 2))]
+        gaps = [*(item.points - curve.at(s)).T]
+    else:  # a single photograph tells no depth
+        on = item.on_points
+        towards, gaps = [-item.residual_along(now, s, change)[on]], [item.residual(now, s)[on]]
+    system: list[FloatArray] = [*towards, rough]
+    target: list[FloatArray] = [*gaps, -weight * np.diff(bends, axis=0).ravel()]
     if item.pose.end is not None:
         system.append(10 * slopes[-1, :d])
         target.append(10 * (np.array(item.pose.end) - curve.nodes[-1]))

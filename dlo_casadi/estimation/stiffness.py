@@ -40,7 +40,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     used = [item for item in measured if item.readable and not item.held_out]
     sweep = Sweep(model, [item.pose for item in used])
     rest = np.zeros(model.chain.n_rests)
-    n_points = sum(len(item.points) for item in used)
+    n_points = sum(len(item.traced.points) for item in used)
 
     stiff = model.stiffness_indices
 

@@ -109,9 +109,8 @@ def write_numbers(folder: Path, outcome: Outcome) -> None:
         if len(pose.points):
             write_points(lines / f"{pose.name}.csv", pose.points, pose.s)
         for k, view in enumerate(pose.views, 1):
-            if view.sight is not None:
-                which = view.name.removeprefix(pose.name).lstrip("-_. ") or str(k)
-                write_table(lines / f"{pose.name}_{which}.csv", ["u_px", "v_px"], view.sight.pixels)
+            which = view.name.removeprefix(pose.name).lstrip("-_. ") or str(k)
+            write_table(lines / f"{pose.name}_{which}.csv", ["u_px", "v_px"], view.sight.pixels)
 
 
 def draw(folder: Path, outcome: Outcome) -> None:

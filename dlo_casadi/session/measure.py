@@ -16,6 +16,7 @@ from dlo_casadi.errors import MeasurementError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.measurements import read_points
 from dlo_casadi.session.outcome import PoseInput, ViewInput
+from dlo_casadi.session.pixels import pixel_std, pixels_of
 
 # Points kept of one centre-line; more only repeat their neighbours' noise.
 MOST_POINTS = 240
@@ -74,20 +75,28 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
     MeasurementError
         If no fit pose could be read; its text lists the reasons.
     """
-    if not any(len(item.points) and item.role == "fit" for item in inputs):
+    if not any(item.readable and item.role == "fit" for item in inputs):
         reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
         raise MeasurementError(f"no fit pose could be read:\n{reasons}")
+    views = [view for item in inputs for view in item.views]
+    std = pixel_std(views) if views else 0.0
     return tuple(
-        MeasuredPose.of_points(
-            replace(conditions(pose), camera_center=item.camera_center),
-            item.points,
-            item.weight,
-            pose.role == "held_out",
-            item.s,
-            pose.readings,
-        )
+        _measured(pose, item, std)
         for pose, item in zip(config.experiment.poses, inputs, strict=True)
     )
+
+
+def _measured(pose: DeclaredPose, item: PoseInput, std: float) -> MeasuredPose:
+    """A pose with its sensors; pixels have the standard deviation `std` [m] at weight one."""
+    held = replace(conditions(pose), camera_center=item.camera_center)
+    held_out = pose.role == "held_out"
+    if item.views:
+        found = [pixels_of(view, std) for view in item.views]
+        sensors = tuple(sensor for sensor in found if sensor is not None)
+        seen = MeasuredPose(held, sensors, held_out, item.points)
+    else:
+        seen = MeasuredPose.of_points(held, item.points, item.weight, held_out, item.s)
+    return seen.with_readings(pose.readings)
 
 
 def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
@@ -154,21 +163,20 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
         length=config.cable.length,
     )
     problems += views.problems.values()
-    if not views.sights or views.line is None:
+    if not views.sights:
         raise MeasurementError(" ".join([*problems, *views.messages]))
-    kept = slice(None, None, max(1, -(-len(views.line.points) // MOST_POINTS)))
-    std = views.line.std[kept]
+    points = np.zeros((0, 3)) if views.line is None else views.line.points
     numbers = [set(sight.viewpoint.numbers) for sight in views.sights.values()]
     return PoseInput(
         pose.name,
         pose.role,
-        views.line.points[kept],
-        weight=std / np.median(std),
+        points[:: max(1, -(-len(points) // MOST_POINTS))],
         confidence=min(sight.confidence for sight in views.sights.values()),
         messages=(*problems, *views.messages),
         markers=tuple(sorted(set.intersection(*numbers))),
         views=tuple(
-            ViewInput(name, path, views.sights.get(name)) for name, path in pose.photographs.items()
+            ViewInput(name, pose.photographs[name], sight, views.places[name])
+            for name, sight in views.sights.items()
         ),
     )
 

@@ -185,11 +185,23 @@ class Stage:
 
 @dataclass(frozen=True)
 class ViewInput:
-    """One of the photographs of a pose in space, and what is seen in it; None if nothing is."""
+    """One of several photographs of a pose in space.
+
+    Parameters
+    ----------
+    name : str
+        File stem.
+    image : Path
+    sight : Sight
+        What is seen in it.
+    places : (K, 3) [m]
+        About where its pixels lie in space; nan for those that are not of the cable.
+    """
 
     name: str
     image: Path
-    sight: Sight | None
+    sight: Sight
+    places: FloatArray
 
 
 @dataclass(frozen=True)
@@ -230,8 +242,8 @@ class PoseInput:
     s : (K,), optional [m]
         Known arc lengths of markers.
     views : tuple of ViewInput
-        Photographs of a cable in space; `points` are the line that they show together, none where
-        fewer than two agree.
+        Usable photographs of a cable in space; `points` are the line that they show together, none
+        where fewer than two agree.
     """
 
     name: str
@@ -251,6 +263,11 @@ class PoseInput:
     messages: tuple[str, ...] = ()
     s: FloatArray | None = None
     views: tuple[ViewInput, ...] = ()
+
+    @property
+    def readable(self) -> bool:
+        """Whether there is anything to compare with."""
+        return len(self.points) > 0 or len(self.views) > 0
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ def held_out_missing(
     inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
 ) -> tuple[str, ...]:
     """Names of held-out poses that have no measured line to be compared with."""
-    read = {item.name for item in inputs if len(item.points)}
+    read = {item.name for item in inputs if item.readable}
     roles = {item.name: item.role for item in skipped} | {item.name: item.role for item in inputs}
     return tuple(name for name, role in roles.items() if role == "held_out" and name not in read)
 

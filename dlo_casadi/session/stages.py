@@ -52,9 +52,10 @@ def pose_shape(
     gap: FloatArray = np.zeros((0, curve.d))
     rmse = branch = None
     if item.readable:
-        s = item.nearest(curve)
-        gap = item.points - curve.at(s)
-        rmse = float(np.sqrt((gap**2).sum(axis=1).mean()))
+        rmse = float(np.sqrt((item.distances(curve) ** 2).mean()))
+    if item.has_line:
+        s = item.traced.nearest(curve)
+        gap = item.traced.points - curve.at(s)
     if item.readable and other is not None:
         distances = item.distances(other.prediction.curve)
         branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)

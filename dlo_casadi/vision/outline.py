@@ -91,7 +91,11 @@ def project_outline(
 
 
 def compare_pixels(
-    viewpoint: Viewpoint, pixels: Array, points: Array, tangents: Array, diameter: float
+    viewpoint: Viewpoint,
+    pixels: ArrayLike,
+    points: ArrayLike,
+    tangents: ArrayLike,
+    diameter: float,
 ) -> tuple[Array, Array]:
     """Pixels measured minus those of a curve, across it.
 
@@ -112,5 +116,5 @@ def compare_pixels(
     Distances (K,) [px], and their slopes d(distance)/d(point) (K, 3) [px/m].
     """
     seen = project_outline(viewpoint, points, tangents, diameter)
-    distance = np.sum((pixels - seen.pixels) * seen.normals, axis=1)
+    distance = np.sum((np.asarray(pixels, float) - seen.pixels) * seen.normals, axis=1)
     return distance, -np.einsum("ki,kij->kj", seen.normals, seen.slopes)

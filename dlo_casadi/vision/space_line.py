@@ -71,12 +71,16 @@ class Views:
         Why a photograph is not used, and what to try.
     messages : tuple of str
         What else a user should know; those on one photograph begin with its name.
+    places : dict of str to (K, 3) [m]
+        Where the pixels of the sights lie: on the line in space, nan for those that are not of it.
+        Without a line it is a guess, at depths from fixture to fixture.
     """
 
     line: SpaceLine | None
     sights: Mapping[str, Sight]
     problems: Mapping[str, str]
     messages: tuple[str, ...]
+    places: Mapping[str, Array]
 
 
 def measure_views(
@@ -119,6 +123,7 @@ def measure_views(
             why = spoilt(image)
             problems[name] = f"{name}: {error.message}{'' if why in error.message else why}"
     fixtures = [np.asarray(at, float) for at in (start, end) if at is not None]
+    places: dict[str, Array] = {}
     spans = int(np.clip(length / (_SPAN * diameter), *_SPANS))
     fit, order = _agreeing_fit(sights, problems, fixtures, length, spans)
     line, missing = None, 0.0
@@ -127,7 +132,13 @@ def measure_views(
         fit, seen = _resolve(fit, seen, [photographs[name] for name in order])
         sights.update(zip(order, seen, strict=True))
         missing = 1.0 - _whole(fit, fixtures) / length if len(fixtures) == 2 else 0.0
-        line = _points(fit, diameter) if missing < _MISSING else None
+        if missing < _MISSING:
+            line = _points(fit, diameter)
+            places = {
+                name: _on_line(fit, params) for name, params in zip(order, fit.params, strict=True)
+            }
+    if line is None:
+        places = {name: _guessed(sight, fixtures) for name, sight in sights.items()}
     messages = [
         f"{name}: {message}"
         for name, sight in sights.items()
@@ -146,7 +157,7 @@ def measure_views(
         )
     elif fit is not None and line is not None:
         messages += _line_messages(line, fit, fixtures, length)
-    return Views(line, sights, problems, tuple(messages))
+    return Views(line, sights, problems, tuple(messages), places)
 
 
 @dataclass(frozen=True)
@@ -297,6 +308,24 @@ def _resolve(
     before = fit
     likelier = min((measure(crossed, fit)[0] for crossed in (False, True)), key=_surprise)
     return measure(None, likelier)
+
+
+def _on_line(fit: CurveFit, params: Array) -> Array:
+    """Places (K, 3) [m] at parameters; nan where there is none."""
+    places = np.full((len(params), 3), np.nan)
+    known = np.isfinite(params)
+    places[known] = fit.curve.position(params[known])
+    return places
+
+
+def _guessed(sight: Sight, fixtures: list[Array]) -> Array:
+    """Places (K, 3) [m] of pixels, if depth went evenly from fixture to fixture along the line."""
+    viewpoint = sight.viewpoint
+    depths = viewpoint.in_camera(fixtures)[:, 2]
+    along = chord_length(sight.pixels)
+    depth = np.interp(along / along[-1], np.linspace(0.0, 1.0, len(depths)), depths)
+    at = np.column_stack([sight.rays, np.ones(len(depth))]) * depth[:, None]
+    return np.asarray((at - viewpoint.translation) @ viewpoint.rotation)
 
 
 def _surprise(fit: CurveFit) -> float:

@@ -140,7 +140,7 @@ def test_readings_are_residuals_beside_points():
     """In units of their noise; what is of points (modes, weights, feet) is theirs alone."""
     points = np.array([[0.1, 0.0], [0.3, 0.0], [0.5, 0.0]])
     readings = {"end_force": (1.0, 2.0), "start_moment": (0.3,)}
-    item = MeasuredPose.of_points(Pose((0.0, 0.0)), points, readings=readings)
+    item = MeasuredPose.of_points(Pose((0.0, 0.0)), points).with_readings(readings)
     assert item.reactions == ("end_force", "start_moment")
     assert list(item.kinds) == ["point"] * 3 + ["moment", "force", "force"]
     seen = Observed(NodeCurve(0.8, np.array([[0.0, 0.0], [0.8, 0.0]]), None), np.zeros(6))
@@ -170,7 +170,7 @@ def test_noise_and_bias_of_readings_are_estimated():
             "end_moment": known.seen.readings[5:6] + rng.normal(scale=0.002, size=1),
         }
         points = known.curve.at(s) + rng.normal(scale=3e-4, size=(20, 2))
-        measured.append(MeasuredPose.of_points(pose, points, s=s, readings=readings))
+        measured.append(MeasuredPose.of_points(pose, points, s=s).with_readings(readings))
     setup = Setup(CABLE, readings=("end_force", "end_moment"), tolerances={"force_bias": 0.05})
     bias = SensorBias.made_for(setup)
     fit = fit_model(

@@ -1,0 +1,170 @@
+"""A photograph of a cable in space as a sensor: pixels compared across the projected cable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.chords import chord_places
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.estimation.sensors import Observed, ObservedChange, OfPoints
+from dlo_casadi.session.outcome import ViewInput
+from dlo_casadi.vision import Viewpoint, compare_pixels
+
+FloatArray = NDArray[np.floating]
+
+_NEWTON_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Pixels(OfPoints):
+    """Pixels of one photograph, compared with the middle of the outline that a curve would have.
+
+        d_k = c n_k . (u_k - m(r(s_k)))                                      [m]
+
+    with the pixel u, the middle m of the projected outline, its normal n, and c the size of a pixel
+    at the cable's distance: the distance across the line of sight, in the units of other sensors.
+    The places s_k are nearest in the picture; there d does not change to first order with s.
+
+    Where the camera stands is known from the board's markers only so well: its error, a rotation
+    and a shift, moves all pixels of a photograph together and is part of their covariance.
+
+    Parameters
+    ----------
+    viewpoint : Viewpoint
+        Where the camera stands.
+    pixels : (K, 2) [px]
+        As photographed, from start to end.
+    diameter : scalar [m]
+        Of the cable.
+    points : (K, 3) [m]
+        About where they lie.
+    weight : (K,)
+        Relative standard deviations.
+    size : scalar [m/px]
+        Of a pixel at the cable.
+    together : (K, 6) [m]
+        What a standard deviation of each error of the camera's place does to the residuals.
+    """
+
+    viewpoint: Viewpoint
+    pixels: FloatArray
+    diameter: float
+    points: FloatArray
+    weight: FloatArray
+    size: float
+    together: FloatArray
+
+    marked = False
+    per_point = 1
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """First guess of the pixels' arc lengths (K,) [m]: running chord length, scaled to L."""
+        return chord_places(self.points, pose, length)
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] that are seen nearest to the pixels, near those given."""
+        return self._nearest(seen.curve, places)
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """Arc lengths (K,) [m] at which the pixels belong on a curve that may be far off."""
+        return self._nearest(curve, curve.nearest(self.points))
+
+    def _nearest(self, curve: NodeCurve, guess: FloatArray) -> FloatArray:
+        """Gauss-Newton steps on the distance in the picture, within [0, L]."""
+        s, limit = guess.copy(), 0.5 * curve.length / curve.n
+        for _ in range(_NEWTON_STEPS):
+            position, tangent = curve.frame(s, 1)
+            seen, slopes = self.viewpoint.project(position)
+            along = np.einsum("kij,kj->ki", slopes, tangent)
+            ahead = np.sum((self.pixels - seen) * along, axis=1)
+            step = ahead / np.maximum(np.sum(along**2, axis=1), 1e-12)
+            new = np.clip(s + np.clip(step, -limit, limit), 0.0, curve.length)
+            done = np.abs(new - s).max() < 1e-8 * curve.length
+            s = new
+            if done:
+                break
+        return s
+
+    def _compared(self, curve: NodeCurve, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals (K,) [m] and their slopes (K, 3) by the curve's points."""
+        position, tangent = curve.frame(places, 1)
+        tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
+        away, slopes = compare_pixels(self.viewpoint, self.pixels, position, tangent, self.diameter)
+        return self.size * away, self.size * slopes
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """What the residual has of displacements (K, 3, q) [m] of what is measured: (K, q)."""
+        return np.asarray(-np.einsum("kd,kdq->kq", self._compared(curve, places)[1], moved))
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (K,) [m]."""
+        return self._compared(seen.curve, places)[0]
+
+    def residual_along(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> FloatArray:
+        """Change (K, q) of the residual along directions."""
+        return -self.components(seen.curve, places, seen.curve.moved(places, along.curve))
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (K, K) [1/m] with W cov W^T = 1, errors of the camera's place among them."""
+        white = noise.whitening(places, self.weight)
+        seen = white @ self.together
+        factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
+        return np.asarray(solve_triangular(factor, white, lower=True))
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same pixels with other relative standard deviations."""
+        return replace(self, weight=weight)
+
+
+def pixel_std(views: Sequence[ViewInput]) -> float:
+    """Median standard deviation [m] of the pixels of photographs, at the cable's distance."""
+    return float(np.median(np.concatenate([view.sight.std * _size(view) for view in views])))
+
+
+def pixels_of(view: ViewInput, std: float) -> Pixels | None:
+    """The sensor of a photograph; None if none of its pixels is of the cable.
+
+    Pixels share their errors with their neighbours over the length of the average along the
+    cable: of those nearer to each other one is taken.
+
+    Parameters
+    ----------
+    view : ViewInput
+        With a sight.
+    std : scalar [m]
+        Standard deviation of a pixel of weight one.
+    """
+    sight = view.sight
+    every = max(1, int(np.ceil(sight.correlation / sight.spacing)))
+    kept = np.flatnonzero(sight.whole & np.isfinite(view.places).all(axis=1))[::every]
+    if len(kept) < 2:
+        return None
+    size, pixels, points = _size(view), sight.pixels[kept], view.places[kept]
+    tangent = np.gradient(pixels, axis=0)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    viewpoint = sight.viewpoint
+    by_shift = np.einsum("ki,kij->kj", normal, viewpoint.project(points)[1])
+    by_shift = by_shift @ viewpoint.rotation.T
+    by_turn = np.cross(viewpoint.in_camera(points), by_shift)
+    error = np.linalg.cholesky(viewpoint.covariance)
+    together = size * np.column_stack([by_turn, by_shift]) @ error
+    weight = sight.std[kept] * size / std
+    return Pixels(viewpoint, pixels, sight.diameter, points, weight, size, together)
+
+
+def _size(view: ViewInput) -> float:
+    """Size [m] of a pixel of a photograph at the cable, the median."""
+    viewpoint = view.sight.viewpoint
+    depth = viewpoint.in_camera(view.places)[:, 2]
+    return float(np.nanmedian(depth)) / viewpoint.camera.focal

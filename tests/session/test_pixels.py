@@ -1,0 +1,102 @@
+"""Pixels of a photograph as a sensor, against a curve that is known."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.sensors import Observed, ObservedChange
+from dlo_casadi.session.pixels import Pixels
+from dlo_casadi.vision import Camera, Viewpoint, project_outline
+
+LENGTH, DIAMETER = 0.9, 0.008
+CAMERA = Camera(
+    np.array([[1000.0, 0, 640], [0, 1000.0, 480], [0, 0, 1]]), np.array([-0.1, 0.05, 0, 0, 0])
+)
+S = np.linspace(0.03, 0.87, 40)
+
+
+def viewpoint(angle):
+    """A camera 1.2 m away, turned by an angle about the board's y axis."""
+    turn = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+    at = np.array([0.4 - 1.2 * np.sin(angle), 0.0, 1.2 * np.cos(angle)])
+    return Viewpoint(
+        CAMERA, turn, -turn @ at, (960, 1280), 1e-8 * np.eye(6), 0.1, np.zeros((0, 4, 2)), ()
+    )
+
+
+def curve(bend=2.0):
+    """An arc of 20 elements in front of the board, leaving its plane."""
+    s = np.linspace(0.0, LENGTH, 21)
+    tangent = np.column_stack(
+        [np.cos(bend * s - 0.9) * 0.9, np.sin(bend * s - 0.9) * 0.9, np.full(21, np.sqrt(0.19))]
+    )
+    angle = bend * s - 0.9
+    nodes = np.column_stack(
+        [0.9 / bend * np.sin(angle), -0.9 / bend * np.cos(angle), np.sqrt(0.19) * s]
+    )
+    return NodeCurve(LENGTH, nodes - nodes[0], tangent)
+
+
+def sensor(angle, shown, together=0.0):
+    """What a camera sees of a curve, without an error."""
+    camera = viewpoint(angle)
+    outline = project_outline(camera, shown.at(S), shown.at(S, 1), DIAMETER)
+    shared = together * np.ones((len(S), 6))
+    return Pixels(camera, outline.pixels, DIAMETER, shown.at(S), np.ones(len(S)), 1.2e-3, shared)
+
+
+def test_a_curve_is_where_it_is_seen():
+    """No residual at its own pixels, also from places half an element off."""
+    seen = Observed(curve(), np.zeros(0))
+    pixels = sensor(0.4, curve())
+    places = pixels.located(seen, S + 0.02)
+    np.testing.assert_allclose(places, S, atol=1e-4)  # the middle is not quite the axis
+    np.testing.assert_allclose(pixels.residual(seen, places), 0.0, atol=1e-6)
+    np.testing.assert_allclose(pixels.nearest(curve()), S, atol=1e-4)
+
+
+def test_derivatives_are_those_of_the_residual():
+    """To first order; the middle of the outline follows the axis to a part in 1e-4."""
+    pixels, now = sensor(0.4, curve()), curve(2.02)
+    table = now.numbers
+    places = pixels.located(Observed(now, np.zeros(0)), S)
+    step = np.random.default_rng(0).normal(size=(*table.shape, 1))
+    change = pixels.residual_along(
+        Observed(now, np.zeros(0)), places, ObservedChange(step, np.zeros((0, 1)))
+    )
+    ahead, behind = (
+        pixels.residual(
+            Observed(NodeCurve.of(LENGTH, table + h * step[..., 0]), np.zeros(0)), places
+        )
+        for h in (1e-6, -1e-6)
+    )
+    found = (ahead - behind) / 2e-6
+    # beside it the tangent turns the normal, which a residual of some millimetres feels
+    np.testing.assert_allclose(change[:, 0], found, atol=0.05 * np.abs(found).max())
+
+
+def test_errors_of_the_cameras_place_are_part_of_the_covariance():
+    pixels = sensor(0.4, curve(), together=1e-3)
+    white = pixels.whitening(NoiseModel(1e-4), S)
+    covariance = 1e-8 * np.eye(len(S)) + 6e-6
+    np.testing.assert_allclose(white @ covariance @ white.T, np.eye(len(S)), atol=1e-9)
+
+
+@pytest.mark.parametrize("line", [True, False])
+def test_a_pose_of_photographs(line):
+    """Its distances are those of its line; of one photograph those across the line of sight."""
+    shown = curve()
+    points = shown.at(S) if line else np.zeros((0, 3))
+    item = MeasuredPose(
+        Pose((0.0, 0.0, 0.0)), (sensor(0.4, shown), sensor(-0.4, shown)), line=points
+    )
+    assert item.has_line is line
+    assert len(item.distances(shown)) == (len(S) if line else 2 * len(S))
+    np.testing.assert_allclose(item.distances(shown), 0.0, atol=1e-6)
+    moved = NodeCurve(LENGTH, shown.nodes + np.array([0.0, 0.0, 1e-3]), shown.slopes)
+    assert 0.3e-3 < np.sqrt(np.mean(item.distances(moved) ** 2)) < 1e-3
+    np.testing.assert_array_equal(item.traced.points, points if line else item.points)
