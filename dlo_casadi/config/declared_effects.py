@@ -21,7 +21,7 @@ def declared_setup(config: Config | File) -> Setup:
     return Setup(
         cable=Cable(
             length=cable.length,
-            mass=cable.mass,
+            mass=cable.prior_mass,
             diameter=cable.diameter,
             bending_stiffness=cable.prior_bending_stiffness,
             name=cable.name,

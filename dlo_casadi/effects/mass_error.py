@@ -8,6 +8,9 @@ from dlo_casadi.effects.effect import Cable, Load, Params
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
+# Qualified name of its parameter.
+MASS_FACTOR = "mass_error.factor"
+
 
 class MassError(Load):
     """The mass of the cable itself is not the declared one.

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Normal, Point
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.model import CableModel
@@ -36,6 +37,12 @@ class Fit:
     def model(self) -> CableModel:
         """The model that was fitted."""
         return self.problem.unknowns.model
+
+    @property
+    def mass(self) -> float:
+        """Mass of the cable [kg]: as declared, or as found."""
+        known = self.model.cable.mass
+        return known * self.value(MASS_FACTOR) if MASS_FACTOR in self.model.names else known
 
     @property
     def noise(self) -> NoiseModel:

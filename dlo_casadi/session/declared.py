@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
-from dlo_casadi.effects import EFFECTS, NUISANCES
+from dlo_casadi.effects import EFFECTS, NUISANCES, MassError
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.model import END_ROLL, CableModel
@@ -113,6 +113,8 @@ def declared_model(
             values[f"{item.name}.{name}"] = parameter.value
             if parameter.fixed:
                 fixed.append(f"{item.name}.{name}")
+    if config.cable.mass is None:
+        model = model.with_effect(MassError())
     tolerances = Tolerances(**setup.tolerances)
     model = nuisances(model, tolerances, pixel, setup.readings)
     return Declared(model, values, tuple(fixed), tolerances)

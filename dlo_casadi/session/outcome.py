@@ -21,6 +21,8 @@ from dlo_casadi.vision import Sight
 
 FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
+# Name of the cable's mass among a stage's parameters.
+MASS = "mass"
 Verdict = Literal["complete", "effect_found", "unexplained"]
 
 

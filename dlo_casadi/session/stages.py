@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.algorithm1 import Algorithm1Result
 from dlo_casadi.estimation.band import Uncertainty, spread_across
@@ -25,6 +26,7 @@ from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model import END_ROLL, CableModel
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.session.outcome import (
+    MASS,
     BranchShape,
     ParameterEstimate,
     PoseShape,
@@ -255,21 +257,24 @@ def fit_stage(
     Parameters
     ----------
     intervals : mapping
-        Of the stiffnesses, by name.
+        Of the stiffnesses and of the mass's factor, by name.
     reported : sequence of str
         Qualified names of the parameters that are effects, not nuisances.
     """
     model = fit.model
-    parameters = {
-        name: ParameterEstimate(
-            fit.value(name),
-            fit.std(name),
-            "N m^2",
-            (interval.low, interval.high),
+    parameters: dict[str, ParameterEstimate] = {}
+    for full, interval in intervals.items():
+        key, unit, size = full, "N m^2", 1.0
+        if full == MASS_FACTOR:
+            key, unit, size = MASS, "kg", model.cable.mass
+        ends = tuple(None if end is None else size * end for end in (interval.low, interval.high))
+        parameters[key] = ParameterEstimate(
+            size * fit.value(full),
+            size * fit.std(full),
+            unit,
+            (ends[0], ends[1]),
             interval.identifiable,
         )
-        for name, interval in intervals.items()
-    }
     roll = [END_ROLL] if END_ROLL in model.names else []
     for qualified in (*roll, *reported):
         q = model.parameters[model.names.index(qualified)]
