@@ -587,7 +587,7 @@ def _from_start(
     solver = _solver(id(model), _Held(model))
     deviation = np.zeros(len(model.deviation_names))
     given = Given.of(p, rest, pose.vector[None])
-    x0 = np.concatenate([phi, np.zeros(2 * model.n_springs + model.n_inner * chain.n_slots)])
+    x0 = np.concatenate([phi, np.zeros(solver.size1_in("x0") - len(phi))])
     bounds = np.zeros(model.n_multipliers + chain.n_nodes - 1)
     bounds[model.n_multipliers :] = JOINT_BOUND
     parameters = np.concatenate([p, rest, pose.vector, deviation])

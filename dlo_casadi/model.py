@@ -708,6 +708,31 @@ class CableModel:
         return ca.SX.sym("inner", self.chain.kind.n_inner)
 
     @cached_property
+    def _compliances(self) -> dict[int, ca.SX]:
+        """What the conditions of clamps that give way give per multiplier, by their places."""
+        sides = {"start": ca.SX(0), "end": ca.SX(0)}
+        for effect, local in self._filling(BoundaryEffect):
+            if effect.gives:
+                for side, compliance in zip(sides, effect.compliance(local), strict=True):
+                    sides[side] += compliance
+        turns = {f"{side}_{turn}": c for side, c in sides.items() for turn in self.node.turns}
+        return {
+            k: turns[name]
+            for k, name in enumerate(self.condition_names)
+            if name in turns and not turns[name].is_zero()
+        }
+
+    @cached_property
+    def compliances(self) -> ca.Function:
+        """(p) -> compliances of the conditions `compliant`."""
+        return ca.Function("compliances", [self._p], [ca.vertcat(*self._compliances.values())])
+
+    @property
+    def compliant(self) -> list[int]:
+        """End conditions that give way."""
+        return list(self._compliances)
+
+    @cached_property
     def _at_ends(self) -> ca.SX:
         """Lagrangian of the ends: holders, end conditions, and the loads' work at the start."""
         node = self.chain.kind.node
@@ -721,6 +746,8 @@ class CableModel:
         total = ca.dot(self._lam[: self.n_conditions], ca.vertcat(*gaps)) if gaps else ca.SX(0)
         for effect, local in self._filling(BoundaryEffect):
             total += effect.energy(first, last, local)
+        for k, compliance in self._compliances.items():
+            total -= compliance * self._lam[k] ** 2 / 2
         for k, spring in enumerate(self._springs):
             place, pull = self._spring_unknowns(k)
             total += spring.energy(place) + ca.dot(pull, held.start - place)

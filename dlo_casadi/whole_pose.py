@@ -57,7 +57,8 @@ class Potential:
 def potential(model: CableModel) -> Potential:
     """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
 
-    The coordinates are the nodes', the places of springs, then the unknowns inside the slots.
+    The coordinates are the nodes', the places of springs, the unknowns inside the slots, then
+    those of clamps that give way: a clamp of the compliance c turns by sqrt(c) a and stores a^2/2.
     """
     s, chain = PoseSymbols.of(model), model.chain
     inner = ca.SX.sym("inner", model.n_inner, chain.n_slots)
@@ -69,11 +70,15 @@ def potential(model: CableModel) -> Potential:
     multipliers = np.flatnonzero(model.are_multipliers).tolist()
     places = np.flatnonzero(~model.are_multipliers).tolist()
     zero = ca.SX.zeros(len(multipliers))
+    given_way = ca.SX.sym("given_way", len(model.compliant))
+    if model.compliant:
+        energy += ca.sumsqr(given_way) / 2
+        conditions[model.compliant] -= ca.sqrt(model.compliances(s.p)) * given_way
     given = [energy, conditions[multipliers]]
     energy, conditions = ca.substitute(given, [s.lam[multipliers]], [zero])
     parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
     held = [s.lam[i] for i in places]
-    coordinates = ca.vertcat(s.x, *held, *ca.vertsplit(ca.vec(inner)))
+    coordinates = ca.vertcat(s.x, *held, *ca.vertsplit(ca.vec(inner)), given_way)
     return Potential(coordinates, parameters, energy, conditions)
 
 

@@ -15,6 +15,7 @@ from dlo_casadi.effects import (
     BendingSoftening,
     Cable,
     ClampAngle,
+    ClampCompliance,
     Effect,
     EndOffset,
     EndSpring,
@@ -54,7 +55,7 @@ POSE_IN_SPACE = Pose(
 ).vector
 GRAVITY = {"plane": (1.0, -9.7), "space": (1.0, 0.5, -9.7)}
 SLOTS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
-UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad"}
+UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad", "rad/(N m)"}
 EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WHERE = (*(("plane", e) for e in ELEMENTS), *(("space", e) for e in ELEMENTS_IN_SPACE))
@@ -70,7 +71,7 @@ EVERYWHERE = pytest.mark.parametrize(("name", "where", "element"), CASES)
 @cache
 def plain(name: str, where: str, element: str) -> CableModel:
     """Model without the effect, with the boundaries that it needs."""
-    held = "pinned" if where == "plane" and name != "clamp_angle" else "clamped"
+    held = "pinned" if where == "plane" and not name.startswith("clamp_") else "clamped"
     cable = CABLE if where == "plane" else IN_SPACE
     return CableModel(cable, 5, element, held, held, GRAVITY[where])
 
@@ -464,6 +465,30 @@ def test_fixtures_are_where_the_boundary_effects_put_them():
     p = np.array([0.05, 0.1, -0.2])
     found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), pose)
     np.testing.assert_allclose(found.phi[[0, -1]], [-0.4, 0.3], atol=1e-8)
+
+
+@ALL
+def test_a_clamp_that_gives_way_is_one_turned_by_the_moment_on_it(element):
+    """And what it stores is c M^2 / 2: the energy's slope by the heading is the moment on it."""
+    held = {"n": 8, "element": element, "start": "clamped", "end": "clamped"}
+    giving = CableModel(CABLE, effects=(ClampCompliance(),), **held)
+    turned = CableModel(CABLE, effects=(ClampAngle(),), **held)
+    rest, pose = np.zeros(giving.chain.n_cells), Pose((0.0, 0.0), (0.5, -0.1), 0.4, -0.2)
+    compliance = np.array([0.6, 0.2])
+    p = np.array([0.05, *compliance])
+    found = solve_equilibrium(giving, p, rest, pose)
+    turns = compliance * found.moments
+    assert np.abs(turns).min() > 0.02
+    same = solve_equilibrium(turned, np.array([0.05, *turns]), rest, pose)
+    np.testing.assert_allclose(found.points, same.points, atol=1e-9)
+    stored = (compliance * found.moments**2).sum() / 2
+    assert found.energy == pytest.approx(same.energy + stored, abs=1e-10)
+    d = 1e-4  # of the third derivative 1e-8 is left, and rounding over d
+    ahead, back = (
+        solve_equilibrium(giving, p, rest, replace(pose, start_heading=0.4 + step)).energy
+        for step in (d, -d)
+    )
+    assert (back - ahead) / (2 * d) == pytest.approx(found.moments[0], rel=1e-6)
 
 
 def test_clamp_angles_of_one_end_only():

@@ -24,7 +24,7 @@ from dlo_casadi.config.sections import (
     SkippedPose,
     Tolerances,
 )
-from dlo_casadi.effects import MassError
+from dlo_casadi.effects import UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.rod.chain import ELEMENTS
 
@@ -185,8 +185,8 @@ def _weightless(file: File) -> Iterator[Problem]:
             "mass: null: shapes tell stiffness over weight alone. Try: the mass in kg, or "
             "end_force of a fit pose, which tells both",
         )
-    elif any(item.name == MassError.name for item in file.model.effects):
-        yield Problem(at, f"mass: null: {MassError.name} is of a declared mass; one of the two")
+    elif any(item.name == UNKNOWN_MASS.name for item in file.model.effects):
+        yield Problem(at, f"mass: null: {UNKNOWN_MASS.name} is of a declared mass; one of the two")
 
 
 def _axes(experiment: Experiment) -> str:

@@ -96,14 +96,23 @@ class CrossValidation:
         return np.asarray(self.squares / self.counts - other.squares / other.counts)
 
 
-def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:
+def cross_validate(
+    fit: Fit, executor: Executor | None = None, shapes: Shapes | None = None
+) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
     All folds are predicted in one sweep, some 6 ms each. Only where a state is carried is each a
     task of its own; it runs in this process unless an executor is given.
+
+    Parameters
+    ----------
+    shapes : Shapes, optional
+        Equilibria at the fit's unknowns from which the folds are followed: the fitted ones, on
+        whichever branch a pose was measured, by default; or `predicted_shapes`.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
+    shapes = fit.point.shapes if shapes is None else shapes
     problem, lin = fit.problem, fit.linearization
     thetas = []
     total = fit.normal
@@ -117,7 +126,7 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
             g_j = g_j - cross.T @ solved[:, -1]
         thetas.append(_without(fit, total.hessian - h_j, total.gradient - g_j))
     errors: list[tuple[FloatArray, FloatArray] | None] = []
-    predicted = _predicted(fit, thetas, executor or InProcess())
+    predicted = _predicted(fit, shapes, thetas, executor or InProcess())
     for j, seen in zip(problem.used, predicted, strict=True):
         item = problem.measured[j]
         found = (
@@ -157,11 +166,12 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> FloatArray:
     return np.clip(fit.point.theta + step, lower, upper)
 
 
-def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[Observed | None]:
+def _predicted(
+    fit: Fit, shapes: Shapes, thetas: list[FloatArray], executor: Executor
+) -> list[Observed | None]:
     """What each fitted pose looks like at its own unknowns, from declared end conditions."""
     problem, sweep = fit.problem, fit.problem.sweep
     unknowns, model = problem.unknowns, fit.model
-    shapes = fit.point.shapes
     plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
     if model.has_state:
         folds = map_in_order(executor, partial(_predict_all, fit, plain), thetas)

@@ -29,6 +29,7 @@ from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.hyperparameters import errors_of, settle
+from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.executors import InProcess
@@ -288,7 +289,11 @@ class _Search:
             if k == 0:
                 ranked = _ranking(screened, p_values, confirmed)
             # What a second effect explains may be what the first one, if wrong, has left.
-            chosen = _choose(confirmed, np.inf if added else BIC_APART)
+            apart = np.inf if added else BIC_APART
+            chosen = _choose(confirmed, apart)
+            while chosen and _misleads(chosen[0].fit, current, validation):
+                confirmed.remove(chosen[0])
+                chosen = _choose(confirmed, apart)
             if chosen is None:
                 break
             winner, rivals = chosen
@@ -475,6 +480,21 @@ def _choose(
     winner = max(close, key=lambda item: item.bic)
     rivals = [item for item in close if item is not winner and item.bic > winner.bic - apart]
     return winner, sorted(rivals, key=lambda item: -item.bic)
+
+
+def _misleads(fit: Fit, before: Fit, validation: CrossValidation) -> bool:
+    """Whether a fit with an effect tells a user, who knows the ends alone, worse than one without.
+
+    `validation` follows the branches on which poses were measured, without the effect.
+    """
+    told = _told(fit)
+    return told > validation.rmse and told > _told(before)
+
+
+def _told(fit: Fit) -> float:
+    """Cross-validated error [m] of poses of which nothing but the ends is known."""
+    shapes = predicted_shapes(fit.problem, fit.point.shapes, fit.p, fit.rest)
+    return cross_validate(fit, shapes=shapes).rmse
 
 
 def _ranking(

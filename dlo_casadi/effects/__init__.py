@@ -5,6 +5,7 @@ from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening
 from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamp_angle import ClampAngle
+from dlo_casadi.effects.clamp_compliance import ClampCompliance
 from dlo_casadi.effects.clamp_rotation import ClampRotation
 from dlo_casadi.effects.edge_bias import EdgeBias
 from dlo_casadi.effects.effect import (
@@ -61,6 +62,7 @@ EFFECTS: dict[str, type[Effect]] = {
         EndSpring,
         ClampAngle,
         ClampRotation,
+        ClampCompliance,
         EndOffset,
         RestCurvatureDrift,
         PlasticSet,
@@ -70,6 +72,9 @@ EFFECTS: dict[str, type[Effect]] = {
         CameraFrame,
     )
 }
+
+# What finds a mass that is not declared.
+UNKNOWN_MASS: type[Effect] = MassError
 
 # What a measurement has beside them: never declared, and never blamed for a residual.
 NUISANCES: dict[str, type[Effect]] = {kind.name: kind for kind in (EdgeBias, SensorBias)}
@@ -83,6 +88,7 @@ def known_effect(name: str) -> type[Effect] | None:
 __all__ = [
     "EFFECTS",
     "NUISANCES",
+    "UNKNOWN_MASS",
     "AxialStretch",
     "BendingAnisotropy",
     "BendingSoftening",
@@ -90,6 +96,7 @@ __all__ = [
     "Cable",
     "CameraFrame",
     "ClampAngle",
+    "ClampCompliance",
     "ClampRotation",
     "EdgeBias",
     "Effect",

@@ -12,8 +12,8 @@ from dlo_casadi.parameters import Parameter
 
 
 @dataclass(frozen=True)
-class ClampTurn(BoundaryEffect):
-    """True minus declared direction of the clamps, the same in all poses.
+class ClampEffect(BoundaryEffect):
+    """Something about the clamps that is the same in all poses.
 
     Parameters
     ----------
@@ -21,20 +21,13 @@ class ClampTurn(BoundaryEffect):
         Which of the ends are clamped.
     """
 
-    # Parameters of one clamp, behind the name of its end.
-    errors: ClassVar[tuple[str, ...]]
-
     start: bool = True
     end: bool = True
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
-        """Declare the errors of the clamped ends."""
-        held = [side for side, used in (("start", self.start), ("end", self.end)) if used]
-        return tuple(
-            Parameter(f"{side}_{error}", "rad", scale=0.05, lower=-0.9, upper=0.9)
-            for side in held
-            for error in self.errors
-        )
+    @property
+    def sides(self) -> list[str]:
+        """Names of the clamped ends."""
+        return [side for side in ("start", "end") if getattr(self, side)]
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
@@ -58,6 +51,21 @@ class ClampTurn(BoundaryEffect):
     def may_be(self, found: Fitted) -> bool:
         """A local effect beside a clamp may be the clamp's."""
         return (self.start and found.near_start) or (self.end and found.near_end)
+
+
+class ClampTurn(ClampEffect):
+    """True minus declared direction of the clamps."""
+
+    # Parameters of one clamp, behind the name of its end.
+    errors: ClassVar[tuple[str, ...]]
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the errors of the clamped ends."""
+        return tuple(
+            Parameter(f"{side}_{error}", "rad", scale=0.05, lower=-0.9, upper=0.9)
+            for side in self.sides
+            for error in self.errors
+        )
 
 
 class ClampAngle(ClampTurn):

@@ -356,9 +356,16 @@ class BoundaryEffect(Effect):
         """Change the end conditions. Changes are applied in the order of the model's effects."""
         return ends
 
+    # Whether clamps give way, see `compliance`.
+    gives: ClassVar[bool] = False
+
     def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX | float:
         """Energy stored in the holders [J], by the cable's first and last node. Energies add."""
         return 0.0
+
+    def compliance(self, params: Params) -> tuple[ca.SX | float, ca.SX | float]:
+        """Turn of the start and end clamp per moment on it [rad/(N m)]. Compliances add."""
+        return 0.0, 0.0
 
 
 class MeasurementEffect(Effect):

@@ -36,7 +36,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "schema": SCHEMA,
         "config": outcome.config.name,
         "versions": outcome.versions,
-        "warnings": all_warnings(outcome),
+        "warnings": [*outcome.doubts, *all_warnings(outcome)],
         "timing_s": outcome.timing,
         "measurement": {
             "kind": measurement.kind,

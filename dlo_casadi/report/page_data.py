@@ -80,12 +80,16 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
 
 def sentence(line: str) -> str:
     """A line of the terminal as a sentence of its own."""
-    text = line.removeprefix("Verdict: ").removeprefix("unexplained. ").removeprefix("complete. ")
+    text = line.removeprefix("Verdict: ")
+    for word in ("unexplained. ", "complete. ", "the fit has failed. "):
+        text = text.removeprefix(word)
     return text[:1].upper() + text[1:]
 
 
 def verdict_word(outcome: Outcome) -> str:
     """The verdict in one or two words."""
+    if not outcome.fit.converged:
+        return "Fit failed"
     if outcome.verdict is None:
         return "Not diagnosed"
     return VERDICT_WORDS[outcome.verdict]

@@ -289,9 +289,15 @@ def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
 
 def verdict_lines(outcome: Outcome) -> list[str]:
     """What the diagnosis has led to, in sentences."""
-    if outcome.verdict is None:
-        return ["Diagnosis: switched off; nothing was looked for in the residual."]
-    lines = [_verdict(outcome), *structure_lines(outcome)]
+    if outcome.doubts:
+        head, *others = (f"{text[:1].upper()}{text[1:]}." for text in outcome.doubts)
+        word = "unexplained" if outcome.fit.converged else "the fit has failed"
+        lines = [f"Verdict: {word}. {head}", *(f"  {text}" for text in others)]
+    elif outcome.verdict is not None:
+        lines = [_verdict(outcome)]
+    else:
+        lines = ["Diagnosis: switched off; nothing was looked for in the residual."]
+    lines += structure_lines(outcome)
     for effect in outcome.effects:
         lines += _effect_lines(effect)
     load = outcome.unexplained

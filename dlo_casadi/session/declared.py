@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
-from dlo_casadi.effects import EFFECTS, NUISANCES, MassError
+from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.model import END_ROLL, CableModel
@@ -114,7 +114,7 @@ def declared_model(
             if parameter.fixed:
                 fixed.append(f"{item.name}.{name}")
     if config.cable.mass is None:
-        model = model.with_effect(MassError())
+        model = model.with_effect(UNKNOWN_MASS())
     tolerances = Tolerances(**setup.tolerances)
     model = nuisances(model, tolerances, pixel, setup.readings)
     return Declared(model, values, tuple(fixed), tolerances)

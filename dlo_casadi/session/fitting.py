@@ -119,9 +119,11 @@ def solved_by_ipopt(fit: Fit) -> Fit:
     if fit.model.in_space:
         return fit
     try:
-        return replace(fit, point=solve_batch(fit.problem, fit.point).point)
+        point = solve_batch(fit.problem, fit.point).point
     except EstimationError:
         return replace(fit, converged=False)
+    lower = point.objective <= fit.point.objective + 1e-6 * abs(fit.point.objective)
+    return Fit(fit.problem, point, converged=True) if lower else fit
 
 
 def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:

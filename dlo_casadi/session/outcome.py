@@ -24,6 +24,8 @@ StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"
 # Name of the cable's mass among a stage's parameters.
 MASS = "mass"
 Verdict = Literal["complete", "effect_found", "unexplained"]
+# Stages that a batch estimate must not be worse than.
+SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,14 @@ class PoseShape:
     tipping: float | None = None
     spread: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+
+    def expected(self, length: float, noise: float) -> FloatArray:
+        """Standard deviations of the residual (K,), in space (K, 2), [m], noise included."""
+        assert self.spread is not None
+        places = np.linspace(0.0, length, len(self.spread))
+        spread = self.spread.reshape((len(places), -1))
+        std = np.stack([np.interp(self.s, places, column) for column in spread.T], axis=1)
+        return np.hypot(std, noise).reshape(self.residual.shape)
 
 
 @dataclass(frozen=True)
@@ -361,6 +371,9 @@ class Outcome:
         As in report.json ("dlo-report/1"), ready to be written.
     verdict : Verdict or None
         None where no diagnosis was made: nothing is claimed then.
+    doubts : tuple of str
+        Why the last stage's numbers do not hold, see `doubts_of`; with them no verdict is
+        `complete` or `effect_found`.
     structure : dict or None
         Tests of the residual "before" and "after", see `diagnosis.structure.Structure`.
     fit : Fit
@@ -378,6 +391,7 @@ class Outcome:
     timing: dict[str, float]
     fit: Fit
     verdict: Verdict | None = None
+    doubts: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     effects: tuple[dict[str, Any], ...] = ()
     candidates: tuple[dict[str, Any], ...] = ()
@@ -402,12 +416,9 @@ class Outcome:
             shape = stage.shapes.get(pose.name)
             if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:
                 continue
-            places = np.linspace(0.0, self.fit.model.cable.length, len(shape.spread))
-            spread = shape.spread.reshape((len(places), -1))
-            std = np.stack([np.interp(shape.s, places, column) for column in spread.T], axis=1)
-            std = np.hypot(std, self.measurement.std)
-            score = ((shape.residual.reshape(std.shape) / std) ** 2).sum(axis=1)
-            inside.append(score <= chi2.ppf(COVERED, std.shape[1]))
+            std = shape.expected(self.fit.model.cable.length, self.measurement.std)
+            score = ((shape.residual / std) ** 2).reshape((len(std), -1)).sum(axis=1)
+            inside.append(score <= chi2.ppf(COVERED, std.size // len(std)))
         return float(np.concatenate(inside).mean()) if inside else None
 
     def held_out(self, stage: Stage) -> HeldOut:

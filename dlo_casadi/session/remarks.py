@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
+from dlo_casadi.equilibrium import PoseBranch
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.fitting import allowed_mesh_error
-from dlo_casadi.session.outcome import PoseInput, Stage
-from dlo_casadi.thresholds import EITHER, FIXTURES, MESH_SHARE
+from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
+from dlo_casadi.thresholds import EITHER, FIXTURES, MESH_SHARE, UNSEEN
+
+FloatArray = NDArray[np.floating]
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
@@ -59,15 +63,10 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
             found = {k: shape for k, shape in stage.other_branch.items() if shape.branch == branch}
             predicted = max(stage.shapes[name].rmse or 0.0 for name in found)
             measured = max(shape.rmse for shape in found.values())
-            cure = (
-                "no `branch` of these poses would choose it"
-                if branch is None
-                else f"`branch: {branch}` in these poses chooses it"
-            )
             lines.append(
                 f"stage {stage.name}: {', '.join(found)}: the equilibrium of lowest energy, which "
                 f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
-                f"off, on the measured branch {1e3 * measured:.3g} mm; {cure}"
+                f"off, on the measured branch {1e3 * measured:.3g} mm; {_cure(branch)}"
             )
     for stage in stages[-1:]:
         either = [
@@ -84,6 +83,91 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
                 "in the pose before it) says which"
             )
     return lines
+
+
+def _cure(branch: PoseBranch | None) -> str:
+    if branch is None:
+        return "no `branch` of these poses would choose it: take them again, or leave them out"
+    return f"`branch: {branch}` in these poses chooses it"
+
+
+def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
+    """Simpler stages that come nearer to the fit poses than the batch estimate.
+
+    By more than chance: the root mean square of K points is known to 1/sqrt(2 K) of it.
+    """
+    lines = []
+    for batch in stages:
+        if batch.name not in ("batch", "closed") or batch.rmse_fit is None:
+            continue
+        count = sum(len(shape.s) for shape in batch.shapes.values())
+        least = batch.rmse_fit / (1 + 1 / np.sqrt(2 * max(count, 1)))
+        lines += [
+            f"stage {stage.name} comes nearer to the fit poses than stage {batch.name}: "
+            f"{1e3 * stage.rmse_fit:.4g} mm instead of {1e3 * batch.rmse_fit:.4g} mm RMS"
+            for stage in stages
+            if stage.name in SIMPLER and stage.rmse_fit is not None and stage.rmse_fit < least
+        ]
+    return lines
+
+
+def doubts_of(
+    stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit, noise: float
+) -> tuple[str, ...]:
+    """Why the numbers of the last stage do not hold, whatever its residual looks like.
+
+    Its fit has not converged; or poses are predicted, from their ends alone, worse than UNSEEN
+    times what noise, fixtures, parameters and the cable's scatter let expect. Where a cable may
+    fall to either side, a pose on the other one is what its scatter lets expect.
+
+    Parameters
+    ----------
+    noise : float [m]
+    """
+    lines, stage = [], stages[-1]
+    if not fit.converged:
+        lines.append(
+            f"the fit of stage {stage.name} has not converged: its numbers are where it stopped, "
+            "not a minimum. Try: a bending_stiffness nearer to the truth, more poses, or "
+            "rest_shape: straight"
+        )
+    for role, said in (("fit", "fit poses"), ("held_out", "held-out poses")):
+        errors = {
+            pose.name: _errors(stage.shapes[pose.name], fit.model.cable.length, noise)
+            for pose in poses
+            if pose.role == role and pose.name in stage.shapes and len(pose.points)
+        }
+        if not errors:
+            continue
+        off, known = np.sqrt(np.mean(np.concatenate(list(errors.values()), axis=1), axis=1))
+        if off <= UNSEEN * known:
+            continue
+        rms = {name: np.sqrt(both.mean(axis=1)) for name, both in errors.items()}
+        bad = sorted((k for k in rms if rms[k][0] > UNSEEN * rms[k][1]), key=lambda k: -rms[k][0])
+        worst, expected = rms[bad[0]]
+        text = (
+            f"{said} are predicted {1e3 * off:.3g} mm off, {1e3 * known:.3g} mm are what noise, "
+            "fixtures, parameters and the cable's scatter let expect: "
+            f"{', '.join(bad)}, at worst {1e3 * worst:.3g} mm instead of {1e3 * expected:.3g} mm"
+        )
+        elsewhere = {k: stage.other_branch[k] for k in bad if k in stage.other_branch}
+        for name, other in elsewhere.items():
+            text += (
+                f". The model's lowest equilibrium in {name} is another one than the measured one, "
+                f"to which it comes within {1e3 * other.rmse:.3g} mm; {_cure(other.branch)}"
+            )
+        lines.append(text)
+    return tuple(lines)
+
+
+def _errors(shape: PoseShape, length: float, noise: float) -> FloatArray:
+    """Squares (2, K) [m^2] of a pose's distances from its prediction: measured, expected."""
+    if shape.spread is None:
+        return np.zeros((2, 0))
+    if shape.measured_branch is not None and shape.tipping is not None and shape.tipping < EITHER:
+        return np.zeros((2, 0))
+    across = shape.expected(length, noise).reshape((len(shape.s), -1))
+    return np.stack([(shape.gap**2).sum(axis=1), (across**2).sum(axis=1) + noise**2])
 
 
 def fit_warnings(fit: Fit, error: float) -> list[str]:
@@ -115,8 +199,6 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"however good the model (the noise is {1e3 * fit.noise.std:.2g} mm); ends measured "
             "pose by pose would help"
         )
-    if not fit.converged:
-        lines.append("the batch fit stopped before it had converged")
     unstable = [
         item.pose.name
         for item, ok in zip(fit.problem.measured, fit.stable, strict=True)

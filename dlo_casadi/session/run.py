@@ -51,10 +51,13 @@ from dlo_casadi.session.outcome import (
 from dlo_casadi.session.progress import Clock, Progress, Silent
 from dlo_casadi.session.remarks import (
     branch_warnings,
+    doubts_of,
     fit_warnings,
     held_out_missing,
     reading_warnings,
+    worse_than_simpler,
 )
+from dlo_casadi.session.simpler import not_worse
 from dlo_casadi.session.stages import algorithm1_stage, fit_stage, initial_stage, stiffness_stage
 from dlo_casadi.workers import one_thread
 
@@ -119,6 +122,10 @@ def fit_session(
     # A diagnosis that finds nothing replaces this stage, intervals and all.
     intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
     stages.append(fit_stage("batch", fit, measured, intervals, reported))
+    better = not_worse(fit, stages)
+    if better is not fit:
+        fit = better
+        stages[-1] = fit_stage("batch", fit, measured, intervals, reported)
     clock.lap("fit")
     outcome = Outcome(
         config=config,
@@ -133,9 +140,21 @@ def fit_session(
         versions=versions(),
     )
     if not config.diagnosis.enabled:
-        said = (*warnings, *fit_warnings(fit, error), *branch_warnings(stages))
-        return replace(outcome, warnings=said)
+        return judged(outcome)
     return close_the_loop(outcome, measured, reported, _center(inputs), clock, progress, executor)
+
+
+def judged(outcome: Outcome) -> Outcome:
+    """An outcome with what is said of its fit, and its verdict if that stands."""
+    fit, stages = outcome.fit, outcome.stages
+    doubts = doubts_of(stages, outcome.poses, fit, outcome.measurement.std)
+    said = [*fit_warnings(fit, outcome.discretization.error), *worse_than_simpler(stages)]
+    return replace(
+        outcome,
+        verdict="unexplained" if outcome.verdict and doubts else outcome.verdict,
+        doubts=doubts,
+        warnings=(*outcome.warnings, *said, *branch_warnings(stages)),
+    )
 
 
 def close_the_loop(
@@ -189,7 +208,7 @@ def close_the_loop(
         shown = fit if complete else outcome.fit
         stages[-1] = fit_stage("batch", shown, measured, intervals, reported)
     clock.lap("diagnosis")
-    return replace(
+    closed = replace(
         outcome,
         fit=fit,
         measurement=_summary(outcome.config, outcome.poses, measured, fit),
@@ -204,8 +223,8 @@ def close_the_loop(
         next_pose=next_pose_row(diagnosis),
         structure=structure_rows(diagnosis),
         diagnosis=diagnosis,
-        warnings=(*outcome.warnings, *fit_warnings(fit, error), *branch_warnings(stages)),
     )
+    return judged(closed)
 
 
 def before_stages(

@@ -119,9 +119,10 @@ def _stage(
     chi2_per_dof: float | None,
     note: str = "",
     uncertainty: Uncertainty | None = None,
+    fitted: Mapping[str, FloatArray] | None = None,
 ) -> Stage:
     predictions = predict_poses(model, p, rest, [item.pose for item in measured])
-    others = measured_branches(model, p, rest, measured, predictions)
+    others = measured_branches(model, p, rest, measured, predictions, fitted)
     shapes = {
         item.pose.name: pose_shape(prediction, item, other)
         for prediction, item, other in zip(predictions, measured, others, strict=True)
@@ -293,6 +294,7 @@ def fit_stage(
         rest_curvature_of(fit),
         fit.chi2_per_dof,
         uncertainty=Uncertainty.of(fit),
+        fitted={fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used},
     )
 
 

@@ -76,6 +76,7 @@ def test_every_effect_of_the_cable_has_values():
     in_plane = {n: e for n, e in EFFECTS.items() if e.in_plane}
     of_the_cable = {n for n, e in in_plane.items() if not issubclass(e, MeasurementEffect)}
     refused = {n for n, e in EFFECTS.items() if issubclass(e, Load) and e.n_springs}
+    refused.add("clamp_compliance")
     assert set(VALUES) == of_the_cable - refused
 
 
@@ -85,6 +86,14 @@ def test_a_load_that_depends_on_the_shape_is_refused(position):
     p = np.array([0.3, 5.0, position, 0.3, 0.4])
     with pytest.raises(DloError, match=r"no solver .* with tether: .*shape"):
         CompiledSolver(model, p, np.zeros(12))
+
+
+def test_clamps_that_give_way_are_refused():
+    model = CableModel(
+        CABLE, 12, start="clamped", effects=(EFFECTS["clamp_compliance"](end=False),)
+    )
+    with pytest.raises(DloError, match=r"no solver .* clamps give way"):
+        CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells))
 
 
 @pytest.mark.parametrize("name", [name for name in VALUES if name != "clamp_angle"])

@@ -5,13 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.prediction import predict_poses, predicted_shapes
 from dlo_casadi.model import CableModel
-from dlo_casadi.session.remarks import branch_warnings
-from dlo_casadi.session.stages import initial_stage
+from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler
+from dlo_casadi.session.simpler import not_worse
+from dlo_casadi.session.stages import fit_stage, initial_stage
 
 # Stiff beside its weight, EI / (w L^3) = 3: its bow is stable upwards, and lower downwards.
 MODEL = CableModel(Cable(0.5, 0.02, 0.006, 0.08), 12, n_rest=0)
@@ -86,3 +91,54 @@ def test_a_held_out_pose_without_a_prediction_is_named():
     assert stage.rmse_held_out is None
     assert "No equilibrium for 2." in stage.note
     assert stage.rmse_fit < 2 * NOISE
+
+
+def judged(poses, fit):
+    stage = fit_stage("batch", fit, poses, {})
+    shown = [
+        PoseInput(item.pose.name, "held_out" if item.held_out else "fit", item.points)
+        for item in poses
+    ]
+    return stage, doubts_of([stage], shown, fit, fit.noise.std)
+
+
+@pytest.mark.parametrize("held_out", [(), (0,)])
+def test_a_pose_predicted_on_another_equilibrium_is_in_doubt(held_out):
+    """Fitted on the branch where it was measured, it leaves nothing in the residual."""
+    poses = measured("cw", "ccw", "ccw", held_out=held_out)
+    fit = fit_model(MODEL, poses, Tolerances(), NOISE)
+    stage, (doubt,) = judged(poses, fit)
+
+    assert fit.chi2_per_dof < 1.5
+    assert f"{'held-out' if held_out else 'fit'} poses are predicted" in doubt
+    assert f": 0, at worst {1e3 * stage.shapes['0'].rmse:.3g} mm instead of 0." in doubt
+    assert "lowest equilibrium in 0 is another one than the measured one" in doubt
+    assert "`branch: cw` in these poses chooses it" in doubt
+    if not held_out:
+        told = predicted_shapes(fit.problem, fit.point.shapes, fit.p, fit.rest)
+        assert cross_validate(fit).rmse < 2 * NOISE
+        assert cross_validate(fit, shapes=told).rmse > 0.05
+
+    poses = measured("cw", "ccw", "ccw", held_out=held_out, told=True)
+    assert judged(poses, fit_model(MODEL, poses, Tolerances(), NOISE))[1] == ()
+
+
+def test_a_fit_is_no_worse_than_the_stiffness_alone():
+    """One that was stopped far off starts again from the simpler one."""
+    poses = measured("ccw", "ccw", "ccw")
+    fit = fit_model(MODEL, poses, Tolerances(), NOISE)
+    stages = [initial_stage(MODEL, poses), fit_stage("batch", fit, poses, {})]
+    assert not_worse(fit, stages) is fit
+    assert worse_than_simpler(stages) == []
+
+    problem, far = fit.problem, fit.point.theta - np.log(10) * np.eye(fit.problem.unknowns.size)[0]
+    rest = problem.unknowns.rest(far)
+    shapes, _ = problem.sweep.settled(fit.point.shapes, problem.unknowns.p(far), rest)
+    stopped = replace(fit, point=problem.evaluate(far, shapes, fit.point.feet), converged=False)
+    stage, doubts = judged(poses, stopped)
+    assert "has not converged" in doubts[0]
+    (said,) = worse_than_simpler([stages[0], stage])
+    assert said.startswith("stage initial comes nearer to the fit poses than stage batch")
+    again = not_worse(stopped, [stages[0], stage])
+    assert again.point.objective < 1.01 * fit.point.objective
+    assert again.converged
