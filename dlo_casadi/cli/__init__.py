@@ -18,6 +18,7 @@ from dlo_casadi.cli.guard import BAD_INPUT, OK, guarded
 COMMANDS = {
     "new": "write a commented configuration to start from",
     "check": "check a configuration and its photographs in seconds, without fitting",
+    "calibrate": "find the camera of a session from its own photographs of the board",
     "fit": "fit a cable to its photographs or centre-lines and report what was found",
     "fit-many": "fit many sessions, on many cores or machines, into one table",
     "diagnose": "fit, and print the search for missing effects in full",

@@ -15,6 +15,7 @@ from dlo_casadi.config import Config
 from dlo_casadi.durable import make_folder
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.report.check_table import advice_lines, check_dict, check_table
+from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import find_suspicions
 from dlo_casadi.session.measure import draw_steps, read_inputs
 from dlo_casadi.vision import write_picture
@@ -48,6 +49,7 @@ def main(argv: Sequence[str]) -> int:
 
     config = configuration(chosen.config)
     with Watch(Console(stderr=True), chosen.quiet) as watch:
+        config = calibrated(config, lambda name, k, m: watch.step(f"calibrate {name}", k, m))
         inputs = read_inputs(config, lambda name, k, m: watch.step(f"read {name}", k, m))
         pictures = [] if chosen.show is None else _show(config, chosen.show, watch)
         watch.step("compare with what is declared", 0, 1)

@@ -231,7 +231,8 @@ class Board(Section):
     marker_size: Positive
     """Side of the black square of a marker [m]."""
     standoff: NonNegative = 0.0
-    """Distance of the cable's axis in front of the board [m]; other than 0 needs a camera."""
+    """Distance of the cable's axis in front of the board [m]; other than 0 needs a camera, or
+    photographs from several directions that show it."""
     marker_centers: Annotated[
         dict[Annotated[int, Field(ge=0)], Vector],
         Field(min_length=1, max_length=max(_FAMILIES.values())),
@@ -306,7 +307,8 @@ class Images(Measurement):
     kind: Literal["images"] = "images"
     """images."""
     camera: Camera | None = None
-    """The camera; without it the board's plane is mapped by a homography."""
+    """The camera. Without it, it is found from the session's photographs where it is needed (in
+    space, or with a standoff); else the board's plane is mapped by a homography."""
     board: Board | None = None
     """The board with its markers; or give reference."""
     reference: Reference | None = None
@@ -318,12 +320,6 @@ class Images(Measurement):
             found = "neither" if self.board is None else "both"
             text = f"kind: images needs either a board or a reference, found {found}"
             raise Contradiction(Problem((), text))
-        if self.board is not None and self.camera is None and self.board.standoff != 0.0:
-            text = (
-                f"{self.board.standoff:g} m need a camera: without one only the plane of the "
-                "board itself can be measured"
-            )
-            raise Contradiction(Problem(("board", "standoff"), text))
         return self
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from dlo_casadi import vision
 from dlo_casadi.config import Camera as DeclaredCamera
-from dlo_casadi.config import Config
+from dlo_casadi.config import Config, Images
 from dlo_casadi.config import Pose as DeclaredPose
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.errors import MeasurementError
@@ -145,8 +145,7 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
     """Photographs of a cable in space; those that cannot be used are told of."""
     measurement = config.experiment.measurement
     assert measurement.kind == "images"
-    if measurement.camera is None:
-        raise MeasurementError("photographs of a cable in space need measurement.camera.matrix")
+    assert measurement.camera is not None  # found before, see `camera.calibrated`
     images, problems = {}, []
     for name, path in pose.photographs.items():
         try:
@@ -155,7 +154,7 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
             problems.append(f"{name}: {error.message}")
     views = vision.measure_views(
         images,
-        _board(config),
+        board_of(measurement),
         _camera(measurement.camera),
         start=pose.start,
         end=pose.end,
@@ -290,12 +289,11 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
         _check_reference(reference.pixels, image.shape)
         return vision.from_reference(reference, image.shape)
     camera = None if measurement.camera is None else _camera(measurement.camera)
-    return vision.locate_board(image, _board(config), camera)
+    return vision.locate_board(image, board_of(measurement), camera)
 
 
-def _board(config: Config) -> vision.Board:
-    measurement = config.experiment.measurement
-    assert measurement.kind == "images"
+def board_of(measurement: Images) -> vision.Board:
+    """The board as the camera step has it."""
     declared = measurement.board
     assert declared is not None
     return vision.Board(

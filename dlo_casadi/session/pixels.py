@@ -16,11 +16,13 @@ from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.sensors import Observed, ObservedChange, OfPoints
 from dlo_casadi.session.outcome import ViewInput
-from dlo_casadi.vision import Viewpoint, compare_pixels
+from dlo_casadi.vision import Viewpoint, compare_pixels, nearest_in_order
 
 FloatArray = NDArray[np.floating]
 
 _NEWTON_STEPS = 12
+_PER_ELEMENT = 8
+_SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,17 @@ class Pixels(OfPoints):
         return self._nearest(seen.curve, places)
 
     def nearest(self, curve: NodeCurve) -> FloatArray:
-        """Arc lengths (K,) [m] at which the pixels belong on a curve that may be far off."""
-        return self._nearest(curve, curve.nearest(self.points))
+        """Arc lengths (K,) [m] at which the pixels belong on a curve that may be far off.
+
+        In order along it, as it is seen.
+        """
+        grid = np.linspace(0.0, curve.length, _PER_ELEMENT * curve.n + 1)
+        seen = self.viewpoint.to_pixels(curve.at(grid))
+        away = np.linalg.norm(self.pixels[:, None] - seen[None], axis=2)
+        found = nearest_in_order(away / (_SURE_PX + np.median(away.min(axis=1))))
+        known = np.flatnonzero(found >= 0)
+        guess = np.interp(np.arange(len(found)), known, grid[found[known]])
+        return self._nearest(curve, guess)
 
     def _nearest(self, curve: NodeCurve, guess: FloatArray) -> FloatArray:
         """Gauss-Newton steps on the distance in the picture, within [0, L]."""

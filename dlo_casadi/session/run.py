@@ -21,6 +21,7 @@ from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model import CableModel
+from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.declared import Declared, declared_model, straight
 from dlo_casadi.session.findings import (
@@ -83,6 +84,7 @@ def run_session(
     """
     progress = progress or Silent()
     clock = Clock()
+    config = calibrated(config, lambda name, k, m: progress.step(f"calibrate {name}", k, m))
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
     try:
         with one_thread():

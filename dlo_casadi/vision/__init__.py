@@ -3,7 +3,7 @@
 from dlo_casadi.vision.board import Board, locate_board, locate_camera
 from dlo_casadi.vision.calibration import Calibration, calibrate_camera
 from dlo_casadi.vision.centerline import Centerline, extract_centerline
-from dlo_casadi.vision.correspondence import places_along
+from dlo_casadi.vision.correspondence import nearest_in_order, places_along
 from dlo_casadi.vision.image import read_image
 from dlo_casadi.vision.outline import Outline, compare_pixels, project_outline
 from dlo_casadi.vision.pictures import draw_steps, write_picture
@@ -34,6 +34,7 @@ __all__ = [
     "locate_board",
     "locate_camera",
     "measure_views",
+    "nearest_in_order",
     "places_along",
     "project_outline",
     "read_image",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_casadi.vision.sight import Sight
 from dlo_casadi.vision.view import Array
@@ -78,12 +79,22 @@ def places_along(sight: Sight, points: Array) -> Array:
     """
     seen = sight.viewpoint.to_pixels(points)
     away = np.linalg.norm(sight.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX
-    first, second = cheapest_way(np.minimum(away, _CAP) ** 2 + _STEP)
-    off = away[first, second]
-    order = np.argsort(-off, kind="stable")  # of several points the nearest is written last
-    places = np.full(len(sight.pixels), np.nan)
-    places[first[order]] = np.where(off[order] < _CAP, second[order] / (len(points) - 1), np.nan)
-    return places
+    found = nearest_in_order(np.minimum(away, _CAP))
+    off = away[np.arange(len(found)), np.maximum(found, 0)]
+    return np.where((found >= 0) & (off < _CAP), found / (len(points) - 1), np.nan)
+
+
+def nearest_in_order(away: Array) -> NDArray[np.intp]:
+    """Columns of a table of distances (K, M) that rows belong to, never going back.
+
+    Distances in standard deviations. Of several columns of a row the nearest is taken; -1 where
+    the row is left over at an end.
+    """
+    first, second = cheapest_way(away**2 + _STEP)
+    order = np.argsort(-away[first, second], kind="stable")  # the nearest is written last
+    found = np.full(len(away), -1)
+    found[first[order]] = second[order]
+    return found
 
 
 def triangulate(one: Sight, other: Sight, match: Match) -> Array:

@@ -73,8 +73,9 @@ def project_outline(
     B = np.maximum(np.linalg.norm(b[:, :2], axis=1), 1e-9)
     g = np.sum(e[:, :2] * b[:, :2], axis=1) / B
     radius, sin = 0.5 * diameter, 0.5 * diameter / d
-    squares = B**2 * (1.0 - sin**2) - (g * sin) ** 2
-    off = radius * g * sin / p[:, 2] / squares
+    # A cable seen on end shows its section, whose middle is the axis to a radius.
+    squares = np.maximum(B**2 * (1.0 - sin**2) - (g * sin) ** 2, sin**2)
+    off = np.clip(radius * g * sin / squares, -radius, radius) / p[:, 2]
     half = radius * B * np.sqrt(1.0 - sin**2) / p[:, 2] / squares
     across = b[:, :2] / B[:, None]
     # d(pixel)/d(ray) = p_z d(pixel)/d(p_xy), and a step along the ray's plane moves no depth

@@ -1,0 +1,62 @@
+"""The camera of a session from its own photographs."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dlo_casadi.cli import main
+from dlo_casadi.config import dump_yaml, load_config, read_yaml
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.session.camera import calibrated, needs_camera
+
+SESSION = Path(__file__).parents[1] / "data/space/space_photos"
+FOCAL = 1080.0  # px, as rendered
+
+
+@pytest.fixture
+def session(tmp_path):
+    """Two poses, five photographs, of which one does not exist; no camera."""
+    data = read_yaml(SESSION / "session.yaml")
+    poses = data["experiment"]["poses"][:2]
+    for pose in poses:
+        pose["files"] = [str(SESSION / name) for name in pose["files"]]
+    poses[1]["files"].append("gone.jpg")
+    data["experiment"]["poses"] = poses
+    del data["experiment"]["measurement"]["camera"]
+    (tmp_path / "photos.yaml").write_text(dump_yaml(data))
+    return tmp_path / "photos.yaml"
+
+
+def test_a_missing_camera_is_found_in_the_photographs(session, capsys):
+    """To half a percent, as the command prints it; the command's text can be pasted."""
+    config = load_config(session)
+    assert needs_camera(config)
+    found = calibrated(config, lambda *_: None)
+    assert not needs_camera(found)
+    camera = found.experiment.measurement.camera
+    assert camera.matrix[0][0] == pytest.approx(FOCAL, rel=5e-3)
+    assert "no camera is declared: focal lengths" in found.warnings[0]
+    assert main(["calibrate", str(session), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["matrix"][0] == pytest.approx(camera.matrix[0])
+    assert len(told["errors_px"]) == 5
+    assert main(["calibrate", str(session), "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+    assert main(["calibrate", str(session)]) == 0
+    assert "matrix: [[10" in capsys.readouterr().out
+
+
+def test_too_few_photographs(session):
+    config = load_config(session)
+    poses = config.experiment.poses
+    few = config.experiment.model_copy(update={"poses": (poses[1],)})
+    with pytest.raises(MeasurementError, match=r"camera is missing.* needs 3 photographs .* are 2"):
+        calibrated(replace(config, experiment=few), lambda *_: None)
+
+
+def test_a_session_without_photographs(capsys):
+    bench = Path(__file__).parents[1] / "data/bench/short_clean/session.yaml"
+    assert main(["calibrate", str(bench)]) == 2
+    assert "photographs of a board of markers, and this session has none" in capsys.readouterr().err
