@@ -248,7 +248,7 @@ class _Search:
     @property
     def error(self) -> float:
         """Cross-validated error of the declared model [m], 0 where it tells nothing."""
-        return self.validation.rmse if self.validation.complete else 0.0
+        return self.validation.error if self.validation.complete else 0.0
 
     @property
     def astray(self) -> bool:
@@ -357,7 +357,7 @@ class _Search:
         limit = UNSEEN * fit.expected_error
         if added:
             limit = max(limit, UNSEEN_LEFT * self.error)
-        unpredicted = (bool(added) or self.several) and validation.rmse > limit
+        unpredicted = (bool(added) or self.several) and validation.error > limit
         unexplained = structure.p_noise < self.significance or unpredicted
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
 
@@ -377,7 +377,7 @@ class _Search:
         explain. And all go if one force in each pose explains more than they do.
         """
         floor = found.fit.expected_error**2
-        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.rmse, self.error))
+        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, self.error))
         if after <= LEFT * before and not self._needless(found, pull):
             return found
         return self._ended(self.declared, [], found.ranked)
@@ -407,6 +407,7 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
         n_poses=len(problem.used),
         center=center,
         camera=any(item.pose.camera_center is not None for item in problem.history),
+        readings=tuple({name for item in problem.history for name in item.reactions}),
         directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
         largest_bend=float(problem.sweep.bends(shapes, fit.p, fit.rest).max()),
     )
@@ -465,7 +466,7 @@ def _improving(
         if item is None or item.bic <= 0 or not item.validation.complete:
             continue
         # An effect that explains the fitted poses but predicts the others worse is none.
-        if item.validation.rmse > validation.rmse:
+        if item.validation.error > validation.error:
             continue
         if doubt is None or validation.chance_of_gain(item.validation) < doubt:
             out.append(item)
@@ -481,7 +482,7 @@ def _choose(
     """
     if not confirmed:
         return None
-    leader = min(confirmed, key=lambda item: item.validation.rmse)
+    leader = min(confirmed, key=lambda item: item.validation.error)
     close = [
         item for item in confirmed if not item.validation.clearly_worse_than(leader.validation)
     ]

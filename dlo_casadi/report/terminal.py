@@ -17,6 +17,7 @@ from dlo_casadi.report.canvas import label_of
 from dlo_casadi.report.geometry import directions
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.session.outcome import (
+    MASS,
     BranchShape,
     Outcome,
     ParameterEstimate,
@@ -150,9 +151,10 @@ def nuisance_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
 def fixed_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     """What was declared and kept."""
     cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
+    fitted = outcome.stages[-1].parameters
     rows = [
         ("length", f"{cable.length:g} m", "", "fixed"),
-        ("mass", f"{cable.mass:g} kg", "", "fixed"),
+        *([("mass", f"{cable.mass:g} kg", "", "fixed")] if MASS not in fitted else []),
         ("gravity", vector(gravity, "g", "m/s^2"), "", "fixed"),
     ]
     unknowns = outcome.fit.problem.unknowns
@@ -176,10 +178,19 @@ def footnotes(outcome: Outcome) -> list[str]:
             "Try: poses in which weight and stiffness compete more (ends close together), or "
             "hang a known weight on the cable and declare it under model.effects."
         )
-    elif stiffness is not None:
+    elif stiffness is not None and not outcome.measurement.readings:
         known = "EI is" if twisting is None else "EI and GJ are"
+        weight = outcome.fit.mass * math.hypot(*outcome.config.experiment.gravity)
+        ratio = f" EI over weight is {stiffness.value / weight:.4g} m^2." if weight else ""
         lines.append(
             f"Shapes give the ratio of stiffness to weight: {known} as good as the declared mass."
+            f"{ratio}"
+        )
+    mass = outcome.stages[-1].parameters.get(MASS)
+    if mass is not None and mass.identifiable is False:
+        lines.append(
+            "The readings do not tell mass from EI: only their ratio is known. Try: end_force or "
+            "start_force of more poses, or a smaller force_std and force_bias."
         )
     if twisting is not None and twisting.identifiable is False:
         lines.append(
