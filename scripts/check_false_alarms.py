@@ -26,7 +26,6 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.durable import write_file
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
@@ -75,13 +74,12 @@ def simulate(config, generator):
     std, share = generator.uniform(1e-4, 4e-4), generator.uniform(0.0, 0.6)
     noise = NoiseModel(std, share, generator.uniform(0.02, 0.04), "gaussian")
     measured = []
-    for pose, z, own in zip(
+    for pose, seen, own in zip(
         config.experiment.poses, sweep.seen(shapes, p, rest), poses, strict=True
     ):
-        curve = NodeCurve.of(cable.length, z)
         s = np.sort(generator.uniform(0.01, 0.99, 200)) * cable.length
         factor = np.linalg.cholesky(noise.covariance(s, np.ones(len(s))))
-        points = curve.at(s) + factor @ generator.standard_normal((len(s), 2))
+        points = seen.curve.at(s) + factor @ generator.standard_normal((len(s), 2))
         measured.append(MeasuredPose.of_points(own, points, held_out=pose.role == "held_out"))
     return measured
 

@@ -14,8 +14,13 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
-from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
-from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.estimation.hyperparameters import (
+    SCATTER_FLOOR,
+    SMOOTH_MODES,
+    first_reading_noise,
+    refine,
+)
+from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import RestScatter
@@ -99,6 +104,7 @@ def fit_model(
     start: Fit | None = None,
     decades: Sequence[float] = DECADES,
     max_iterations: int = 40,
+    readings: ReadingNoise | None = None,
 ) -> Fit:
     """Fit a model to all readable fit poses.
 
@@ -122,6 +128,8 @@ def fit_model(
         Stiffnesses to start from, powers of ten about the prior.
     max_iterations : int
         Of a fit that continues from `start`.
+    readings : ReadingNoise, optional
+        Noise of forces and moments on the fixtures; estimated by default.
 
     Raises
     ------
@@ -148,6 +156,7 @@ def fit_model(
     if std is not None:
         declared = NoiseModel(std, source="declared")
         noise = with_repeats(declared, measured, model.cable.length)
+    noise = replace(noise, readings=readings or first_reading_noise(model))
     scatter = tolerances.deviation(model.node)
     count = sum(item.readable and not item.held_out for item in measured)
     if count == 1:
@@ -156,7 +165,7 @@ def fit_model(
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta, decades)
-    if different_poses(measured) >= DIFFERENT and fit.beyond_noise:
+    if different_poses(measured, model.cable.length) >= DIFFERENT and fit.beyond_noise:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every hanging had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
@@ -195,8 +204,8 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
     shapes that are held to a fraction of a millimetre allow no way to the minimum.
     """
     model = problem.unknowns.model
-    sure = NoiseModel(SEARCH_STD * model.cable.length)
-    if model.in_space and sure.std > problem.noise.std:
+    sure = problem.noise.doubted(SEARCH_STD * model.cable.length)
+    if model.in_space and sure is not problem.noise:
         doubtful = problem.changed(
             sure, problem.roughness_std, problem.scatter, problem.rest_scatter
         )
@@ -325,7 +334,15 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
         # The coarse mesh was too far off to be followed: start again from the measured shapes.
         names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]
         std = fit.noise.std if fit.noise.source == "declared" else None
-        return fit_model(model, problem.history, problem.tolerances, std, free=names, values=fit.p)
+        return fit_model(
+            model,
+            problem.history,
+            problem.tolerances,
+            std,
+            free=names,
+            values=fit.p,
+            readings=fit.noise.readings,
+        )
     problem, point, converged = refine(
         moved.problem, moved.point, estimate=not fit.noise.known, rounds=2, modes=modes
     )

@@ -39,8 +39,21 @@ def correlation(kernel: Kernel, ratio: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
+class ReadingNoise:
+    """Standard deviations of one component of a force [N] and of a moment [N m] that were read.
+
+    `force_known`, `moment_known`: whether they were declared; else they are estimated.
+    """
+
+    force: float
+    moment: float
+    force_known: bool = False
+    moment_known: bool = False
+
+
+@dataclass(frozen=True)
 class NoiseModel:
-    """Covariance of one component of the errors of one pose's points.
+    """Covariance of one component of the errors of one pose's points, and of readings.
 
     Parameters
     ----------
@@ -56,6 +69,8 @@ class NoiseModel:
         estimated from the residual.
     slow_dof : float
         Degrees of freedom of chi-square with which the variance of slow modes is known.
+    readings : ReadingNoise, optional
+        Of forces and moments on the fixtures, where there are any.
     """
 
     std: float
@@ -64,6 +79,7 @@ class NoiseModel:
     kernel: Kernel = "matern"
     source: Source = "estimated"
     slow_dof: float = np.inf
+    readings: ReadingNoise = ReadingNoise(1.0, 1.0)
 
     @property
     def known(self) -> bool:
@@ -77,6 +93,22 @@ class NoiseModel:
             distance = np.abs(s[:, None] - s[None])
             unit += self.share * correlation(self.kernel, distance / self.length)
         return self.std**2 * unit * np.outer(weight, weight)
+
+    def units(self, kinds: NDArray[np.str_]) -> FloatArray:
+        """What a unit of each residual counts as [m] (R,): one of its stds as one of a point's.
+
+        One of points, m/N of forces, 1/N of moments.
+        """
+        own = {"point": self.std, "force": self.readings.force, "moment": self.readings.moment}
+        return self.std / np.array([own[kind] for kind in kinds])
+
+    def doubted(self, std: float) -> NoiseModel:
+        """White noise of that size [m] where it is larger, that of readings grown with it."""
+        factor, own = std / self.std, self.readings
+        if factor <= 1:
+            return self
+        grown = replace(own, force=factor * own.force, moment=factor * own.moment)
+        return NoiseModel(std, readings=grown)
 
     def whitening(self, s: FloatArray, weight: FloatArray) -> FloatArray:
         """Matrix W (K, K) with W cov W^T = 1."""

@@ -334,7 +334,7 @@ def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
 def draw_moment(path: Path, outcome: Outcome) -> None:
     """Bending moment against curvature of a cable with a free end, measured and fitted."""
     cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
-    weight = cable.mass / cable.length * float(np.linalg.norm(gravity))
+    weight = outcome.fit.mass / cable.length * float(np.linalg.norm(gravity))
     shown = [p for p in outcome.poses if p.role == "fit" and len(p.points) >= LEAST_POINTS]
     if not weight or not shown or cable.rest_shape != "straight":
         return  # the moment needs the weight, and the bend the shape without load

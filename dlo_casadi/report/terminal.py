@@ -17,6 +17,7 @@ from dlo_casadi.report.canvas import label_of
 from dlo_casadi.report.geometry import directions
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.session.outcome import (
+    MASS,
     BranchShape,
     Outcome,
     ParameterEstimate,
@@ -150,9 +151,10 @@ def nuisance_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
 def fixed_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     """What was declared and kept."""
     cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
+    fitted = outcome.stages[-1].parameters
     rows = [
         ("length", f"{cable.length:g} m", "", "fixed"),
-        ("mass", f"{cable.mass:g} kg", "", "fixed"),
+        *([("mass", f"{cable.mass:g} kg", "", "fixed")] if MASS not in fitted else []),
         ("gravity", vector(gravity, "g", "m/s^2"), "", "fixed"),
     ]
     unknowns = outcome.fit.problem.unknowns
@@ -176,10 +178,19 @@ def footnotes(outcome: Outcome) -> list[str]:
             "Try: poses in which weight and stiffness compete more (ends close together), or "
             "hang a known weight on the cable and declare it under model.effects."
         )
-    elif stiffness is not None:
+    elif stiffness is not None and not outcome.measurement.readings:
         known = "EI is" if twisting is None else "EI and GJ are"
+        weight = outcome.fit.mass * math.hypot(*outcome.config.experiment.gravity)
+        ratio = f" EI over weight is {stiffness.value / weight:.4g} m^2." if weight else ""
         lines.append(
             f"Shapes give the ratio of stiffness to weight: {known} as good as the declared mass."
+            f"{ratio}"
+        )
+    mass = outcome.stages[-1].parameters.get(MASS)
+    if mass is not None and mass.identifiable is False:
+        lines.append(
+            "The readings do not tell mass from EI: only their ratio is known. Try: end_force or "
+            "start_force of more poses, or a smaller force_std and force_bias."
         )
     if twisting is not None and twisting.identifiable is False:
         lines.append(
@@ -296,6 +307,12 @@ def verdict_lines(outcome: Outcome) -> list[str]:
             f"  Without naming a cause: pulled by {vector(force, '.3g', 'N')} on average "
             f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
+        experiment = outcome.config.experiment
+        if experiment.boundary.end == "free" and np.dot(force, experiment.gravity) < 0:
+            lines.append(
+                "  Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or "
+                "another stiffness may stand behind it."
+            )
     if outcome.next_pose is not None:
         lines.append(
             f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "

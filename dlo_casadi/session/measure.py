@@ -89,13 +89,14 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
 def _measured(pose: DeclaredPose, item: PoseInput, std: float) -> MeasuredPose:
     """A pose with its sensors; pixels have the standard deviation `std` [m] at weight one."""
     held = replace(conditions(pose), camera_center=item.camera_center)
-    if not item.views:
-        return MeasuredPose.of_points(
-            held, item.points, item.weight, pose.role == "held_out", item.s
-        )
-    found = [pixels_of(view, std) for view in item.views]
-    sensors = tuple(sensor for sensor in found if sensor is not None)
-    return MeasuredPose(held, sensors, pose.role == "held_out", item.points)
+    held_out = pose.role == "held_out"
+    if item.views:
+        found = [pixels_of(view, std) for view in item.views]
+        sensors = tuple(sensor for sensor in found if sensor is not None)
+        seen = MeasuredPose(held, sensors, held_out, item.points)
+    else:
+        seen = MeasuredPose.of_points(held, item.points, item.weight, held_out, item.s)
+    return seen.with_readings(pose.readings)
 
 
 def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:

@@ -14,7 +14,7 @@ from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.chords import chord_places
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.sensors import Observed, ObservedChange
+from dlo_casadi.estimation.sensors import Observed, ObservedChange, OfPoints
 from dlo_casadi.session.outcome import ViewInput
 from dlo_casadi.vision import Viewpoint, compare_pixels, nearest_in_order
 
@@ -27,7 +27,7 @@ _SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
 
 
 @dataclass(frozen=True)
-class Pixels:
+class Pixels(OfPoints):
     """Pixels of one photograph, compared with the middle of the outline that a curve would have.
 
         d_k = c n_k . (u_k - m(r(s_k)))                                      [m]

@@ -26,7 +26,7 @@ from dlo_casadi.estimation.hyperparameters import settle
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.profile import stiffness_interval
+from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -163,7 +163,7 @@ def run_one(index: int, seed: int) -> dict[str, Any]:
         measured = simulate(truth, rng)
     # The guess is within a factor of five: one start is enough.
     fit = settle(fit_model(model_on(MESH), measured, TOLERANCES, decades=(0,)))
-    interval = stiffness_interval(fit)
+    interval = profile_interval(fit)
     rest = rest_curvature_of(fit)
     gap = rest.value - fit.model.rest.basis(places()) @ truth.coefficients
     bound_log, bound_rest = bound(fit, truth)
