@@ -15,7 +15,8 @@ from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.causes import refit_from
 from dlo_casadi.diagnosis.confirm import Confirmed, confirm
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.equivalents import untried_equivalents
+from dlo_casadi.diagnosis.equivalents import equivalents
+from dlo_casadi.diagnosis.hidden_weight import HiddenWeight, hidden_weight
 from dlo_casadi.diagnosis.next_pose import NextPose, next_pose
 from dlo_casadi.diagnosis.pull import Pull, estimate_pull
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
@@ -64,8 +65,8 @@ class AddedEffect:
         Without and with the effect.
     rivals : tuple of Confirmed
         Candidates that could not be told apart from it.
-    untried : tuple of str
-        Effects that act as it does and were not among the candidates.
+    equivalents : tuple of str
+        What it may stand for, see `equivalents`.
     """
 
     candidate: Candidate
@@ -73,7 +74,7 @@ class AddedEffect:
     before: CrossValidation
     after: CrossValidation
     rivals: tuple[Confirmed, ...]
-    untried: tuple[str, ...] = ()
+    equivalents: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,8 @@ class Diagnosis:
         What separates an effect from its best rival.
     proposal_for : tuple of str
         Names of those two; empty where there is no rival.
+    weight : HiddenWeight or None
+        That the fit would not notice.
     """
 
     before: Fit
@@ -121,6 +124,7 @@ class Diagnosis:
     pull: Pull | None = None
     proposal: NextPose | None = None
     proposal_for: tuple[str, ...] = field(default_factory=tuple)
+    weight: HiddenWeight | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -176,7 +180,12 @@ def diagnose(
             pull = estimate_pull(found.fit, search.executor)
     tried = {row.name for row in found.ranked}
     added = tuple(
-        replace(item, untried=untried_equivalents(found.fit, item.candidate, tried))
+        replace(
+            item,
+            equivalents=equivalents(
+                found.fit, item.candidate, tried, [rival.candidate for rival in item.rivals]
+            ),
+        )
         for item in found.added
     )
     proposal, names = _proposal(found.fit, added)
@@ -193,6 +202,7 @@ def diagnose(
         pull=pull if found.unexplained else None,
         proposal=proposal,
         proposal_for=names,
+        weight=None if found.unexplained else hidden_weight(found.fit, exclude),
     )
 
 
@@ -253,10 +263,9 @@ class _Search:
     @property
     def doubt(self) -> float | None:
         """What a gain has to be held against where a pose or two were taken again and again."""
-        count = different_poses(self.declared.problem.history)
-        return (
-            self.significance if count < min(DIFFERENT, len(self.declared.problem.used)) else None
-        )
+        problem = self.declared.problem
+        count = different_poses(problem.history, problem.unknowns.model.cable.length)
+        return self.significance if count < min(DIFFERENT, len(problem.used)) else None
 
     @cached_property
     def first(self) -> list[Screened]:

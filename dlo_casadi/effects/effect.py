@@ -268,6 +268,8 @@ class Load(Effect):
     """Slot `load`: forces with a potential. Loads add; all share one gravity."""
 
     slot: ClassVar[str] = "load"
+    # Whether it is a weight that the cable carries beside its own.
+    carried: ClassVar[bool] = False
     # Number of `springs`; without any the forces stay the same whatever the shape.
     n_springs: ClassVar[int] = 0
 

@@ -165,7 +165,7 @@ def fit_model(
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta, decades)
-    if different_poses(measured) >= DIFFERENT and fit.beyond_noise:
+    if different_poses(measured, model.cable.length) >= DIFFERENT and fit.beyond_noise:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every hanging had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)

@@ -201,7 +201,7 @@ def rest_scatter_of(
     problem: BatchProblem, point: Point, lin: Linearization, noise: NoiseModel
 ) -> ScatterEstimate:
     """Rest curvature of each hanging's own; see `estimate_rest_scatter`."""
-    if different_poses(problem.history) < DIFFERENT:
+    if different_poses(problem.history, problem.unknowns.model.cable.length) < DIFFERENT:
         return ScatterEstimate(RestScatter(), 1.0, 1.0)
     size, std = problem.unknowns.size, problem.deviation_std
     moved = problem.moved_by_rest(point.theta, point.shapes, point.feet)

@@ -69,6 +69,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "unexplained": outcome.unexplained,
         "next_pose": outcome.next_pose,
         "structure": outcome.structure,
+        "hidden_weight": outcome.hidden_weight,
     }
     plain: dict[str, Any] = finite(document)
     return plain

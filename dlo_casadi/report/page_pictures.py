@@ -184,8 +184,8 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
         lines.append(
             Line(
                 kind,
-                _svg(drawn[-1], 1),
-                _svg(behind.points(near), 2),
+                svg(drawn[-1], 1),
+                svg(behind.points(near), 2),
                 _solid(behind.room, shape.curve, 1),
                 _solid(behind.room, near, 2),
             )
@@ -226,7 +226,7 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
 
 def _measured(pose: PoseInput, behind: Background) -> Line:
     solid = _solid(behind.room, pose.points, 2)
-    return Line("measured", _svg(behind.points(pose.points), 2), solid=solid)
+    return Line("measured", svg(behind.points(pose.points), 2), solid=solid)
 
 
 def _around(
@@ -240,7 +240,7 @@ def _around(
 
 
 def _drawn(mark: Mark) -> Solid:
-    return Solid(mark.kind, _svg(flat(mark.points), 1), _text(mark.points, 1), mark.label)
+    return Solid(mark.kind, svg(flat(mark.points), 1), _text(mark.points, 1), mark.label)
 
 
 def _solid(room: Room | None, points: FloatArray, decimals: int) -> str:
@@ -279,7 +279,7 @@ def _alt(outcome: Outcome, pose: PoseInput, behind: Background) -> str:
     )
 
 
-def _svg(points: FloatArray, decimals: int) -> str:
+def svg(points: FloatArray, decimals: int) -> str:
     """Points as SVG has them; nothing where the camera cannot see a point of it."""
     if not np.isfinite(points).all():
         return ""

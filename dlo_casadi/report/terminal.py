@@ -307,6 +307,12 @@ def verdict_lines(outcome: Outcome) -> list[str]:
             f"  Without naming a cause: pulled by {vector(force, '.3g', 'N')} on average "
             f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
+        experiment = outcome.config.experiment
+        if experiment.boundary.end == "free" and np.dot(force, experiment.gravity) < 0:
+            lines.append(
+                "  Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or "
+                "another stiffness may stand behind it."
+            )
     if outcome.next_pose is not None:
         lines.append(
             f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "

@@ -346,7 +346,7 @@ class Repeatability:
     def of(cls, fit: Fit) -> Self:
         """What a fit has found."""
         rest = fit.problem.rest_scatter.std
-        if different_poses(fit.problem.history) >= DIFFERENT:
+        if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
             return cls(rest, float(np.sqrt(2) * fit.hanging_error), "poses")
         spread = repeatability(fit.problem.history, fit.model.cable.length)
         return cls(rest, spread or 0.0, None if spread is None else "repeats")
@@ -378,6 +378,8 @@ class Outcome:
         Tests of the residual "before" and "after", see `diagnosis.structure.Structure`.
     fit : Fit
         The last stage's fit, from which parameters.yaml is written.
+    hidden_weight : dict or None
+        A weight that the shapes do not tell from stiffness, see `HiddenWeight`.
     diagnosis : object or None
         The diagnosis's own result, for figures.
     """
@@ -398,6 +400,7 @@ class Outcome:
     unexplained: dict[str, Any] | None = None
     next_pose: dict[str, Any] | None = None
     structure: dict[str, dict[str, Any]] | None = None
+    hidden_weight: dict[str, Any] | None = None
     diagnosis: Any = None
     versions: dict[str, str] = field(default_factory=dict)
 

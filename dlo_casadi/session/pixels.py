@@ -21,6 +21,7 @@ from dlo_casadi.vision import Viewpoint, compare_pixels, nearest_in_order
 FloatArray = NDArray[np.floating]
 
 _NEWTON_STEPS = 12
+_SETTLED = 1e-6  # of the length: a residual feels the square of what a place is off
 _PER_ELEMENT = 8
 _SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
 
@@ -98,7 +99,7 @@ class Pixels(OfPoints):
             ahead = np.sum((self.pixels - seen) * along, axis=1)
             step = ahead / np.maximum(np.sum(along**2, axis=1), 1e-12)
             new = np.clip(s + np.clip(step, -limit, limit), 0.0, curve.length)
-            done = np.abs(new - s).max() < 1e-8 * curve.length
+            done = np.abs(new - s).max() < _SETTLED * curve.length
             s = new
             if done:
                 break

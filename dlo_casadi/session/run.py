@@ -27,6 +27,7 @@ from dlo_casadi.session.declared import Declared, declared_model, straight
 from dlo_casadi.session.findings import (
     candidate_rows,
     effect_rows,
+    hidden_weight_row,
     next_pose_row,
     structure_rows,
     unexplained_row,
@@ -56,6 +57,7 @@ from dlo_casadi.session.remarks import (
     fit_warnings,
     held_out_missing,
     reading_warnings,
+    weight_warning,
     worse_than_simpler,
 )
 from dlo_casadi.session.simpler import not_worse
@@ -151,6 +153,8 @@ def judged(outcome: Outcome) -> Outcome:
     fit, stages = outcome.fit, outcome.stages
     doubts = doubts_of(stages, outcome.poses, fit, outcome.measurement.std)
     said = [*fit_warnings(fit, outcome.discretization.error), *worse_than_simpler(stages)]
+    if outcome.hidden_weight is not None:
+        said.append(weight_warning(outcome.hidden_weight, fit.expected_error))
     return replace(
         outcome,
         verdict="unexplained" if outcome.verdict and doubts else outcome.verdict,
@@ -224,6 +228,7 @@ def close_the_loop(
         unexplained=unexplained_row(diagnosis),
         next_pose=next_pose_row(diagnosis),
         structure=structure_rows(diagnosis),
+        hidden_weight=hidden_weight_row(diagnosis),
         diagnosis=diagnosis,
     )
     return judged(closed)

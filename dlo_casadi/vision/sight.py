@@ -124,7 +124,7 @@ def see_cable(
         )
     distance = float(fixtures[:, 2].mean())
     view = viewpoint.facing(distance)
-    flat = fixtures[:, :2] / fixtures[:, 2:] * distance * [1.0, -1.0]
+    flat = viewpoint.flattened(declared, distance)
     last = None if end is None else flat[1]
     line = measure_line(
         image,
@@ -263,8 +263,7 @@ def see_beside(
     viewpoint, distance = sight.viewpoint, sight.distance
     view = viewpoint.facing(distance)
     pixel = 1.0 / view.scale
-    at = viewpoint.in_camera(curve)
-    flat = at[:, :2] / at[:, 2:] * distance * [1.0, -1.0]
+    at, flat = viewpoint.in_camera(curve), viewpoint.flattened(curve, distance)
     t = chord_length(flat)
     beside = other_stretches(flat, t, sight.width * pixel)
     hidden = np.isfinite(beside)

@@ -31,6 +31,7 @@ KEYS = {
     "unexplained": type(None),
     "next_pose": type(None),
     "structure": type(None),
+    "hidden_weight": type(None),
 }
 
 
