@@ -51,7 +51,7 @@ STD, FORCE_STD, MOMENT_STD = 3e-4, 0.015, 1e-3  # m, N, N m
 TABLES = ("clean", "mass", "loads", "clamps")
 NUMBERS = (0, 3, 12)  # of poses with readings
 MASS, POSITION = 0.03, 0.3  # kg, m: of the lumped mass
-STIFFNESS, HEADING = 300.0, 0.35  # N m/rad, rad: of the spring at the start
+STIFFNESS, HEADING = 600.0, 0.35  # N m/rad, rad: of the spring at the start
 APART = 10.0  # of chi-square: as BIC_APART of the diagnosis
 
 
