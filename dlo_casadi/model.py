@@ -725,7 +725,8 @@ class CableModel:
     @cached_property
     def compliances(self) -> ca.Function:
         """(p) -> compliances of the conditions `compliant`."""
-        return ca.Function("compliances", [self._p], [ca.vertcat(*self._compliances.values())])
+        found = ca.vertcat(ca.SX.zeros(0), *self._compliances.values())
+        return ca.Function("compliances", [self._p], [found])
 
     @property
     def compliant(self) -> list[int]:

@@ -422,6 +422,12 @@ class Pose(Section):
         found = _TOLD_APART.fullmatch(first) if self.files else None
         return found[1] if found else first
 
+    @property
+    def readings(self) -> dict[str, tuple[float, ...]]:
+        """Forces and moments on the fixtures that were measured, by their keys."""
+        found = {name: getattr(self, name) for name in REACTIONS}
+        return {name: value for name, value in found.items() if value is not None}
+
     @field_validator("file", mode="before")
     @classmethod
     def _absolute(cls, value: object, info: ValidationInfo) -> object:

@@ -21,6 +21,7 @@ from dlo_casadi.session.outcome import (
     BranchShape,
     Outcome,
     ParameterEstimate,
+    ReadingErrors,
     Stage,
     StageName,
 )
@@ -248,10 +249,23 @@ def error_table(outcome: Outcome) -> Table:
                 "held out": _mm(stage.rmse_held_out_measured_branch),
             }
             table.add_row(f"  {ON_BRANCH}", *(cells.get(column, "") for column in columns))
+    last = outcome.stages[-1]
+    if outcome.measurement.readings:
+        cells = {
+            "fit": _newtons(last.readings_fit),
+            "held out": _newtons(last.readings_held_out),
+        }
+        table.add_row("  forces, moments", *(cells.get(column, "") for column in columns))
     table.add_section()
     floor = [_mm(outcome.measurement.std)] + [""] * (len(columns) - 1)
     table.add_row(f"noise ({outcome.measurement.std_source})", *floor)
     return table
+
+
+def _newtons(errors: ReadingErrors) -> str:
+    """Errors of forces and moments, as far as there are any."""
+    found = ((errors.force, "N"), (errors.moment, "N m"))
+    return ", ".join(f"{value:.2g} {unit}" for value, unit in found if value is not None) or "-"
 
 
 # The errors of a stage, of which some poses were measured in another equilibrium.

@@ -312,6 +312,12 @@ class MeasurementSummary:
     moment_std: float | None = None
     held_out_missing: tuple[str, ...] = ()
 
+    def std_of(self, kind: str) -> tuple[float, str]:
+        """Standard deviation of one component of a reading, force or moment, and its unit."""
+        std = self.force_std if kind == "force" else self.moment_std
+        assert std is not None
+        return std, "N" if kind == "force" else "N m"
+
 
 @dataclass(frozen=True)
 class HeldOut:
