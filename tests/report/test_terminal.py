@@ -7,7 +7,8 @@ from rich.console import Console
 from test_figures import EFFECT, LOAD
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
-from dlo_casadi.report.page_data import stage_rows
+from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.report.page_data import page_data, stage_rows
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.terminal import (
     describe,
@@ -154,6 +155,19 @@ def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):
 
     assert "Verdict: unexplained. The residual is not noise." in text
     assert "pulled by (0, 1) N on average at 0.300 m (0.280 to 0.320 m) from the start" in text
+
+
+def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
+    doubt = "fit poses are predicted 50 mm off, 0.6 mm are what noise lets expect"
+    found = replace(outcome, verdict="unexplained", doubts=(doubt,))
+    assert f"Verdict: unexplained. F{doubt[1:]}." in said(found)
+    assert report_dict(found)["warnings"][0] == doubt
+    assert page_data(found)["sentence"] == f"F{doubt[1:]}."
+    assert page_data(found)["verdict_word"] == "Unexplained"
+
+    stopped = replace(found, fit=replace(outcome.fit, converged=False))
+    assert "Verdict: the fit has failed. Fit poses" in said(stopped)
+    assert page_data(stopped)["verdict_word"] == "Fit failed"
 
 
 def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcome):
