@@ -384,9 +384,8 @@ def reading_text(proposal: dict[str, Any]) -> str:
     )
     if proposal["times"] is None or proposal["times"] > MOST_REPEATS:
         return text + "it would not tell them apart."
-    return text + (
-        "one suffices." if proposal["times"] == 1 else f"read {proposal['times']} times."
-    )
+    times = proposal["times"]
+    return text + ("one suffices." if times == 1 else f"read it {times} times.")
 
 
 # What the residual may depend on, by the key of its normal score.
