@@ -415,13 +415,12 @@ class Pose(Section):
     def name(self) -> str:
         """Name of the pose: its file without folder and ending.
 
-        Of several files it is what their names have in common, where letters follow that tell
-        them apart (pose_01 of pose_01_a.jpg and pose_01_b.jpg), else the first one's.
+        Of photographs in `files` the first one's, without the letters after a number that tell
+        them apart: pose_01 of pose_01_a.jpg and pose_01_b.jpg.
         """
-        stems = list(self.photographs)
-        common = {found[1] for stem in stems if (found := _TOLD_APART.fullmatch(stem))}
-        every = all(_TOLD_APART.fullmatch(stem) for stem in stems)
-        return common.pop() if self.files and every and len(common) == 1 else stems[0]
+        first = next(iter(self.photographs))
+        found = _TOLD_APART.fullmatch(first) if self.files else None
+        return found[1] if found else first
 
     @property
     def readings(self) -> dict[str, tuple[float, ...]]:

@@ -37,8 +37,9 @@ class Sight:
     std : (K,) [px]
         Standard deviation of each across the line.
     whole : (K,) bool
-        Both edges are seen; where not, another stretch of the cable lies beside or behind, and
-        the pixel is only somewhere in their common outline.
+        Both edges are seen; where not, another stretch of the cable lies beside or behind. Until
+        `see_beside` has told them apart the pixel is only somewhere in their common outline, and
+        then up to a pixel off: a fit does without.
     width : scalar [px]
         Distance of the two edges, the median along the line.
     width_std : scalar [px]
@@ -302,7 +303,7 @@ def see_beside(
         sight,
         pixels=np.vstack(pixels)[order],
         std=np.concatenate(std)[order],
-        whole=np.ones(len(order), bool),
+        whole=np.concatenate([np.full(len(part), k == 0) for k, part in enumerate(pixels)])[order],
     )
     return again, np.concatenate(places)[order]
 
