@@ -89,6 +89,8 @@ def next_pose_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
         "expected_difference_m": diagnosis.proposal.difference,
         # In standard deviations of one measured line.
         "expected_difference_std": diagnosis.proposal.separation,
+        # Of a sensor of forces and moments: in N or N m, and in standard deviations of one reading.
+        "reading": asdict(diagnosis.proposal.reading),
     }
 
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, DloError
 from dlo_casadi.assembly import DEVIATIONS, Shapes
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Tolerances
 from dlo_casadi.estimation.hyperparameters import settle
@@ -119,10 +118,10 @@ def simulate(truth: Truth, rng: np.random.Generator) -> list[MeasuredPose] | Non
     if not converged.all():
         return None
     measured = []
-    for pose, z in zip(published.poses(), sweep.seen(moved, truth.p, rest), strict=True):
+    for pose, seen in zip(published.poses(), sweep.seen(moved, truth.p, rest), strict=True):
         s = np.sort(rng.uniform(0.01, 0.99, POINTS)) * published.LENGTH
         factor = np.linalg.cholesky(truth.noise.covariance(s, np.ones(POINTS)))
-        points = NodeCurve.of(published.LENGTH, z).at(s) + factor @ rng.standard_normal((POINTS, 2))
+        points = seen.curve.at(s) + factor @ rng.standard_normal((POINTS, 2))
         measured.append(MeasuredPose.of_points(pose, points))
     return measured
 

@@ -86,6 +86,7 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
         "separates": ["lumped_mass", "point_force"],
         "expected_difference_m": 2.5e-3,
         "expected_difference_std": 8.2,
+        "reading": {"name": "end_force", "difference": 0.3, "separation": 4.0, "times": 2},
     }
     text = said(
         replace(
@@ -99,6 +100,8 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
     )
 
     assert "the declared model lacked lumped_mass; with it the residual is noise" in text
+    assert "A reading of end_force there differs by 0.3 N" in text
+    assert "4 standard deviations of one: read it 2 times." in text
     assert "lumped_mass: mass 0.0500 ± 0.0020 kg (p = 1e-09)" in text
     assert "These data cannot tell it from point_force." in text
     assert (
