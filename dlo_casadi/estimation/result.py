@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Normal, Point
+from dlo_casadi.estimation.gauss_newton import (
+    NO_INFORMATION,
+    BatchProblem,
+    Linearization,
+    Normal,
+    Point,
+)
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.model import CableModel
 
@@ -175,6 +181,22 @@ class Fit:
     @property
     def _on_points(self) -> list[NDArray[np.bool_]]:
         return [self.problem.measured[j].on_points for j in self.problem.used]
+
+    @property
+    def failed(self) -> bool:
+        """Whether it stopped so far from a minimum that its numbers may be off.
+
+        A Gauss-Newton step within the bounds would still lower the objective by more than one
+        standard deviation of one parameter does: 1/2, where the residual is noise.
+        """
+        if self.converged:
+            return False
+        lower, upper = self.problem.unknowns.bounds
+        inside = (self.point.theta > lower) & (self.point.theta < upper)
+        slope = self.normal.gradient[inside]
+        hessian = self.normal.hessian[np.ix_(inside, inside)]
+        step = np.linalg.solve(hessian + NO_INFORMATION * np.eye(len(slope)), slope)
+        return bool(slope @ step > self.inflation**2)
 
     @property
     def _n_points(self) -> int:

@@ -94,7 +94,7 @@ def sentence(line: str) -> str:
 
 def verdict_word(outcome: Outcome) -> str:
     """The verdict in one or two words."""
-    if not outcome.fit.converged:
+    if outcome.fit.failed:
         return "Fit failed"
     if outcome.verdict is None:
         return "Not diagnosed"

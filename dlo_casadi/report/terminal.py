@@ -323,7 +323,7 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     """What the diagnosis has led to, in sentences."""
     if outcome.doubts:
         head, *others = (f"{text[:1].upper()}{text[1:]}." for text in outcome.doubts)
-        word = "unexplained" if outcome.fit.converged else "the fit has failed"
+        word = "the fit has failed" if outcome.fit.failed else "unexplained"
         lines = [f"Verdict: {word}. {head}", *(f"  {text}" for text in others)]
     elif outcome.verdict is not None:
         lines = [_verdict(outcome)]

@@ -21,7 +21,7 @@ from dlo_casadi.vision import Viewpoint, compare_pixels, nearest_in_order
 FloatArray = NDArray[np.floating]
 
 _NEWTON_STEPS = 12
-_SETTLED = 1e-6  # of the length: a residual feels the square of what a place is off
+_SETTLED = 1e-5  # of the length: a residual feels half the bend times the square of that
 _PER_ELEMENT = 8
 _SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
 

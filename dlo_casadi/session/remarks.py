@@ -153,7 +153,7 @@ def doubts_of(
     noise : float [m]
     """
     lines, stage = [], stages[-1]
-    if not fit.converged:
+    if fit.failed:
         lines.append(
             f"the fit of stage {stage.name} has not converged: its numbers are where it stopped, "
             "not a minimum. Try: a bending_stiffness nearer to the truth, more poses, or "
@@ -227,6 +227,8 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"however good the model (the noise is {1e3 * fit.noise.std:.2g} mm); ends measured "
             "pose by pose would help"
         )
+    if not fit.converged and not fit.failed:
+        lines.append("the fit crept to its minimum: it stopped within a standard deviation of it")
     unstable = [
         item.pose.name
         for item, ok in zip(fit.problem.measured, fit.stable, strict=True)

@@ -37,9 +37,8 @@ class Sight:
     std : (K,) [px]
         Standard deviation of each across the line.
     whole : (K,) bool
-        Both edges are seen; where not, another stretch of the cable lies beside or behind. Until
-        `see_beside` has told them apart the pixel is only somewhere in their common outline, and
-        then up to a pixel off: a fit does without.
+        Both edges are seen; where not, another stretch of the cable lies beside or behind, and
+        the pixel is only somewhere in their common outline.
     width : scalar [px]
         Distance of the two edges, the median along the line.
     width_std : scalar [px]
@@ -295,15 +294,20 @@ def see_beside(
         )
         good = profiles.inside & (np.abs(apart - np.abs(beside[run])) < 0.5 * usual)
         good &= np.diff(np.floor(t[run] / spacing), prepend=-1.0) > 0
+        if not good.any():
+            continue
         pixels.append(view.to_pixels(points[good]).reshape(-1, 2))
-        std.append(np.full(int(good.sum()), np.hypot(np.median(sight.std), 0.5 * sight.width_std)))
+        # Both the outline and the rest of the line tell how far apart the two lie.
+        doubt = 0.5 * float(np.sqrt(np.mean((apart - np.abs(beside[run]))[good] ** 2))) / pixel
+        told = np.sqrt(np.median(sight.std) ** 2 + (0.5 * sight.width_std) ** 2 + doubt**2)
+        std.append(np.full(int(good.sum()), told))
         places.append(params[run][good])
     order = np.argsort(np.concatenate(places), kind="stable")
     again = replace(
         sight,
         pixels=np.vstack(pixels)[order],
         std=np.concatenate(std)[order],
-        whole=np.concatenate([np.full(len(part), k == 0) for k, part in enumerate(pixels)])[order],
+        whole=np.ones(len(order), bool),
     )
     return again, np.concatenate(places)[order]
 

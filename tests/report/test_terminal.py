@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console
 from test_figures import EFFECT, LOAD
@@ -165,7 +166,13 @@ def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
     assert page_data(found)["sentence"] == f"F{doubt[1:]}."
     assert page_data(found)["verdict_word"] == "Unexplained"
 
-    stopped = replace(found, fit=replace(outcome.fit, converged=False))
+    fit, problem = outcome.fit, outcome.fit.problem
+    assert not replace(fit, converged=False).failed  # it is at its minimum
+    off = fit.point.theta + 0.5 * np.eye(problem.unknowns.size)[0]  # ln EI
+    p, rest = problem.unknowns.p(off), problem.unknowns.rest(off)
+    shapes, _ = problem.sweep.settled(fit.point.shapes, p, rest)
+    point = problem.evaluate(off, shapes, fit.point.feet)
+    stopped = replace(found, fit=replace(fit, point=point, converged=False))
     assert "Verdict: the fit has failed. Fit poses" in said(stopped)
     assert page_data(stopped)["verdict_word"] == "Fit failed"
 
