@@ -302,6 +302,11 @@ def _oddities(file: File) -> list[str]:
         warnings.append(
             f"youngs_modulus {cable.youngs_modulus:g} Pa is softer than any cable: in pascal?"
         )
+    if cable.mass is None:
+        warnings.append(
+            f"cable.mass is not declared: stages before the batch take {cable.prior_mass:.3g} kg, "
+            "that of a solid cable of this diameter; the readings tell it from there on"
+        )
     density = cable.prior_mass / (cable.length * math.pi * cable.diameter**2 / 4.0)
     if density > 1.0e6:
         warnings.append(

@@ -352,10 +352,13 @@ def draw_readings(path: Path, outcome: Outcome) -> None:
                     continue
                 known, model = stage.shapes[pose.name].readings[name]
                 color = _HELD_OUT if pose.role == "held_out" else BLUE
-                for axis, value in zip("xyz", (known - model) / std, strict=False):
-                    label = f"${axis}$" if len(known) > 1 else "o"
-                    axes.plot(k, value, marker=label, color=color, ls="none", ms=6)
-            axes.set_title(f"{name}: noise {std:.3g} {unit}", loc="left")
+                apart = 0.2 * (np.arange(len(known)) - (len(known) - 1) / 2)
+                axes.plot(k + apart, (known - model) / std, ".-", color=color, lw=0.6, ms=6)
+            count = len(
+                next(x.readings[name][0] for x in stage.shapes.values() if name in x.readings)
+            )
+            parts = f"{', '.join('xyz'[:count])} from left to right, " if count > 1 else ""
+            axes.set_title(f"{name}: {parts}noise {std:.3g} {unit}", loc="left")
             axes.set_ylabel("residual / noise")
         ticks = [pose.name for pose in poses]
         grid[-1, 0].set_xticks(range(len(poses)), ticks, rotation=60, ha="right", fontsize=8)
