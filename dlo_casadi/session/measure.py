@@ -91,7 +91,7 @@ def _measured(pose: DeclaredPose, item: PoseInput, std: float) -> MeasuredPose:
     held = replace(conditions(pose), camera_center=item.camera_center)
     held_out = pose.role == "held_out"
     if item.views:
-        found = [pixels_of(view, std) for view in item.views]
+        found = [pixels_of(view, std, len(item.points) > 0) for view in item.views]
         sensors = tuple(sensor for sensor in found if sensor is not None)
         seen = MeasuredPose(held, sensors, held_out, item.points)
     else:

@@ -26,6 +26,8 @@ _PER_ELEMENT = 8
 # Standard deviations of the average along the cable. On rendered photographs pixels are 0.014 px
 # RMS off the true curve, but 0.1 px within two of an end, and 0.03 px within three.
 _REACH = 3.0
+# Times the median: stretches that share an outline are known to 0.2 to 0.4 px, and off by as much.
+_UNSURE = 2.0
 _SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
 
 
@@ -58,6 +60,8 @@ class Pixels(OfPoints):
         Of a pixel at the cable.
     together : (K, 6) [m]
         What a standard deviation of each error of the camera's place does to the residuals.
+    on_line : bool
+        Whether the points are of a line in space, and no guess.
     """
 
     viewpoint: Viewpoint
@@ -67,6 +71,7 @@ class Pixels(OfPoints):
     weight: FloatArray
     size: float
     together: FloatArray
+    on_line: bool = False
 
     marked = False
     per_point = 1
@@ -82,8 +87,10 @@ class Pixels(OfPoints):
     def nearest(self, curve: NodeCurve) -> FloatArray:
         """Arc lengths (K,) [m] at which the pixels belong on a curve that may be far off.
 
-        In order along it, as it is seen.
+        Those nearest in space; of one photograph alone those nearest in it, in order.
         """
+        if self.on_line:
+            return self._nearest(curve, curve.nearest(self.points))
         grid = np.linspace(0.0, curve.length, _PER_ELEMENT * curve.n + 1)
         seen = self.viewpoint.to_pixels(curve.at(grid))
         away = np.linalg.norm(self.pixels[:, None] - seen[None], axis=2)
@@ -146,7 +153,7 @@ def pixel_std(views: Sequence[ViewInput]) -> float:
     return float(np.median(np.concatenate([view.sight.std * _size(view) for view in views])))
 
 
-def pixels_of(view: ViewInput, std: float) -> Pixels | None:
+def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | None:
     """The sensor of a photograph; None if none of its pixels is of the cable.
 
     Pixels share their errors with their neighbours over the length of the average along the
@@ -165,7 +172,8 @@ def pixels_of(view: ViewInput, std: float) -> Pixels | None:
     steps = np.linalg.norm(np.diff(sight.pixels, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     inside = np.minimum(along, along[-1] - along) > _REACH * sight.correlation / np.sqrt(np.pi)
-    kept = np.flatnonzero(inside & sight.whole & np.isfinite(view.places).all(axis=1))[::every]
+    sure = sight.whole & (sight.std < _UNSURE * np.median(sight.std))
+    kept = np.flatnonzero(inside & sure & np.isfinite(view.places).all(axis=1))[::every]
     if len(kept) < 2:
         return None
     size, pixels, points = _size(view), sight.pixels[kept], view.places[kept]
@@ -179,7 +187,7 @@ def pixels_of(view: ViewInput, std: float) -> Pixels | None:
     error = np.linalg.cholesky(viewpoint.covariance)
     together = size * np.column_stack([by_turn, by_shift]) @ error
     weight = sight.std[kept] * size / std
-    return Pixels(viewpoint, pixels, sight.diameter, points, weight, size, together)
+    return Pixels(viewpoint, pixels, sight.diameter, points, weight, size, together, on_line)
 
 
 def _size(view: ViewInput) -> float:
