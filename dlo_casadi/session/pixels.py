@@ -23,6 +23,9 @@ FloatArray = NDArray[np.floating]
 _NEWTON_STEPS = 12
 _SETTLED = 1e-5  # of the length: a residual feels half the bend times the square of that
 _PER_ELEMENT = 8
+# Standard deviations of the average along the cable. On rendered photographs pixels are 0.014 px
+# RMS off the true curve, but 0.1 px within two of an end, and 0.03 px within three.
+_REACH = 3.0
 _SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
 
 
@@ -147,7 +150,8 @@ def pixels_of(view: ViewInput, std: float) -> Pixels | None:
     """The sensor of a photograph; None if none of its pixels is of the cable.
 
     Pixels share their errors with their neighbours over the length of the average along the
-    cable: of those nearer to each other one is taken.
+    cable: of those nearer to each other one is taken. Where that average reaches over an end of
+    the line, into what holds the cable, none is.
 
     Parameters
     ----------
@@ -158,7 +162,10 @@ def pixels_of(view: ViewInput, std: float) -> Pixels | None:
     """
     sight = view.sight
     every = max(1, int(np.ceil(sight.correlation / sight.spacing)))
-    kept = np.flatnonzero(sight.whole & np.isfinite(view.places).all(axis=1))[::every]
+    steps = np.linalg.norm(np.diff(sight.pixels, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    inside = np.minimum(along, along[-1] - along) > _REACH * sight.correlation / np.sqrt(np.pi)
+    kept = np.flatnonzero(inside & sight.whole & np.isfinite(view.places).all(axis=1))[::every]
     if len(kept) < 2:
         return None
     size, pixels, points = _size(view), sight.pixels[kept], view.places[kept]
