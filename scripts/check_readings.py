@@ -37,6 +37,7 @@ from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.durable import write_file
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.effects.mass_error import MASS_FACTOR
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_intervals
@@ -215,8 +216,11 @@ def told(generator, hidden, wrong: str, readings, number: int, held: str, other:
         else:
             model = model.with_effect(effect())
         declared = replace(declared, model=model, values=dict(START.get(name, {})))
-        fit, _ = fit_declared(as_held, declared, items, 20)
-        gains[name] = 2 * fit.log_evidence
+        try:
+            fit, _ = fit_declared(as_held, declared, items, 20)
+            gains[name] = 2 * fit.log_evidence
+        except EstimationError:  # no shape of the model comes near the measured ones
+            gains[name] = -1e9
     return {"number": number, "gain": gains[right] - gains[wrong]}
 
 

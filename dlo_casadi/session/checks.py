@@ -16,7 +16,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.session.declared import declared_model, straight
 from dlo_casadi.session.hanging import pulled_elsewhere
 from dlo_casadi.session.headings import wrong_headings
@@ -49,6 +49,9 @@ _MESH, _POSES = 12, 8
 # shapes need: effects that are missing are below it.
 _REST, _FAITHFUL = 4, 2e-3
 _DECADES = (0, -1, 1)
+# Stiffness over weight is known if its relative standard deviation is below this: units are told
+# where forces are five times off.
+_SIZED = 0.5
 # Points of a line between which its length is measured.
 _SPARSE = 60
 # Of the length: no other explanation is looked for once one comes so near.
@@ -167,7 +170,7 @@ def _misread(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]
                 forces if kind == "moment" else None,
             )
         )
-    return misread(compared)
+    return misread(compared, sized=fit.std(BENDING_STIFFNESS) < _SIZED * fit.p[0])
 
 
 def _axes_of(model: CableModel, frame: FloatArray) -> FloatArray:

@@ -47,8 +47,14 @@ class Compared:
     forces: FloatArray | None = None
 
 
-def misread(readings: Sequence[Compared]) -> tuple[Suspicion, ...]:
-    """What was read otherwise than the configuration says, the likeliest of each reading."""
+def misread(readings: Sequence[Compared], *, sized: bool = True) -> tuple[Suspicion, ...]:
+    """What was read otherwise than the configuration says, the likeliest of each reading.
+
+    Parameters
+    ----------
+    sized : bool
+        Whether the shapes tell stiffness over weight: else only how forces and moments compare.
+    """
     found = []
     scales = {}
     for one in readings:
@@ -71,7 +77,8 @@ def misread(readings: Sequence[Compared]) -> tuple[Suspicion, ...]:
             )
         scales[one.name] = float((rows * one.model).sum() / (one.model**2).sum())
     for name, scale in scales.items():
-        found += _other_unit(name, scale, scales)
+        if sized or (name.endswith("moment") and any(x.endswith("force") for x in scales)):
+            found += _other_unit(name, scale, scales)
     return tuple(found)
 
 
