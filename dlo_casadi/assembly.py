@@ -286,10 +286,19 @@ class Assembly:
         )
         return CurveSlopes(self, rows[..., 0], by_moving, by_others, by_station, by_p)
 
-    def start_force(self, shapes: Shapes, given: Given) -> FloatArray:
-        """Force (m, dimension) [N] of the cable on whatever holds its start."""
-        rows = (shapes.lam, given.p, given.poses, shapes.deviation)
-        return self._mapped("start_force", 1)(*(row[:, None] for row in rows))[0][:, 0, :, 0]
+    def reactions(self, shapes: Shapes, given: Given) -> FloatArray:
+        """Forces and moments (m, n_reactions) of the cable on its fixtures, `ends.REACTIONS`."""
+        return self._call_ends("reactions", shapes, given)[0][..., 0]
+
+    def readings(self, shapes: Shapes, given: Given) -> FloatArray:
+        """`reactions` as sensors show them."""
+        return self._call_ends("readings", shapes, given)[0][..., 0]
+
+    def readings_along(self, shapes: Shapes, given: Given, along: Directions) -> FloatArray:
+        """Change (m, n_reactions, q) of `readings` along directions."""
+        by_ends, by_p, by_deviation = self._call_ends("reading_slopes", shapes, given)
+        moved = np.concatenate([along.x[:, 0], along.x[:, -1], along.lam], axis=1)
+        return np.asarray(by_ends @ moved + by_p @ along.p + by_deviation @ along.deviation)
 
     # ---- state and strain ------------------------------------------------------------------------
 

@@ -9,6 +9,18 @@ import casadi as ca
 
 from dlo_casadi.rod.node import Node, quaternion_product
 
+# What the cable does to its fixtures, and a sensor there measures, in the order of `reactions`.
+REACTIONS = ("start_force", "start_moment", "end_force", "end_moment")
+
+
+def reaction_rows(node: type[Node]) -> dict[str, slice]:
+    """Where each of REACTIONS stands in their vector: forces (dimension,), moments (increment,)."""
+    sizes = [node.dimension, node.increment] * 2
+    ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
+    return {
+        name: slice(end - size, end) for name, size, end in zip(REACTIONS, sizes, ends, strict=True)
+    }
+
 
 @dataclass(frozen=True)
 class EndConditions:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.descent import Minima, descend
+from dlo_casadi.ends import reaction_rows
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.initial import arc_headings, arc_into_clamps, limited, wrapped
 from dlo_casadi.initial_frames import guessed_frames_of
@@ -626,14 +627,14 @@ def _equilibrium(
     strain = assembly.strain(shapes, given)[0]
     n_cells = model.chain.n_cells
     curvature = model.chain.curvatures(strain).ravel()
-    end_force, moments = split_multipliers(model, shapes.x[0], shapes.lam[0])
+    on_fixtures, rows = assembly.reactions(shapes, given)[0], reaction_rows(model.node)
     return Equilibrium(
         x=shapes.x[0],
         points=assembly.nodes(shapes, given)[0],
         energy=float(assembly.energy(shapes, given)[0]),
-        lam=end_force,
-        lam_start=assembly.start_force(shapes, given)[0],
-        moments=moments,
+        lam=on_fixtures[rows["end_force"]],
+        lam_start=on_fixtures[rows["start_force"]],
+        moments=clamp_moments(model, shapes.x[0], shapes.lam[0]),
         multipliers=shapes.lam[0],
         bound_multipliers=bound_lam,
         curvature=curvature,
@@ -794,20 +795,14 @@ def _bordered(
     return whole, matrix.with_border(arms)
 
 
-def split_multipliers(
-    model: CableModel, x: FloatArray, lam: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Force on the end's holder (dimension,) [N] and moments on the clamps (start, end) [N m].
-
-    The moments are (2,) in a plane, (2, 3) about the world's axes in space.
-    """
+def clamp_moments(model: CableModel, x: FloatArray, lam: FloatArray) -> FloatArray:
+    """Moments [N m] on the clamps (start, end): (2,), in space (2, 3) about the world's axes."""
     node, named = model.node, dict(zip(model.border_names, lam, strict=True))
-    force = np.array([named.get(f"end_position_{axis}", 0.0) for axis in node.axes])
     moments = [
         node.to_world(frame, np.array([named.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
         for side, frame in (("start", x[0]), ("end", x[-1]))
     ]
-    return force, np.squeeze(np.array(moments))
+    return np.squeeze(np.array(moments))
 
 
 def total_dead_load(model: CableModel, p: FloatArray) -> FloatArray:

@@ -33,7 +33,7 @@ from dlo_casadi.effects import (
     SpringAt,
     StateEffect,
 )
-from dlo_casadi.ends import EndConditions
+from dlo_casadi.ends import EndConditions, reaction_rows
 from dlo_casadi.errors import DloError
 from dlo_casadi.parameters import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.rest import RestCurvature
@@ -725,7 +725,8 @@ class CableModel:
     @cached_property
     def compliances(self) -> ca.Function:
         """(p) -> compliances of the conditions `compliant`."""
-        return ca.Function("compliances", [self._p], [ca.vertcat(*self._compliances.values())])
+        found = ca.vertcat(ca.SX.zeros(0), *self._compliances.values())
+        return ca.Function("compliances", [self._p], [found])
 
     @property
     def compliant(self) -> list[int]:
@@ -988,14 +989,59 @@ class CableModel:
         return self._here("slot_state", self._slot_arguments, [mean, *slopes])
 
     @cached_property
-    def start_force(self) -> ca.Function:
-        """(lam, p, pose, deviation) -> force (dimension,) [N] of the cable on its start.
+    def _reactions(self) -> ca.SX:
+        """Forces [N] and moments [N m] of the cable on its fixtures, see `ends.REACTIONS`.
 
-        Minus the slope of the Lagrangian by the start's place, nodes and multipliers kept.
+        Forces are minus the slope of the Lagrangian by the ends' places, nodes and multipliers
+        kept. Moments, about the world's axes, are the slope by turns of the first and last node of
+        what the holders add to it: multipliers of clamps, springs of pins.
         """
-        slope = ca.gradient(self._at_ends, self._pose)[: self.node.dimension]
-        arguments = self._end_arguments[1:]
-        return ca.Function("start_force", arguments, [ca.densify(-slope)])
+        node, (x, delta) = self.node, self._nodes
+        places = -ca.gradient(self._at_ends, self._pose)[: 2 * node.dimension]
+        turns = ca.gradient(self._at_ends, delta)
+        places, turns = ca.substitute([places, turns], [delta], [ca.SX.zeros(delta.shape)])
+        pairs = zip(
+            ca.vertsplit(places, node.dimension),
+            ca.vertsplit(x, node.coordinates),
+            ca.vertsplit(turns, node.increment),
+            strict=True,
+        )
+        here = [row for force, own, turn in pairs for row in (force, node.in_world(own, turn))]
+        moved = [
+            node.retract(own, step)
+            for own, step in zip(
+                ca.vertsplit(x, node.coordinates),
+                ca.vertsplit(delta, node.increment),
+                strict=True,
+            )
+        ]
+        return ca.substitute([ca.vertcat(*here)], [x], [ca.vertcat(*moved)])[0]
+
+    @cached_property
+    def reactions(self) -> ca.Function:
+        """As `at_ends` -> `ends.REACTIONS` in one column [N, N m]."""
+        return self._here("reactions", self._end_arguments, [self._reactions])
+
+    @cached_property
+    def _readings(self) -> ca.SX:
+        """The same as sensors show them."""
+        rows, of = self._reactions, reaction_rows(self.node)
+        for effect, local in self._filling(MeasurementEffect):
+            parts = effect.feel({name: rows[at] for name, at in of.items()}, local)
+            rows = ca.vertcat(*(parts[name] for name in of))
+        return rows
+
+    @cached_property
+    def readings(self) -> ca.Function:
+        """As `reactions`, as sensors show them."""
+        return self._here("readings", self._end_arguments, [self._readings])
+
+    @cached_property
+    def reading_slopes(self) -> ca.Function:
+        """As `readings` -> derivatives by increments and multipliers, by p, and by deviation."""
+        by = (self._by_ends, self._p, self._deviation)
+        slopes = [ca.jacobian(self._readings, one) for one in by]
+        return self._here("reading_slopes", self._end_arguments, slopes)
 
     @property
     def shape_dependent_loads(self) -> tuple[str, ...]:

@@ -115,6 +115,13 @@ PULLED = 6.0
 # Neighbouring markers farther apart than the cable between them, in lengths of the cable: half of
 # what fits leaves noise of 3 mm (five times, of both) on a cable of 1 m.
 STRETCHED = FITS / 2
+# Distance of readings from a multiple of those that the shapes need, over their size: 0.02 in a
+# session in space with a wrong mass (space_wrench), 0.6 and more with another sign or frame.
+MISREAD = 0.15
+# Ways to read them that are nearly as near as the best one are judged by how likely they are.
+READ_OTHERWISE = 1.5
+# What a mass may be wrong by: `mass_error` reaches from a fifth to five times.
+READ_SCALE = 5.0
 # How far a factor may be from that of a unit: the nearest two are 2.54 apart, more than 1.25^2.
 NEAR_UNIT = 1.25
 # Share of the poses that a common mistake shows in: a pose or two may be wrong by themselves.

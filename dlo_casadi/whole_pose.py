@@ -120,6 +120,11 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     return ca.vertcat(*rows)
 
 
+def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
+    """What sensors on the fixtures show (n_reactions,) [N, N m], see `ends.REACTIONS`."""
+    return model.readings(*_end_arguments(model, s))
+
+
 def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Rest curvature (n_rests,) [1/m] that the pose leaves behind."""
     arguments = _slot_arguments(model, s)

@@ -20,10 +20,11 @@ TITLES = {
 def draw_camera_steps() -> None:
     """The four pictures of `dlo check --show` for a photograph with a card before the cable."""
     config = dlo.load_config(ROOT / "tests/data/bench/orange/session.yaml")
-    pictures = draw_steps(config, config.experiment.poses[1])
+    pose = config.experiment.poses[1]
+    pictures = draw_steps(config, pose)
     drawing = Figure(figsize=(9, 6.4), layout="constrained")
     for axes, (name, title) in zip(drawing.subplots(2, 2).ravel(), TITLES.items(), strict=True):
-        axes.imshow(pictures[name][..., ::-1])
+        axes.imshow(pictures[f"{pose.name}_{name}"][..., ::-1])
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
     drawing.savefig(PICTURES / "camera_steps.jpg", dpi=110, pil_kwargs={"quality": 82})

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 import yaml
 
-from dlo_casadi.config import Centerlines, Config, Images, dump_yaml, load_config, read_yaml
+from dlo_casadi.config import (
+    Centerlines,
+    Config,
+    Images,
+    declared_setup,
+    dump_yaml,
+    load_config,
+    read_yaml,
+)
+from dlo_casadi.config.sections import DENSITY
 from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.errors import ConfigError
 
@@ -673,3 +682,45 @@ def test_yaml_round_trip_keeps_every_digit_and_the_order(tmp_path):
 def test_dump_refuses_what_is_no_data():
     with pytest.raises(TypeError, match="object cannot be written as YAML"):
         dump_yaml({"a": object()})
+
+
+# ---- readings ------------------------------------------------------------------------------------
+
+
+def read_at(folder: Path, readings: str, *changes: tuple[str, str]) -> Config:
+    """The good configuration with readings at its second pose."""
+    return load(folder, ("end: [0.4, 0.1]", f"end: [0.4, 0.1], {readings}"), *changes)
+
+
+def test_readings_of_a_pose(tmp_path):
+    config = read_at(tmp_path, "end_force: [1, -2], start_moment: 0.1")
+    pose = config.experiment.poses[1]
+    assert pose.readings == {"end_force": (1.0, -2.0), "start_moment": (0.1,)}
+    assert set(declared_setup(config).readings) == {"end_force", "start_moment"}
+    assert config.experiment.poses[0].readings == {}
+
+
+@pytest.mark.parametrize(
+    ("readings", "said"),
+    [
+        ("end_force: [1, -2, 3]", r"end_force: \[fx, fy\] belongs here"),
+        ("end_moment: [1, 2, 3]", "end_moment: one number belongs here"),
+        ("end_moment: [1, 2]", r"one number belongs here, in space three \[mx, my, mz\]"),
+        ("end_force: [1.0e+7, 0]", "end_force: 1e"),
+    ],
+)
+def test_readings_that_cannot_be(tmp_path, readings, said):
+    with pytest.raises(ConfigError, match=said):
+        read_at(tmp_path, readings)
+
+
+def test_a_mass_that_is_not_declared_takes_a_reading(tmp_path):
+    unknown = ("mass: 0.23", "mass: null")
+    with pytest.raises(ConfigError, match="end_force of a fit pose, which tells both"):
+        load(tmp_path, unknown)
+    config = read_at(tmp_path, "end_force: [1, -2]", unknown)
+    solid = DENSITY * math.pi / 4 * config.cable.diameter**2 * config.cable.length
+    assert config.cable.prior_mass == pytest.approx(solid)
+    assert any("cable.mass is not declared" in text for text in config.warnings)
+    with pytest.raises(ConfigError, match="without gravity nothing depends on it"):
+        read_at(tmp_path, "end_force: [1, -2]", unknown, ("[0, -9.81]", "[0, 0]"))

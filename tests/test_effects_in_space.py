@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.effects import (
     EFFECTS,
-    NUISANCES,
     BendingAnisotropy,
     Cable,
     CameraFrame,
     ClampCompliance,
     ClampRotation,
+    EdgeBias,
     GravityTilt,
     LumpedMass,
     MassError,
@@ -383,7 +383,5 @@ def test_effects_of_the_other_kind_of_cable_are_refused(where):
 
 
 def test_what_a_camera_sees_of_an_edge_is_of_a_plane():
-    assert all(kind.in_plane != kind.in_space for kind in NUISANCES.values())
-    assert not any(
-        kind.applies(Setup(CABLE, gravity=GRAVITY, pixel=1e-4)) for kind in NUISANCES.values()
-    )
+    assert not EdgeBias.applies(Setup(CABLE, gravity=GRAVITY, pixel=1e-4))
+    assert EdgeBias.applies(Setup(FLAT, pixel=1e-4))

@@ -20,7 +20,7 @@ PARALLEL = {"executors", "parallel"}
 MAY_IMPORT: dict[str, set[str]] = {
     **{layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)},
     "assembly": {*CHAIN[:7], "model"},  # the model only for its type
-    "config": {"errors", "thresholds", "parameters", "rod", "effects"},
+    "config": {"errors", "thresholds", "parameters", "rod", "ends", "effects"},
     "durable": {"errors"},
     "measurements": {"errors", "config", "durable"},
     "vision": {"errors", "durable"},

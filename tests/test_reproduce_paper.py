@@ -15,7 +15,7 @@ from paper.content import Claim, Part, Section, Target, drawing
 from paper.fits import estimate
 
 from dlo_casadi.estimation import fit as fitting
-from dlo_casadi.estimation.profile import stiffness_interval, stiffness_profile, threshold
+from dlo_casadi.estimation.profile import profile_interval, stiffness_profile, threshold
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_held_out_poses_of_the_replica(revealing):
 
 
 def test_profile_meets_the_threshold_at_the_ends_of_the_interval(fitted):
-    interval = stiffness_interval(fitted)
+    interval = profile_interval(fitted)
     ends = np.array([interval.high, fitted.p[0], interval.low])
     rises = stiffness_profile(fitted, ends)
     # The ends are found by two secant steps.

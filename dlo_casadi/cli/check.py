@@ -79,7 +79,7 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
     """Write the steps' pictures of all poses; return the files."""
     if config.experiment.measurement.kind != "images":
         raise DloError("--show draws photographs; this configuration has centre-lines")
-    poses = [pose for pose in config.measured_poses if pose.paths[0].is_file()]
+    poses = [pose for pose in config.measured_poses if any(path.is_file() for path in pose.paths)]
     written = []
     make_folder(folder)
     for k, pose in enumerate(poses):
@@ -89,7 +89,7 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
         except MeasurementError:  # no photograph; the table says so
             continue
         for name, picture in pictures.items():
-            written.append(folder / f"{pose.name}_{name}.jpg")
+            written.append(folder / f"{name}.jpg")
             write_picture(written[-1], picture)
     watch.step("draw the steps", len(poses), len(poses))
     return written

@@ -188,12 +188,6 @@ def generate(
             "and the generated solver knows dead loads only.\n"
             "  Try: dlo predict, or dlo_casadi.predict, which know it."
         )
-    if model.compliant:
-        raise DloError(
-            "no solver can be generated for a cable whose clamps give way (clamp_compliance): it "
-            "holds them as they are declared.\n"
-            "  Try: dlo predict, or dlo_casadi.predict, which know it."
-        )
     digest = solver_hash(model, p, rest)
     own, kind = (space, "space") if model.in_space else (plane, "plane")
     values = _values(model, prefix, digest) | own.values(model, p, rest, inline)

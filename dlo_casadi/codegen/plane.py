@@ -37,7 +37,16 @@ def _extra(model: CableModel, p: FloatArray) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
     offsets, length = model.held(p, 0, 0)
-    return [float(length), down, *total_dead_load(model, p), *np.array(offsets).ravel()[2:]]
+    compliance = clamp_compliances(model, p)
+    hold = [1 / c if c > 0 else 0.0 for c in compliance]
+    return [float(length), down, *total_dead_load(model, p), *np.array(offsets).ravel()[2:], *hold]
+
+
+def clamp_compliances(model: CableModel, p: FloatArray) -> list[float]:
+    """Turn of the start and end clamp per moment on it [rad/(N m)]."""
+    found = zip(model.compliant, np.array(model.compliances(p)).ravel(), strict=True)
+    named = {model.condition_names[k]: float(c) for k, c in found}
+    return [named.get(f"{side}_heading", 0.0) for side in ("start", "end")]
 
 
 def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray, kernels: Kernels) -> list[float]:
@@ -57,7 +66,7 @@ def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> 
     kernels = kernels_of(model, p, rest, inline)
     functions, loops = kernels.to_c(model.yields)
     chain, rows = model.chain, len(kernels.table)
-    count = chain.n_nodes
+    count, gives = chain.n_nodes, [c > 0 for c in clamp_compliances(model, p)]
     return {
         "N_HEADINGS": str(count),
         "HEADINGS_ARE": chain.kind.nodes_are,
@@ -65,8 +74,10 @@ def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> 
         "WORKSPACE": str(_ARRAYS * (count + 1)),
         "ELEMENTS": str(chain.n_slots),
         "FIRST": str(chain.layout.advancing[0]),
-        "LOW": str(int(model.start == "clamped")),
-        "HIGH": str(count - int(model.end == "clamped")),
+        "LOW": str(int(model.start == "clamped" and not gives[0])),
+        "HIGH": str(count - int(model.end == "clamped" and not gives[1])),
+        "GIVES_START": str(int(gives[0])),
+        "GIVES_END": str(int(gives[1])),
         "SMOOTH": str(int(chain.kind.smooth)),
         "STRETCHES": str(int(model.extensible)),
         "TABLE": table_to_c(numbers_of(model, p, rest, kernels)),

@@ -126,9 +126,10 @@ def numbers_of(
 def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> dict[str, str]:
     """What the marks of the templates stand for."""
     meshes, count = meshes_of(model, p, rest, inline), coarse_elements(model)
-    if meshes["kernel"].ends is not None:
+    if meshes["kernel"].ends is not None or model.compliant:
         raise DloError(
-            "no solver can be generated for a cable in space whose ends are held by springs\n"
+            "no solver can be generated for a cable in space whose ends are held by springs, or by "
+            "clamps that give way\n"
             "  Try: dlo predict, or dlo_casadi.predict, which know them."
         )
     functions: list[str] = []

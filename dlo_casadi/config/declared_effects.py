@@ -21,7 +21,7 @@ def declared_setup(config: Config | File) -> Setup:
     return Setup(
         cable=Cable(
             length=cable.length,
-            mass=cable.mass,
+            mass=cable.prior_mass,
             diameter=cable.diameter,
             bending_stiffness=cable.prior_bending_stiffness,
             name=cable.name,
@@ -34,6 +34,7 @@ def declared_setup(config: Config | File) -> Setup:
         curved=cable.rest_shape != "straight",
         n_poses=sum(pose.role == "fit" for pose in experiment.poses),
         camera=measurement.kind == "images" and None not in (measurement.board, measurement.camera),
+        readings=tuple({name for pose in experiment.poses for name in pose.readings}),
         tolerances=experiment.tolerances.model_dump(),
     )
 

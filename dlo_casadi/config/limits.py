@@ -61,6 +61,10 @@ COORDINATE = Range(-1.0e3, 1.0e3, "m")
 _FINEST_STD = 1.0e-7
 # A nanometre over a metre is what interferometers resolve.
 _FINEST_TOLERANCE = 1.0e-9
+# The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; taut it pulls more. A moment: a metre's arm.
+FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
+# A nanonewton is what atomic force microscopes resolve.
+_FINEST_READING = 1.0e-9
 # A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
 PIXELS = Range(-1.0e6, 1.0e6, "px")
 FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
@@ -173,3 +177,17 @@ def impossible_values(experiment: Experiment, length: float) -> Iterator[Problem
             for k, value in enumerate(getattr(pose, key) or ()):
                 for place, message in COORDINATE.problems((*at, "poses", i, key, k), value):
                     yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")
+        for key, values in pose.readings.items():
+            possible = FORCE if key.endswith("force") else MOMENT
+            for value in values:
+                for place, message in possible.problems((*at, "poses", i, key), value):
+                    yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")
+    stds = experiment.measurement
+    for key, value, possible in (
+        ("force_std", stds.force_std, FORCE),
+        ("moment_std", stds.moment_std, MOMENT),
+    ):
+        if value is not None:
+            finest = possible._replace(least=_FINEST_READING)
+            for place, message in finest.problems((*at, "measurement", key), value):
+                yield Problem(place, f"{key}: {message}")

@@ -24,6 +24,7 @@ from dlo_casadi.config.sections import (
     SkippedPose,
     Tolerances,
 )
+from dlo_casadi.effects import UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.rod.chain import ELEMENTS
 
@@ -63,6 +64,7 @@ def load_config(path: str | Path) -> Config:
 
     if problems := [
         *_contradictions(file.experiment),
+        *_weightless(file),
         *wrong_effects(file),
         *impossible_values(file.experiment, file.cable.length),
     ]:
@@ -151,7 +153,7 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
         if pose.branch == "previous" and i == 0:
             wrong("the first pose continues none; branch: ccw or cw?", key="branch")
         if held.end == "free":
-            for key in ("end", "end_heading", "end_orientation"):
+            for key in ("end", "end_heading", "end_orientation", "end_force", "end_moment"):
                 if getattr(pose, key) is not None:
                     wrong(f"a free end has no {key}; boundary.end: pinned or clamped?")
         endings = {path.suffix.lower() for path in pose.paths}
@@ -167,6 +169,24 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
         at = ("experiment", "poses")
         problems.append(Problem(at, "no pose has role: fit, there is nothing to fit to"))
     return problems
+
+
+def _weightless(file: File) -> Iterator[Problem]:
+    """Why a mass that is not declared cannot be found."""
+    experiment = file.experiment
+    if file.cable.mass is not None:
+        return
+    at = ("cable", "mass")
+    if not any(experiment.gravity):
+        yield Problem(at, "mass: null: without gravity nothing depends on it; declare any")
+    elif not any(pose.readings for pose in experiment.poses if pose.role == "fit"):
+        yield Problem(
+            at,
+            "mass: null: shapes tell stiffness over weight alone. Try: the mass in kg, or "
+            "end_force of a fit pose, which tells both",
+        )
+    elif any(item.name == UNKNOWN_MASS.name for item in file.model.effects):
+        yield Problem(at, f"mass: null: {UNKNOWN_MASS.name} is of a declared mass; one of the two")
 
 
 def _axes(experiment: Experiment) -> str:
@@ -191,6 +211,13 @@ def _frame_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, s
         if heading is not None and space:
             text = "is for a cable in a plane; gravity has three numbers. Try: "
             yield f"{key}_heading {text}{key}_orientation", f"{key}_heading"
+        for kind, count, what in (
+            ("force", len(experiment.gravity), "[fx, fy, fz]" if space else "[fx, fy]"),
+            ("moment", 3 if space else 1, "[mx, my, mz]" if space else "one number"),
+        ):
+            reading = getattr(pose, f"{key}_{kind}")
+            if reading is not None and len(reading) != count:
+                yield f"{key}_{kind}: {what} belongs here ({numbers})", f"{key}_{kind}"
         if getattr(held, key) != "clamped":
             continue
         if space and orientation is None:
@@ -275,7 +302,12 @@ def _oddities(file: File) -> list[str]:
         warnings.append(
             f"youngs_modulus {cable.youngs_modulus:g} Pa is softer than any cable: in pascal?"
         )
-    density = cable.mass / (cable.length * math.pi * cable.diameter**2 / 4.0)
+    if cable.mass is None:
+        warnings.append(
+            f"cable.mass is not declared: stages before the batch take {cable.prior_mass:.3g} kg, "
+            "that of a solid cable of this diameter; the readings tell it from there on"
+        )
+    density = cable.prior_mass / (cable.length * math.pi * cable.diameter**2 / 4.0)
     if density > 1.0e6:
         warnings.append(
             f"the cable is {density / 1000:.3g} times as dense as water: "

@@ -14,6 +14,7 @@ Beirami et al., On optimal generalizability in parametric learning, NeurIPS 2017
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,9 +24,9 @@ from numpy.typing import NDArray
 from scipy.stats import ttest_1samp
 
 from dlo_casadi.assembly import Shapes
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import map_in_order
 from dlo_casadi.thresholds import CLEARLY_WORSE
@@ -43,23 +44,32 @@ class CrossValidation:
     Parameters
     ----------
     squares : (folds,) [m^2]
-        Sum of squared distances of each fold's points.
+        Sum of squared errors of each fold: distances of its points, and readings as
+        `NoiseModel.units` count them.
     counts : (folds,)
-        Number of points of each fold.
+        Number of points and components of readings of each fold.
     complete : bool
         Whether each fold could be predicted.
+    of_points : float [m]
+        Root mean square distance over all points; that of everything where it is not given.
     """
 
     squares: FloatArray
     counts: FloatArray
     complete: bool
+    of_points: float | None = None
+
+    @property
+    def error(self) -> float:
+        """Root mean square error of everything [m]."""
+        if not self.complete:
+            return float("inf")
+        return float(np.sqrt(self.squares.sum() / self.counts.sum()))
 
     @property
     def rmse(self) -> float:
         """Root mean square distance over all points [m]."""
-        if not self.complete:
-            return float("inf")
-        return float(np.sqrt(self.squares.sum() / self.counts.sum()))
+        return self.error if self.of_points is None or not self.complete else self.of_points
 
     def clearly_worse_than(self, other: CrossValidation) -> bool:
         """Whether the mean paired difference of the folds exceeds its standard error clearly."""
@@ -115,17 +125,27 @@ def cross_validate(
             h_j = h_j - cross.T @ solved[:, :-1]
             g_j = g_j - cross.T @ solved[:, -1]
         thetas.append(_without(fit, total.hessian - h_j, total.gradient - g_j))
-    squares, counts, complete = [], [], True
-    curves = _predicted(fit, shapes, thetas, executor or InProcess())
-    for j, curve in zip(problem.used, curves, strict=True):
+    errors: list[tuple[FloatArray, FloatArray] | None] = []
+    predicted = _predicted(fit, shapes, thetas, executor or InProcess())
+    for j, seen in zip(problem.used, predicted, strict=True):
         item = problem.measured[j]
-        counts.append(len(item.traced.points))
-        if curve is None:
-            complete = False
-            squares.append(np.inf)
-        else:
-            squares.append(float((item.distances(curve) ** 2).sum()))
-    return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)
+        found = (
+            None if seen is None else (item.distances(seen.curve), item.misread(seen, fit.noise))
+        )
+        errors.append(found)
+    return _validation(errors)
+
+
+def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> CrossValidation:
+    """From errors [m] of points and of readings of each fold; None where it was not predicted."""
+    known = [fold for fold in errors if fold is not None]
+    complete = len(known) == len(errors)
+    both = [np.zeros(1) if fold is None else np.concatenate(fold) for fold in errors]
+    squares = np.array([float((fold**2).sum()) for fold in both])
+    squares[[fold is None for fold in errors]] = np.inf
+    points = np.concatenate([fold[0] for fold in known]) if known else np.zeros(1)
+    rmse = float(np.sqrt((points**2).mean()))
+    return CrossValidation(squares, np.array([float(len(fold)) for fold in both]), complete, rmse)
 
 
 def _inner(fit: Fit) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
@@ -148,31 +168,31 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> FloatArray:
 
 def _predicted(
     fit: Fit, shapes: Shapes, thetas: list[FloatArray], executor: Executor
-) -> list[NodeCurve | None]:
-    """Curve of each fitted pose at its own unknowns, from the declared end conditions."""
+) -> list[Observed | None]:
+    """What each fitted pose looks like at its own unknowns, from declared end conditions."""
     problem, sweep = fit.problem, fit.problem.sweep
     unknowns, model = problem.unknowns, fit.model
     plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
     if model.has_state:
         folds = map_in_order(executor, partial(_predict_all, fit, plain), thetas)
-        return [curves[j] for j, curves in zip(problem.used, folds, strict=True)]
+        return [seen[j] for j, seen in zip(problem.used, folds, strict=True)]
     p = np.repeat(fit.p[None], sweep.m, axis=0)
     rest = np.repeat(fit.rest[None], sweep.m, axis=0)
     for j, theta in zip(problem.used, thetas, strict=True):
         p[j], rest[j] = unknowns.p(theta), unknowns.rest(theta)
     solved, converged = sweep.solve(plain, p, rest)
-    z = sweep.seen(solved, p, rest)
-    return [problem.curve_of(z[j]) if converged[j] else None for j in problem.used]
+    seen = sweep.seen(solved, p, rest)
+    return [seen[j] if converged[j] else None for j in problem.used]
 
 
-def _predict_all(fit: Fit, plain: Shapes, theta: FloatArray) -> list[NodeCurve | None]:
+def _predict_all(fit: Fit, plain: Shapes, theta: FloatArray) -> list[Observed | None]:
     """All poses in order at one value of the unknowns, a state carried along."""
     sweep, unknowns = fit.problem.sweep, fit.problem.unknowns
     p, rest = unknowns.p(theta), unknowns.rest(theta)
     solved, converged = sweep.solve(plain, p, rest)
     if not converged.all():
         return [None] * sweep.m
-    return [fit.problem.curve_of(z) for z in sweep.seen(solved, p, rest)]
+    return list(sweep.seen(solved, p, rest))
 
 
 def _stretches(fit: Fit) -> CrossValidation:
@@ -188,10 +208,11 @@ def _stretches(fit: Fit) -> CrossValidation:
     prior[size:, size:] = np.diag(1 / problem.deviation_std**2)
     own = fit.point.shapes.deviation[j, problem.sweep.used_deviations]
     pull = np.concatenate([fit.point.theta - problem.mean, own])
-    squares, counts, complete = [], [], True
+    errors: list[tuple[FloatArray, FloatArray] | None] = []
     sweep = problem.sweep
     for left_out in np.array_split(points, min(STRETCHES, len(points))):
-        kept = ~np.isin(item.point_of, left_out)
+        kept = np.ones(item.n_residuals, dtype=bool)
+        kept[item.on_points] = ~np.isin(item.point_of, left_out)
         a, e = joint[kept], lin.residuals[0][kept]
         hessian = a.T @ a + prior
         hessian += 1e-9 * np.diag(np.diag(hessian)) + NO_INFORMATION * np.eye(len(hessian))
@@ -202,11 +223,9 @@ def _stretches(fit: Fit) -> CrossValidation:
         plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
         p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
         solved, converged = sweep.solve(plain, p, rest)
-        counts.append(len(left_out))
         if not converged.all():
-            squares.append(np.inf)
-            complete = False
+            errors.append(None)
             continue
-        curve = problem.curve_of(sweep.seen(solved, p, rest)[j])
-        squares.append(float((item.misses(curve)[left_out] ** 2).sum()))
-    return CrossValidation(np.array(squares), np.array(counts, dtype=float), complete)
+        curve = sweep.seen(solved, p, rest)[j].curve
+        errors.append((item.misses(curve)[left_out], np.zeros(0)))
+    return _validation(errors)

@@ -15,7 +15,8 @@ from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.causes import refit_from
 from dlo_casadi.diagnosis.confirm import Confirmed, confirm
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.equivalents import untried_equivalents
+from dlo_casadi.diagnosis.equivalents import equivalents
+from dlo_casadi.diagnosis.hidden_weight import HiddenWeight, hidden_weight
 from dlo_casadi.diagnosis.next_pose import NextPose, next_pose
 from dlo_casadi.diagnosis.pull import Pull, estimate_pull
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
@@ -64,8 +65,8 @@ class AddedEffect:
         Without and with the effect.
     rivals : tuple of Confirmed
         Candidates that could not be told apart from it.
-    untried : tuple of str
-        Effects that act as it does and were not among the candidates.
+    equivalents : tuple of str
+        What it may stand for, see `equivalents`.
     """
 
     candidate: Candidate
@@ -73,7 +74,7 @@ class AddedEffect:
     before: CrossValidation
     after: CrossValidation
     rivals: tuple[Confirmed, ...]
-    untried: tuple[str, ...] = ()
+    equivalents: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,8 @@ class Diagnosis:
         What separates an effect from its best rival.
     proposal_for : tuple of str
         Names of those two; empty where there is no rival.
+    weight : HiddenWeight or None
+        That the fit would not notice.
     """
 
     before: Fit
@@ -121,6 +124,7 @@ class Diagnosis:
     pull: Pull | None = None
     proposal: NextPose | None = None
     proposal_for: tuple[str, ...] = field(default_factory=tuple)
+    weight: HiddenWeight | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -177,7 +181,12 @@ def diagnose(
             pull = estimate_pull(found.fit, search.executor)
     tried = {row.name for row in found.ranked}
     added = tuple(
-        replace(item, untried=untried_equivalents(found.fit, item.candidate, tried))
+        replace(
+            item,
+            equivalents=equivalents(
+                found.fit, item.candidate, tried, [rival.candidate for rival in item.rivals]
+            ),
+        )
         for item in found.added
     )
     proposal, names = _proposal(found.fit, added)
@@ -194,6 +203,7 @@ def diagnose(
         pull=pull if found.unexplained else None,
         proposal=proposal,
         proposal_for=names,
+        weight=None if found.unexplained else hidden_weight(found.fit, exclude),
     )
 
 
@@ -239,7 +249,7 @@ class _Search:
     @property
     def error(self) -> float:
         """Cross-validated error of the declared model [m], 0 where it tells nothing."""
-        return self.validation.rmse if self.validation.complete else 0.0
+        return self.validation.error if self.validation.complete else 0.0
 
     @property
     def astray(self) -> bool:
@@ -254,10 +264,9 @@ class _Search:
     @property
     def doubt(self) -> float | None:
         """What a gain has to be held against where a pose or two were taken again and again."""
-        count = different_poses(self.declared.problem.history)
-        return (
-            self.significance if count < min(DIFFERENT, len(self.declared.problem.used)) else None
-        )
+        problem = self.declared.problem
+        count = different_poses(problem.history, problem.unknowns.model.cable.length)
+        return self.significance if count < min(DIFFERENT, len(problem.used)) else None
 
     @cached_property
     def first(self) -> list[Screened]:
@@ -352,7 +361,7 @@ class _Search:
         limit = UNSEEN * fit.expected_error
         if added:
             limit = max(limit, UNSEEN_LEFT * self.error)
-        unpredicted = (bool(added) or self.several) and validation.rmse > limit
+        unpredicted = (bool(added) or self.several) and validation.error > limit
         unexplained = structure.p_noise < self.significance or unpredicted
         unexplained |= fit.noise.source == "misfit"
         return _Found(fit, tuple(added), ranked, validation, structure, unexplained)
@@ -373,7 +382,7 @@ class _Search:
         explain. And all go if one force in each pose explains more than they do.
         """
         floor = found.fit.expected_error**2
-        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.rmse, self.error))
+        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, self.error))
         if after <= LEFT * before and not self._needless(found, pull):
             return found
         return self._ended(self.declared, [], found.ranked)
@@ -403,6 +412,7 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
         n_poses=len(problem.used),
         center=center,
         camera=any(item.pose.camera_center is not None for item in problem.history),
+        readings=tuple({name for item in problem.history for name in item.reactions}),
         directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
         largest_bend=float(problem.sweep.bends(shapes, fit.p, fit.rest).max()),
     )
@@ -494,7 +504,7 @@ def _improving(
         if item is None or item.bic <= 0 or not item.validation.complete:
             continue
         # An effect that explains the fitted poses but predicts the others worse is none.
-        if item.validation.rmse > validation.rmse:
+        if item.validation.error > validation.error:
             continue
         if doubt is None or validation.chance_of_gain(item.validation) < doubt:
             out.append(item)
@@ -510,7 +520,7 @@ def _choose(
     """
     if not confirmed:
         return None
-    leader = min(confirmed, key=lambda item: item.validation.rmse)
+    leader = min(confirmed, key=lambda item: item.validation.error)
     close = [
         item for item in confirmed if not item.validation.clearly_worse_than(leader.validation)
     ]

@@ -7,10 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.ends import reaction_rows
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.sensors import Observed
+from dlo_casadi.thresholds import APART
 
 FloatArray = NDArray[np.floating]
 
@@ -20,12 +23,34 @@ SEED = 0
 
 
 @dataclass(frozen=True)
+class NextReading:
+    """The force or moment on a fixture by which rivals differ most in a pose.
+
+    Parameters
+    ----------
+    name : str
+        Of `ends.REACTIONS`.
+    difference : float [N] or [N m]
+        Size of the difference of the two predictions.
+    separation : float
+        The same in standard deviations of one reading, that of a bias of the sensor included.
+    times : int or None
+        How often it has to be read to tell them apart; None if the bias hides the difference.
+    """
+
+    name: str
+    difference: float
+    separation: float
+    times: int | None
+
+
+@dataclass(frozen=True)
 class NextPose:
     """An end pose at which rivals predict different shapes.
 
     Parameters
     ----------
-    end : (2,) [m]
+    end : (d,) [m]
     difference : float [m]
         RMS difference of the two predictions.
     separation : float
@@ -33,11 +58,14 @@ class NextPose:
         the cable included: sqrt(d^T C^-1 d) with the differences d between the predictions, as
         the sensors see them, at the places of the points that the nearest pose has. What a new
         fit of either rival could adapt to is not taken off.
+    reading : NextReading
+        What a sensor at a fixture would tell there.
     """
 
-    end: tuple[float, float]
+    end: tuple[float, ...]
     difference: float
     separation: float
+    reading: NextReading
 
 
 def next_pose(first: Fit, second: Fit) -> NextPose | None:
@@ -54,32 +82,50 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     margin = 0.1 * np.maximum(high - low, 0.1 * first.model.cable.length)
     generator = np.random.default_rng(SEED)
     places = np.linspace(0.0, first.model.cable.length, 101)
-    best: tuple[float, FloatArray, tuple[NodeCurve, NodeCurve]] | None = None
+    best: (
+        tuple[float, FloatArray, tuple[NodeCurve, NodeCurve], tuple[Observed, Observed]] | None
+    ) = None
     for _ in range(TRIED):
         end = generator.uniform(low - margin, high + margin)
         nearest = poses[int(((ends - end) ** 2).sum(axis=1).argmin())]
-        reach = float(np.hypot(*(end - np.array(nearest.start))))
+        reach = float(np.linalg.norm(end - np.array(nearest.start)))
         if not 0.03 < reach / first.model.cable.length < 0.97:
             continue
-        pose: Pose = replace(nearest, end=(float(end[0]), float(end[1])), name="next")
+        pose: Pose = replace(nearest, end=tuple(map(float, end)), name="next")
         pair = [
             predict_poses(fit.model, fit.p, _rest_now(fit), [pose])[0] for fit in (first, second)
         ]
         if pair[0] is None or pair[1] is None:
             continue
-        curves = (pair[0].curve, pair[1].curve)
+        curves, seen = (pair[0].curve, pair[1].curve), (pair[0].seen, pair[1].seen)
         gap = curves[0].at(places) - curves[1].at(places)
         difference = float(np.sqrt((gap**2).sum(axis=1).mean()))
         # Beyond a tenth of the length the rivals sit on different branches: no clean test.
         if difference > 0.1 * first.model.cable.length:
             continue
         if best is None or difference > best[0]:
-            best = (difference, end, curves)
+            best = (difference, end, curves, seen)
     if best is None:
         return None
-    difference, end, curves = best
-    place = (round(float(end[0]), 4), round(float(end[1]), 4))
-    return NextPose(place, difference, _separation(first, end, curves))
+    difference, end, curves, seen = best
+    place = tuple(round(float(x), 4) for x in end)
+    return NextPose(place, difference, _separation(first, end, curves), next_reading(first, *seen))
+
+
+def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
+    """Which reading tells two predictions of a pose apart best."""
+    tolerances, noise = fit.problem.tolerances, fit.noise.readings
+    found = []
+    for name, at in reaction_rows(fit.model.node).items():
+        moment = name.endswith("moment")
+        std = noise.moment if moment else noise.force
+        known = [fit.std(own) for own in fit.model.names if f".{name}" in own]
+        bias = max(known, default=tolerances.moment_bias if moment else tolerances.force_bias)
+        difference = float(np.linalg.norm(one.readings[at] - other.readings[at]))
+        left = (difference / APART) ** 2 - bias**2
+        times = int(np.ceil(std**2 / left)) if left > 0 else None
+        found.append(NextReading(name, difference, difference / float(np.hypot(std, bias)), times))
+    return max(found, key=lambda item: item.separation)
 
 
 def _separation(fit: Fit, end: FloatArray, curves: tuple[NodeCurve, NodeCurve]) -> float:

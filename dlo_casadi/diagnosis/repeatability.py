@@ -14,7 +14,7 @@ FloatArray = NDArray[np.floating]
 
 def limiting_spread(fit: Fit) -> float | None:
     """How badly the same pose repeats [m], where that is what limits a prediction, else None."""
-    if different_poses(fit.problem.history) >= DIFFERENT:
+    if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
         return None
     spread = repeatability(fit.problem.history, fit.model.cable.length)
     if spread is None or fit.noise.source == "repeats":

@@ -35,7 +35,6 @@ from dlo_casadi.estimation.gauss_newton import (
     Point,
 )
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
@@ -98,8 +97,7 @@ class _Linearized:
         along = problem.sweep.directions(shapes, p, rest, slopes, still)
         seen = problem.sweep.observe(shapes, p, rest, along)
         for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
-            now = Observed(problem.curve_of(seen.z[j]), shapes.lam[j])
-            change = ObservedChange(seen.slopes[j], along.lam[j])
+            now, change = seen.pose(j, self.problem.unknowns.model.cable.length)
             moved = problem.measured[j].residual_along(now, s, change)
             self.lin.by_theta[k][:, columns] = problem.whitening(j) @ moved[:, : len(columns)]
 

@@ -34,6 +34,7 @@ from dlo_casadi.effects.mass_error import MassError
 from dlo_casadi.effects.plastic_set import PlasticSet
 from dlo_casadi.effects.point_force import PointForce
 from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
+from dlo_casadi.effects.sensor_bias import SensorBias
 from dlo_casadi.effects.setup import Fitted, Setup
 from dlo_casadi.effects.side_load import SideLoad
 from dlo_casadi.effects.standoff_error import StandoffError
@@ -72,8 +73,11 @@ EFFECTS: dict[str, type[Effect]] = {
     )
 }
 
+# What finds a mass that is not declared.
+UNKNOWN_MASS: type[Effect] = MassError
+
 # What a measurement has beside them: never declared, and never blamed for a residual.
-NUISANCES: dict[str, type[Effect]] = {EdgeBias.name: EdgeBias}
+NUISANCES: dict[str, type[Effect]] = {kind.name: kind for kind in (EdgeBias, SensorBias)}
 
 
 def known_effect(name: str) -> type[Effect] | None:
@@ -84,6 +88,7 @@ def known_effect(name: str) -> type[Effect] | None:
 __all__ = [
     "EFFECTS",
     "NUISANCES",
+    "UNKNOWN_MASS",
     "AxialStretch",
     "BendingAnisotropy",
     "BendingSoftening",
@@ -114,6 +119,7 @@ __all__ = [
     "PointLoad",
     "RestCurvatureDrift",
     "SectionLaw",
+    "SensorBias",
     "Setup",
     "SideLoad",
     "Sight",

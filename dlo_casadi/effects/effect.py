@@ -268,6 +268,8 @@ class Load(Effect):
     """Slot `load`: forces with a potential. Loads add; all share one gravity."""
 
     slot: ClassVar[str] = "load"
+    # Whether it is a weight that the cable carries beside its own.
+    carried: ClassVar[bool] = False
     # Number of `springs`; without any the forces stay the same whatever the shape.
     n_springs: ClassVar[int] = 0
 
@@ -369,7 +371,7 @@ class BoundaryEffect(Effect):
 
 
 class MeasurementEffect(Effect):
-    """Slot `measurement`: from true points of the cable to measured ones."""
+    """Slot `measurement`: from true points of the cable, and true forces, to measured ones."""
 
     slot: ClassVar[str] = "measurement"
 
@@ -381,7 +383,11 @@ class MeasurementEffect(Effect):
         frame : (coordinates,)
             Of the cable at the point, as a node would carry it: in a plane its heading [rad].
         """
-        raise TypeError(f"{self.name} has no measurement map")
+        return point
+
+    def feel(self, reactions: Mapping[str, ca.SX], params: Params) -> dict[str, ca.SX]:
+        """What sensors show of forces and moments on the fixtures, by `ends.REACTIONS`."""
+        return dict(reactions)
 
 
 class StateEffect(Effect):

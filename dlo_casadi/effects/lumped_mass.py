@@ -31,6 +31,7 @@ class LumpedMass(PointLoad):
     """
 
     name = "lumped_mass"
+    carried = True
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare mass and position."""

@@ -8,6 +8,9 @@ from dlo_casadi.effects.effect import Cable, Load, Params
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.parameters import Parameter
 
+# Qualified name of its parameter.
+MASS_FACTOR = "mass_error.factor"
+
 
 class MassError(Load):
     """The mass of the cable itself is not the declared one.
@@ -32,7 +35,7 @@ class MassError(Load):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where forces are measured, and the cable has weight."""
-        return super().applies(setup) and setup.readings and any(setup.gravity)
+        return super().applies(setup) and bool(setup.readings) and any(setup.gravity)
 
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Weight of the part beyond s, over the declared one."""

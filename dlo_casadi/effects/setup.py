@@ -34,8 +34,8 @@ class Setup:
         Size of a pixel on the board; absent without photographs.
     camera : bool
         Whether it is known from where the photographs were taken.
-    readings : bool
-        Whether forces or moments on the fixtures were measured.
+    readings : tuple of str
+        Which forces and moments on the fixtures were measured, of `ends.REACTIONS`.
     tolerances : mapping
         How well declared values are known, one standard deviation, by the names of `tolerances`
         in a configuration.
@@ -54,7 +54,7 @@ class Setup:
     center: tuple[float, float] | None = None
     pixel: float | None = None
     camera: bool = False
-    readings: bool = False
+    readings: tuple[str, ...] = ()
     tolerances: Mapping[str, float] = field(default_factory=dict)
     directions: tuple[float, float] = (0.0, 0.0)
     largest_bend: float | None = None

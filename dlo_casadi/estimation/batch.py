@@ -8,7 +8,7 @@
           rest_(j+1) = rest_after(x_j, rest_j)                         (only with a state)
 
 What is measured enters through R_j, the triangular factor of the whitened residuals' Jacobian by
-the numbers z of the curve and the multipliers (of lines: whitening x normals x Hermite
+the numbers z of the curve and of readings (of lines: whitening x normals x Hermite
 interpolation): |R_j z - b_j|^2 equals the sum of squares up to a constant. Feet
 and normals are brought up to date between solves, until they stand still; at a foot the normal
 distance is stationary in s, so that the fixed point is that of the consistent problem.
@@ -31,7 +31,7 @@ from dlo_casadi.equilibrium import stats_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.sensors import ObservedChange
-from dlo_casadi.whole_pose import PoseSymbols, balance, curve, rest_after
+from dlo_casadi.whole_pose import PoseSymbols, balance, curve, readings, rest_after
 
 FloatArray = NDArray[np.floating]
 
@@ -102,11 +102,11 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
     unit = np.eye(size)
     out: list[tuple[FloatArray, FloatArray]] = []
     for j, s in zip(problem.used, point.feet, strict=True):
-        curve, lam = seen[j].curve.numbers, seen[j].lam
+        curve, readings = seen[j].curve.numbers, seen[j].readings
         each = ObservedChange(unit[: curve.size].reshape((*curve.shape, size)), unit[curve.size :])
         item, white = problem.measured[j], problem.whitening(j)
         rows = -white @ item.residual_along(seen[j], s, each)
-        here = np.concatenate([curve.ravel(), lam])
+        here = np.concatenate([curve.ravel(), readings])
         target = white @ item.residual(seen[j], s) + rows @ here
         triangle = np.linalg.qr(np.column_stack([rows, target]), mode="r")
         padded = np.zeros((count, size + 1))
@@ -118,7 +118,7 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
 
 def _n_rows(problem: BatchProblem) -> int:
     """Rows of a pose's compressed residuals: no more than what they depend on, or residuals."""
-    most = max(len(problem.measured[j].point_of) for j in problem.used)
+    most = max(problem.measured[j].n_residuals for j in problem.used)
     return min(most, problem.observed_size)
 
 
@@ -169,7 +169,7 @@ class _BatchNlp:
             ]
         )
         imbalance = balance(model, symbols) * scale
-        z = ca.vertcat(curve(model, symbols), symbols.lam)
+        z = ca.vertcat(curve(model, symbols), readings(model, symbols))
         after = ca.SX.zeros(0)
         if model.has_state:
             after = rest_after(model, symbols) / model.cable.curvature_scale

@@ -12,8 +12,13 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.equilibrium import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
-from dlo_casadi.estimation.hyperparameters import SCATTER_FLOOR, SMOOTH_MODES, refine
-from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.estimation.hyperparameters import (
+    SCATTER_FLOOR,
+    SMOOTH_MODES,
+    first_reading_noise,
+    refine,
+)
+from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import RestScatter
@@ -123,6 +128,7 @@ def fit_model(
     start: Fit | None = None,
     decades: Sequence[float] = DECADES,
     max_iterations: int = 40,
+    readings: ReadingNoise | None = None,
 ) -> Fit:
     """Fit a model to all readable fit poses.
 
@@ -146,6 +152,8 @@ def fit_model(
         Stiffnesses to start from, powers of ten about the prior.
     max_iterations : int
         Of a fit that continues from `start`.
+    readings : ReadingNoise, optional
+        Noise of forces and moments on the fixtures; estimated by default.
 
     Raises
     ------
@@ -172,6 +180,7 @@ def fit_model(
     if std is not None:
         declared = NoiseModel(std, source="declared")
         noise = with_repeats(declared, measured, model.cable.length)
+    noise = replace(noise, readings=readings or first_reading_noise(model))
     scatter = tolerances.deviation(model.node)
     count = sum(item.readable and not item.held_out for item in measured)
     if count == 1:
@@ -180,8 +189,8 @@ def fit_model(
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta, decades)
-    searched_loosely = model.in_space
-    if not searched_loosely and different_poses(measured) >= DIFFERENT and fit.beyond_noise:
+    searched_loosely, different = model.in_space, different_poses(measured, model.cable.length)
+    if not searched_loosely and different >= DIFFERENT and fit.beyond_noise:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every hanging had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
@@ -221,8 +230,8 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
     In space the search takes the points for less sure than they are: where an effect is missing,
     shapes that are held to a fraction of a millimetre allow no way to the minimum.
     """
-    loosely = NoiseModel(SEARCH_STD * problem.unknowns.model.cable.length)
-    if not problem.unknowns.model.in_space or problem.noise.std >= loosely.std:
+    loosely = problem.noise.doubted(SEARCH_STD * problem.unknowns.model.cable.length)
+    if not problem.unknowns.model.in_space or loosely is problem.noise:
         return _best(problem, theta, decades)
     rest = problem.rest_scatter
     loose = problem.changed(loosely, problem.roughness_std, problem.scatter, rest)
@@ -242,11 +251,7 @@ def _fit_to_misfit(
     ends in folds of single poses; to some millimetres it stays where what is missing can be added.
     """
     model, known = problem.unknowns.model, problem.noise
-    noise = NoiseModel(
-        MISFIT_STD * model.cable.length,
-        source="misfit",
-        declared=known.std if known.known else None,
-    )
+    noise = replace(known.doubted(MISFIT_STD * model.cable.length), source="misfit", before=known)
     scatter = problem.tolerances.deviation(model.node)
     loose = problem.changed(noise, ROUGHNESS_START, scatter, RestScatter())
     found = _best(loose, theta, decades) or near
@@ -263,16 +268,18 @@ def fitted_closely(fit: Fit) -> Fit:
     EstimationError
         As `fit_model`.
     """
-    model, problem = fit.model, fit.problem
+    model, problem, known = fit.model, fit.problem, fit.noise.before
+    assert known is not None
     free = [name for name, chosen in zip(model.names, fit.free_in(model), strict=True) if chosen]
     return fit_model(
         model,
         problem.history,
         problem.tolerances,
-        fit.noise.declared,
+        known.std if known.known else None,
         free=free,
         values=fit.p,
         decades=(0,),
+        readings=known.readings,
     )
 
 
@@ -391,7 +398,15 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
         # The coarse mesh was too far off to be followed: start again from the measured shapes.
         names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]
         std = fit.noise.std if fit.noise.source == "declared" else None
-        return fit_model(model, problem.history, problem.tolerances, std, free=names, values=fit.p)
+        return fit_model(
+            model,
+            problem.history,
+            problem.tolerances,
+            std,
+            free=names,
+            values=fit.p,
+            readings=fit.noise.readings,
+        )
     problem, point, converged = refine(
         moved.problem, moved.point, estimate=not fit.noise.known, rounds=2, modes=modes
     )

@@ -22,11 +22,10 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.assembly import Directions, Shapes
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
-from dlo_casadi.estimation.sensors import Observed, ObservedChange
+from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.rod.band import Vector
@@ -58,6 +57,8 @@ class Tolerances:
     roll: float = 1.0
     camera_rotation: float = 2e-3
     camera_translation: float = 1e-3
+    force_bias: float = 0.02
+    moment_bias: float = 2e-3
 
     def deviation(self, node: type[Node]) -> FloatArray:
         """Standard deviations of a pose's deviations, see `deviation_names`; pulls are free."""
@@ -185,25 +186,24 @@ class BatchProblem:
 
     @property
     def n_residuals(self) -> int:
-        """Number of residuals of the fitted poses: in the plane one of a point, two of a marker."""
-        return sum(len(self.measured[j].point_of) for j in self.used)
+        """Number of residuals of the fitted poses.
+
+        In the plane one of a point, two of a marker; one of each component of a reading.
+        """
+        return sum(self.measured[j].n_residuals for j in self.used)
 
     # ---- evaluation --------------------------------------------------------------------------
 
     def observed(self, theta: FloatArray, shapes: Shapes) -> list[Observed]:
         """All poses as the sensors see them."""
-        z = self.sweep.seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
-        return [Observed(self.curve_of(row), lam) for row, lam in zip(z, shapes.lam, strict=True)]
+        return self.sweep.seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
 
     @property
     def observed_size(self) -> int:
-        """Numbers that residuals depend on: those of a measured curve, and multipliers."""
+        """Numbers that residuals depend on: those of a measured curve, and of readings."""
         model = self.unknowns.model
-        return (model.chain.n + 1) * int(model.station.size1_out(0)) + model.n_border
-
-    def curve_of(self, z: FloatArray) -> NodeCurve:
-        """Curve of what the model says of its nodes."""
-        return NodeCurve.of(self.unknowns.model.cable.length, z)
+        curve = (model.chain.n + 1) * int(model.station.size1_out(0))
+        return curve + int(model.readings.size1_out(0))
 
     def whitening(self, j: int) -> FloatArray:
         """Whitening matrix (R_j, R_j) of pose j, as of the last `refresh`."""
@@ -235,14 +235,11 @@ class BatchProblem:
         p, rest = self.unknowns.p(theta), self.unknowns.rest(theta)
         along = self.sweep.by_rest(shapes, p, rest, modes_in(self.unknowns.model))
         seen = self.sweep.observe(shapes, p, rest, along)
-        return [
-            self.measured[j].residual_along(
-                Observed(self.curve_of(seen.z[j]), shapes.lam[j]),
-                s,
-                ObservedChange(seen.slopes[j], along.lam[j]),
-            )
-            for j, s in zip(self.used, feet, strict=True)
-        ]
+        out = []
+        for j, s in zip(self.used, feet, strict=True):
+            now, change = seen.pose(j, self.unknowns.model.cable.length)
+            out.append(self.measured[j].residual_along(now, s, change))
+        return out
 
     @property
     def has_metric(self) -> bool:
@@ -300,15 +297,14 @@ class BatchProblem:
         if correction is not None:
             ahead = self.sweep.observe(point.shapes, p, rest, correction)
         out = Linearization([], [], [], [], [], along)
-        size = self.unknowns.size
+        size, length = self.unknowns.size, self.unknowns.model.cable.length
         for j, s in zip(self.used, point.feet, strict=True):
-            now, item = Observed(self.curve_of(seen.z[j]), point.shapes.lam[j]), self.measured[j]
+            (now, change), item = seen.pose(j, length), self.measured[j]
             white = self.whitening(j)
             d = item.residual(now, s)
-            if ahead is not None and correction is not None:
-                change = ObservedChange(ahead.slopes[j], correction.lam[j])
-                d = d + item.residual_along(now, s, change)[:, 0]
-            directions = item.residual_along(now, s, ObservedChange(seen.slopes[j], along.lam[j]))
+            if ahead is not None:
+                d = d + item.residual_along(now, s, ahead.pose(j, length)[1])[:, 0]
+            directions = item.residual_along(now, s, change)
             whitened = white @ directions
             out.residuals.append(white @ d)
             out.by_theta.append(whitened[:, :size])

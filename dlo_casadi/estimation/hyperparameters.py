@@ -12,6 +12,7 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Poin
 from dlo_casadi.estimation.noise import (
     NoiseModel,
     NoiseSample,
+    ReadingNoise,
     estimate_noise,
     smooth_modes,
     tell_of_noise,
@@ -26,6 +27,7 @@ from dlo_casadi.estimation.rest_scatter import (
     estimate_rest_scatter,
 )
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model import CableModel
 from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
@@ -34,6 +36,8 @@ FloatArray = NDArray[np.floating]
 # be missing, few once the model is taken as complete, because noise is slow, too.
 SMOOTH_MODES = 5
 SETTLED_MODES = 2
+# A first guess of the noise of readings, over the forces in the cable.
+FIRST_FORCE = 0.01
 # Degrees of freedom from which the size of the noise can be estimated.
 LEAST_SPARE = 3.0
 ROUGHNESS_FLOOR = 1e-3
@@ -147,17 +151,63 @@ def errors_of(
                 break
         else:
             noise, together = _white_noise(problem, point), True
+    noise = replace(noise, readings=reading_noise_of(problem, point, lin))
     if repeats:
         return noise, RestScatter()
     found = rest_scatter_of(problem, point, lin, noise)
     return replace(noise, std=found.noise * noise.std) if together else noise, found.rest
 
 
+def first_reading_noise(
+    model: CableModel, force: float | None = None, moment: float | None = None
+) -> ReadingNoise:
+    """Noise of forces [N] and moments [N m] as declared; of others a first guess.
+
+    FIRST_FORCE of the forces by which such a cable hangs and bends, and at a tenth of its length.
+    """
+    cable = model.cable
+    weight = cable.mass * float(np.linalg.norm(model.gravity))
+    guess = FIRST_FORCE * (weight + cable.bending_stiffness / cable.length**2)
+    return ReadingNoise(
+        guess if force is None else force,
+        guess * cable.length / 10 if moment is None else moment,
+        force is not None,
+        moment is not None,
+    )
+
+
+def reading_noise_of(problem: BatchProblem, point: Point, lin: Linearization) -> ReadingNoise:
+    """Noise of forces and of moments where it is not declared: one fixed-point update.
+
+        std^2 = (sum of squares + guess^2) / (components - what of them the unknowns explain + 1)
+
+    so that the first guess counts as one component.
+
+    References
+    ----------
+    MacKay, Neural Computation 4 (1992).
+    """
+    own, guess = problem.noise.readings, first_reading_noise(problem.unknowns.model)
+    kinds = np.concatenate([problem.measured[j].kinds for j in problem.used])
+    if (kinds == "point").all():
+        return own
+    free = 1 - np.concatenate(Fit(problem, point, converged=True).leverages)
+    square = np.concatenate(lin.raw) ** 2
+
+    def std(kind: str, first: float) -> float:
+        of = kinds == kind
+        return float(np.sqrt((square[of].sum() + first**2) / (free[of].sum() + 1)))
+
+    force = own.force if own.force_known else std("force", guess.force)
+    moment = own.moment if own.moment_known else std("moment", guess.moment)
+    return replace(own, force=force, moment=moment)
+
+
 def rest_scatter_of(
     problem: BatchProblem, point: Point, lin: Linearization, noise: NoiseModel
 ) -> ScatterEstimate:
     """Rest curvature of each hanging's own; see `estimate_rest_scatter`."""
-    if different_poses(problem.history) < DIFFERENT:
+    if different_poses(problem.history, problem.unknowns.model.cable.length) < DIFFERENT:
         return ScatterEstimate(RestScatter(), 1.0, 1.0)
     size, std = problem.unknowns.size, problem.deviation_std
     moved = problem.moved_by_rest(point.theta, point.shapes, point.feet)
@@ -180,19 +230,21 @@ def rest_scatter_of(
 def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
     """White noise of the size of the residuals over their degrees of freedom."""
     fit = Fit(problem, point, converged=True)
-    spare = problem.n_residuals - fit.determined_unknowns
+    items = [problem.measured[j] for j in problem.used]
+    on_points = np.concatenate([item.on_points for item in items])
+    free = 1 - np.concatenate(fit.leverages)
+    spare = problem.n_residuals - fit.determined_unknowns - float(free[~on_points].sum())
     if spare < LEAST_SPARE:
         raise EstimationError(
-            f"the {problem.n_residuals} distances of {len(problem.used)} fit poses determine "
+            f"the {on_points.sum()} distances of {len(problem.used)} fit poses determine "
             f"{fit.determined_unknowns:.1f} unknowns (stiffness, rest curvature, deviations within "
             f"the tolerances): {max(spare, 0.0):.1f} degrees of freedom are left to estimate the "
             f"noise from, {LEAST_SPARE:g} are needed.\n"
             "  Try: more points on each line, more poses, the noise as measurement.std, or "
             "rest_shape: straight."
         )
-    items = [problem.measured[j] for j in problem.used]
-    weight = np.concatenate([item.relative_std[item.point_of] for item in items])
-    raw = np.concatenate(fit.linearization.raw) / weight
+    weight = np.concatenate([x.relative_std[x.point_of[x.on_points]] for x in items])
+    raw = np.concatenate(fit.linearization.raw)[on_points] / weight
     return NoiseModel(float(np.sqrt((raw**2).sum() / spare)), slow_dof=spare)
 
 
@@ -204,16 +256,21 @@ def _noise_samples(
     length = model.cable.length
     size = problem.unknowns.size
     bases, left_over = [], []
-    scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in lin.raw_directions], axis=0)
     rest = None
     if problem.rest_scatter.std > 0:
         rest = problem.moved_by_rest(point.theta, point.shapes, point.feet)
+    kept = [problem.measured[j].on_points for j in problem.used]
+    raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
+    ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]
+    scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in ways], axis=0)
     for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
-        directions = lin.raw_directions[k]
+        directions = ways[k]
         own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
-        slow = problem.measured[j].slow_rows(smooth_modes(s, length, modes, model.end == "free"))
+        sines = smooth_modes(s, length, modes, model.end == "free")
+        slow = problem.measured[j].slow_rows(sines)[kept[k]]
         if rest is not None:
-            slow = np.concatenate([slow, rest[k] / np.abs(rest[k]).max()], axis=1)
+            way = rest[k][kept[k]]
+            slow = np.concatenate([slow, way / np.abs(way).max()], axis=1)
         basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
         basis = basis[:, values > 1e-3 * values[0]]
         shared = directions[:, :size] / np.maximum(scale, 1e-300)
@@ -221,9 +278,9 @@ def _noise_samples(
         left_over.append(shared - basis @ (basis.T @ shared))
     # A direction that the poses' own ones hold already costs no further degree of freedom.
     left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
-    blocks = np.split(left[:, values > 1e-6], np.cumsum([len(raw) for raw in lin.raw])[:-1])
+    blocks = np.split(left[:, values > 1e-6], np.cumsum([len(raw) for raw in raws])[:-1])
     samples = []
-    for j, raw, s, own, block in zip(problem.used, lin.raw, point.feet, bases, blocks, strict=True):
+    for j, raw, s, own, block in zip(problem.used, raws, point.feet, bases, blocks, strict=True):
         samples += [
             NoiseSample(raw[rows], s[points], sensor.weight, own[rows], block[rows])
             for sensor, points, rows in problem.measured[j].slices

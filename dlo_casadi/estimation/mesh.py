@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import on_other_mesh
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
@@ -52,7 +51,7 @@ def discretization_error(fit: Fit) -> float:
     coarse = fit.problem.observed(fit.point.theta, fit.point.shapes)
     places = np.linspace(0.0, fit.model.cable.length, 101)
     worst = 0.0
-    for row, seen in zip(fine, coarse, strict=True):
-        gap = NodeCurve.of(fit.model.cable.length, row).at(places) - seen.curve.at(places)
+    for true, seen in zip(fine, coarse, strict=True):
+        gap = true.curve.at(places) - seen.curve.at(places)
         worst = max(worst, float(np.sqrt((gap**2).sum(axis=1).mean())))
     return 4 / 3 * worst

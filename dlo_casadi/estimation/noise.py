@@ -39,8 +39,21 @@ def correlation(kernel: Kernel, ratio: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
+class ReadingNoise:
+    """Standard deviations of one component of a force [N] and of a moment [N m] that were read.
+
+    `force_known`, `moment_known`: whether they were declared; else they are estimated.
+    """
+
+    force: float
+    moment: float
+    force_known: bool = False
+    moment_known: bool = False
+
+
+@dataclass(frozen=True)
 class NoiseModel:
-    """Covariance of one component of the errors of one pose's points.
+    """Covariance of one component of the errors of one pose's points, and of readings.
 
     Parameters
     ----------
@@ -57,8 +70,10 @@ class NoiseModel:
         something, by which a fit of it weighs the points.
     slow_dof : float
         Degrees of freedom of chi-square with which the variance of slow modes is known.
-    declared : float, optional [m]
-        Of a misfit: the standard deviation of the points that was declared.
+    readings : ReadingNoise, optional
+        Of forces and moments on the fixtures, where there are any.
+    before : NoiseModel, optional
+        Of a misfit: what was known of the noise.
     """
 
     std: float
@@ -67,12 +82,13 @@ class NoiseModel:
     kernel: Kernel = "matern"
     source: Source = "estimated"
     slow_dof: float = np.inf
-    declared: float | None = None
+    readings: ReadingNoise = ReadingNoise(1.0, 1.0)
+    before: NoiseModel | None = None
 
     @property
-    def of_points(self) -> float:
-        """Standard deviation [m] of the points themselves, as far as it is known."""
-        return self.std if self.declared is None else self.declared
+    def of_points(self) -> NoiseModel:
+        """What is known of the noise of the points themselves."""
+        return self.before if self.before is not None and self.before.known else self
 
     @property
     def known(self) -> bool:
@@ -86,6 +102,22 @@ class NoiseModel:
             distance = np.abs(s[:, None] - s[None])
             unit += self.share * correlation(self.kernel, distance / self.length)
         return self.std**2 * unit * np.outer(weight, weight)
+
+    def units(self, kinds: NDArray[np.str_]) -> FloatArray:
+        """What a unit of each residual counts as [m] (R,): one of its stds as one of a point's.
+
+        One of points, m/N of forces, 1/N of moments.
+        """
+        own = {"point": self.std, "force": self.readings.force, "moment": self.readings.moment}
+        return self.std / np.array([own[kind] for kind in kinds])
+
+    def doubted(self, std: float) -> NoiseModel:
+        """White noise of that size [m] where it is larger, that of readings grown with it."""
+        factor, own = std / self.std, self.readings
+        if factor <= 1:
+            return self
+        grown = replace(own, force=factor * own.force, moment=factor * own.moment)
+        return NoiseModel(std, readings=grown)
 
     def whitening(self, s: FloatArray, weight: FloatArray) -> FloatArray:
         """Matrix W (K, K) with W cov W^T = 1."""

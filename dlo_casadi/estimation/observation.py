@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -13,7 +14,15 @@ from scipy.linalg import block_diag
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.sensors import Centerline, Markers, Observed, ObservedChange, Sensor
+from dlo_casadi.estimation.sensors import (
+    Centerline,
+    Markers,
+    Observed,
+    ObservedChange,
+    Sensor,
+    Wrench,
+)
+from dlo_casadi.rod.node import Frame, Heading
 
 FloatArray = NDArray[np.floating]
 
@@ -27,7 +36,7 @@ class MeasuredPose:
     pose : Pose
         End conditions as declared.
     sensors : tuple of Sensor
-        Empty if the pose could not be read.
+        Those of points first; empty if the pose could not be read.
     held_out : bool
         Whether the pose is kept for the final test.
     line : (M, d) [m], optional
@@ -59,6 +68,17 @@ class MeasuredPose:
         sensor = Centerline(points, weight) if s is None else Markers(points, weight, s)
         return cls(pose, (sensor,), held_out)
 
+    def with_readings(self, readings: Mapping[str, Sequence[float]]) -> Self:
+        """The same pose with forces and moments on its fixtures, by names of `ends.REACTIONS`.
+
+        A pose that could not be read stays so.
+        """
+        if not readings or not self.readable:
+            return self
+        node = Frame if len(self.pose.start) == 3 else Heading
+        known = {name: np.array(value, dtype=float) for name, value in readings.items()}
+        return replace(self, sensors=(*self.sensors, Wrench(known, node)))
+
     @property
     def readable(self) -> bool:
         """Whether there is anything to compare with."""
@@ -80,40 +100,68 @@ class MeasuredPose:
     @cached_property
     def points(self) -> FloatArray:
         """All measured points (K, d) [m]."""
-        if not self.sensors:
-            return np.zeros((0, len(self.pose.start)))
-        return np.concatenate([sensor.points for sensor in self.sensors])
+        found = [sensor.points for sensor in self.sensors if len(sensor.points)]
+        return np.concatenate(found) if found else np.zeros((0, len(self.pose.start)))
 
     @cached_property
     def relative_std(self) -> FloatArray:
         """Relative standard deviation of each point (K,)."""
         return np.concatenate([sensor.weight for sensor in self.sensors])
 
+    @property
+    def n_residuals(self) -> int:
+        """Number R of residuals."""
+        return len(self.kinds)
+
     @cached_property
     def point_of(self) -> NDArray[np.intp]:
-        """Index (R,) of the point to which each residual belongs."""
+        """Index of the point to which each residual of points belongs: they come first."""
         per_point = [np.full(len(x.points), x.per_point) for x in self.sensors]
         return np.repeat(np.arange(len(self.points)), np.concatenate(per_point))
 
+    @cached_property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
+        return np.concatenate([sensor.kinds for sensor in self.sensors])
+
+    @property
+    def on_points(self) -> NDArray[np.bool_]:
+        """Which residuals (R,) are of points; the others are of readings."""
+        return np.asarray(self.kinds == "point")
+
+    @property
+    def reactions(self) -> tuple[str, ...]:
+        """Which forces and moments on the fixtures were measured, of `ends.REACTIONS`."""
+        return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.measured)
+
+    def readings_beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """These, measured and as a model says, by their names."""
+        found = (x.beside(seen) for x in self.sensors if isinstance(x, Wrench))
+        return {name: pair for parts in found for name, pair in parts.items()}
+
     @property
     def slices(self) -> list[tuple[Sensor, slice, slice]]:
-        """Each sensor that has points, which of the points and which of the residuals are its."""
+        """Each sensor of points, which of the points and which of the residuals are its."""
         out, point, row = [], 0, 0
         for sensor in self.sensors:
-            count, rows = len(sensor.points), len(sensor.points) * sensor.per_point
-            out.append((sensor, slice(point, point + count), slice(row, row + rows)))
+            count, rows = len(sensor.points), len(sensor.kinds)
+            if count:
+                out.append((sensor, slice(point, point + count), slice(row, row + rows)))
             point, row = point + count, row + rows
         return out
 
     def slow_rows(self, modes: FloatArray) -> FloatArray:
         """Displacements (K, count) along the cable, in each of the residuals' directions.
 
-        Beside them what the residuals of a sensor share.
+        Beside them what the residuals of a sensor share. Of what is measured at no point each
+        residual is a mode of its own.
         """
         blocks = [
             np.hstack([np.kron(modes[points], np.eye(x.per_point)), _scaled(x.together)])
             for x, points, _ in self.slices
         ]
+        if others := int((~self.on_points).sum()):
+            blocks.append(np.eye(others))
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
 
     def _parts(self, per_point: FloatArray) -> list[FloatArray]:
@@ -168,8 +216,15 @@ class MeasuredPose:
 
     def misses(self, curve: NodeCurve) -> FloatArray:
         """Size (K,) [m] of the residuals of each point of a sensor."""
-        residual = self.residual(Observed(curve, np.zeros(0)), self.nearest(curve))
-        return np.sqrt(np.bincount(self.point_of, residual**2))
+        seen, places = Observed(curve, np.zeros(0)), self.nearest(curve)
+        rows = [sensor.residual(seen, places[points]) for sensor, points, _ in self.slices]
+        return np.sqrt(np.bincount(self.point_of, np.concatenate(rows) ** 2))
+
+    def misread(self, seen: Observed, noise: NoiseModel) -> FloatArray:
+        """Errors of the readings [m] as `NoiseModel.units` have them; empty without any."""
+        rows = [x.residual(seen, np.zeros(0)) for x in self.sensors if not len(x.points)]
+        kinds = self.kinds[~self.on_points]
+        return np.concatenate([np.zeros(0), *rows]) * noise.units(kinds)
 
     def weighing(self, weight: FloatArray) -> Self:
         """The same pose with other relative standard deviations (K,) of its points."""

@@ -24,6 +24,7 @@ from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.model import CableModel
 from dlo_casadi.thresholds import EITHER
 
@@ -37,15 +38,20 @@ class Prediction:
     Parameters
     ----------
     equilibrium : Equilibrium
-    curve : NodeCurve
-        As the camera would see it.
+    seen : Observed
+        As camera and sensors would see it.
     rest : (n_rests,) [1/m]
         Rest curvature that the pose finds.
     """
 
     equilibrium: Equilibrium
-    curve: NodeCurve
+    seen: Observed
     rest: FloatArray
+
+    @property
+    def curve(self) -> NodeCurve:
+        """As the camera would see it."""
+        return self.seen.curve
 
     @property
     def either(self) -> bool:
@@ -104,8 +110,9 @@ def predict_poses(
             continue
         last = pose, eq.x
         shapes, given = eq.shapes, Given.of(p, rest, pose.vector[None])
-        z = model.assembly.curve(shapes, given)[0]
-        out.append(Prediction(eq, NodeCurve.of(model.cable.length, z), rest))
+        curve = NodeCurve.of(model.cable.length, model.assembly.curve(shapes, given)[0])
+        readings = model.assembly.readings(shapes, given)[0]
+        out.append(Prediction(eq, Observed(curve, readings), rest))
         if model.has_state:
             rest = model.assembly.state_after(shapes, given)[0][0]
     return out

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.gauss_newton import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -46,31 +47,32 @@ def threshold(fit: Fit) -> float:
         if fit.noise.source != "declared":
             break
         item = fit.problem.measured[j]
-        constant = SYSTEMATIC_SHARE * fit.noise.std * item.relative_std[item.point_of]
+        constant = np.zeros(item.n_residuals)
+        constant[item.on_points] = item.relative_std[item.point_of]
+        constant *= SYSTEMATIC_SHARE * fit.noise.std
         square += float(((fit.problem.whitening(j) @ constant) ** 2).sum())
     return (NORMAL_95 + np.sqrt(square)) ** 2 * fit.inflation**2
 
 
-def stiffness_intervals(fit: Fit) -> dict[str, Interval]:
-    """Intervals of the stiffnesses that are estimated, see `stiffness_interval`."""
-    free = [name for name in STIFFNESSES if name in fit.problem.unknowns.names]
-    return {name: stiffness_interval(fit, name) for name in free}
+def profile_intervals(fit: Fit) -> dict[str, Interval]:
+    """Intervals of the stiffnesses and of the mass's factor, as far as they are estimated."""
+    wanted = (*STIFFNESSES, MASS_FACTOR)
+    free = [name for name in wanted if name in fit.problem.unknowns.names]
+    return {name: profile_interval(fit, name) for name in free}
 
 
-def stiffness_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
-    """Profile-likelihood interval of a stiffness [N m^2].
+def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
+    """Profile-likelihood interval of a positive parameter, such as a stiffness [N m^2].
 
-    The stiffness is held, everything else refitted; the prior of the stiffness itself does not
-    count.
+    It is held, everything else refitted; its own prior does not count.
 
     Parameters
     ----------
     name : str
-        Of STIFFNESSES: bending by default.
+        The bending stiffness by default.
     """
     log_ei = float(np.log(fit.value(name)))
-    k = fit.problem.unknowns.names.index(name)
-    log_std = float(np.sqrt(max(fit.covariance[k, k], 0.0))) * fit.inflation
+    log_std = fit.std(name) / fit.value(name)
     limit = threshold(fit)
 
     def held(log_value: float, near: Point) -> tuple[Point, float] | None:

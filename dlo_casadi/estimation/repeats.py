@@ -8,15 +8,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE
 
 FloatArray = NDArray[np.floating]
 
 # Of the length: beside a fixture all repeats are where it holds them.
 _BESIDE_FIXTURES = 0.02
+# Ends so near [lengths], and clamps [rad], hold a pose in the same way: whatever the cable, its
+# shape moves by no more than about that share of its length.
+NEARLY = 1e-3
 # Of the mean of repeats, a polyline.
 _NODES = 201
 
@@ -28,7 +33,7 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
     """
     grid = np.linspace(_BESIDE_FIXTURES, 1 - _BESIDE_FIXTURES, 97) * length
     squares = []
-    for group in _groups(measured):
+    for group in _groups(measured, length):
         curves = np.array([_line(item, grid, length) for item in group])
         # From the mean of the others it is m / (m - 1) times as far as from the mean of all.
         gaps = (curves - curves.mean(axis=0)) * len(group) / (len(group) - 1)
@@ -36,10 +41,9 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 
-def different_poses(measured: Sequence[MeasuredPose]) -> int:
-    """Number of fit poses that are held differently."""
-    fitted = [item.pose for item in measured if item.readable and not item.held_out]
-    return len({tuple(pose.ends) for pose in fitted})
+def different_poses(measured: Sequence[MeasuredPose], length: float) -> int:
+    """Number of fit poses that are held differently, wherever they stand."""
+    return len(_held_alike(measured, length))
 
 
 def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: float) -> NoiseModel:
@@ -54,19 +58,20 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     ----------
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
-    if different_poses(measured) >= DIFFERENT:
+    if different_poses(measured, length) >= DIFFERENT:
         return noise  # what differs between hangings has its own place there, see `rest_scatter`
     spread = repeatability(measured, length)
     if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise
     samples = []
     nodes = np.linspace(0.0, length, _NODES)
-    for group in _groups(measured):
+    for group in _groups(measured, length):
         lines = [_line(other, nodes, length) for other in group]
         mean = NodeCurve(length, np.mean(lines, axis=0), None)
         for item in group:
             places = item.places(length)
-            gap = np.sqrt(len(group) / (len(group) - 1)) * (item.points - mean.at(places))
+            away = item.points - item.pose.start - mean.at(places)
+            gap = np.sqrt(len(group) / (len(group) - 1)) * away
             residual = item.components(mean, places, gap[..., None])[:, 0]
             inside = np.abs(places / length - 0.5) < 0.5 - _BESIDE_FIXTURES
             for sensor, points, rows in item.slices:
@@ -82,16 +87,36 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     return replace(found, source="repeats") if found.std > REPEATS_ARE_NOISE * noise.std else noise
 
 
-def _groups(measured: Sequence[MeasuredPose]) -> list[list[MeasuredPose]]:
-    """Fit poses that were held in the same way, two or more each."""
-    groups: dict[tuple[float, ...], list[MeasuredPose]] = {}
+def _groups(measured: Sequence[MeasuredPose], length: float) -> list[list[MeasuredPose]]:
+    """Measured lines of fit poses that were held in the same way, two or more each."""
+    groups = [group for group in _held_alike(measured, length) if len(group) > 1]
+    return [[item.traced for item in group] for group in groups]
+
+
+def _held_alike(measured: Sequence[MeasuredPose], length: float) -> list[list[MeasuredPose]]:
+    """Fit poses in groups, each of those that are held as its first one."""
+    groups: list[list[MeasuredPose]] = []
     for item in measured:
         if item.readable and not item.held_out:
-            groups.setdefault(tuple(item.pose.ends), []).append(item.traced)
-    return [group for group in groups.values() if len(group) > 1]
+            alike = (group for group in groups if _alike(item.pose, group[0].pose, length))
+            group = next(alike, None)
+            if group is None:
+                groups.append([item])
+            else:
+                group.append(item)
+    return groups
+
+
+def _alike(pose: Pose, other: Pose, length: float) -> bool:
+    """Whether two poses hold a cable in the same way, up to where they stand."""
+    chords = [np.subtract(one.end or one.start, one.start) / length for one in (pose, other)]
+    node = Heading if len(pose.start) == 2 else Frame
+    turned = np.abs(node.difference(np.stack(pose.frames), np.stack(other.frames))).max()
+    near = max(np.abs(chords[0] - chords[1]).max(), turned) <= NEARLY
+    return bool(near) and pose.turns == other.turns
 
 
 def _line(item: MeasuredPose, s: FloatArray, length: float) -> FloatArray:
-    """Places (K, d) [m] of a measured line at arc lengths s (K,) [m]."""
-    places = np.maximum.accumulate(item.places(length))
-    return np.stack([np.interp(s, places, column) for column in item.points.T], axis=1)
+    """Places (K, d) [m] from the start of a measured line at arc lengths s (K,) [m]."""
+    places, away = np.maximum.accumulate(item.places(length)), item.points - item.pose.start
+    return np.stack([np.interp(s, places, column) for column in away.T], axis=1)

@@ -229,7 +229,10 @@ class RestLikelihood:
 
         def deviance(q: FloatArray) -> float:
             outside = float(((q - np.clip(q, _LOWEST, _HIGHEST)) ** 2).sum())
-            return self.deviance(*sizes(q), smoothness, range_ or 1.0)[0] + outside
+            try:
+                return self.deviance(*sizes(q), smoothness, range_ or 1.0)[0] + outside
+            except np.linalg.LinAlgError:  # sizes so large that their sums are lost in rounding
+                return np.inf
 
         count = sum(free)
         start = np.zeros(count)

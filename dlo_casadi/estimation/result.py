@@ -8,7 +8,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Normal, Point
+from dlo_casadi.effects.mass_error import MASS_FACTOR
+from dlo_casadi.estimation.gauss_newton import (
+    NO_INFORMATION,
+    BatchProblem,
+    Linearization,
+    Normal,
+    Point,
+)
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.model import CableModel
 
@@ -36,6 +43,12 @@ class Fit:
     def model(self) -> CableModel:
         """The model that was fitted."""
         return self.problem.unknowns.model
+
+    @property
+    def mass(self) -> float:
+        """Mass of the cable [kg]: as declared, or as found."""
+        known = self.model.cable.mass
+        return known * self.value(MASS_FACTOR) if MASS_FACTOR in self.model.names else known
 
     @property
     def noise(self) -> NoiseModel:
@@ -96,6 +109,21 @@ class Fit:
             effective += len(block) - float(np.trace(full @ precision))
         return effective
 
+    @cached_property
+    def leverages(self) -> list[FloatArray]:
+        """What of each fitted residual (R_j,) the unknowns take up: 0 to 1."""
+        lin, out = self.linearization, []
+        for k, (a, b) in enumerate(zip(lin.by_theta, lin.by_deviation, strict=True)):
+            taken = a
+            if b.shape[1]:
+                block, cross, _ = self.normal.inner[k]
+                taken = a - b @ np.linalg.solve(block, cross)
+            own = ((taken @ self.covariance) * taken).sum(axis=1)
+            if b.shape[1]:
+                own += (b * np.linalg.solve(block, b.T).T).sum(axis=1)
+            out.append(own)
+        return out
+
     @property
     def degrees_of_freedom(self) -> float:
         """Number of residuals minus the effective number of unknowns that they determine."""
@@ -109,12 +137,13 @@ class Fit:
     @property
     def chi2_of_points(self) -> float:
         """`chi2_per_dof` by the noise of the points where the fit weighs them by its misfit."""
-        return self.chi2_per_dof * (self.noise.std / self.noise.of_points) ** 2
+        return self.chi2_per_dof * (self.noise.std / self.noise.of_points.std) ** 2
 
     @cached_property
     def residual_rms(self) -> float:
         """Root mean square residual of the fitted points [m]."""
-        return float(np.sqrt((np.concatenate(self.linearization.raw) ** 2).mean()))
+        rows = [raw[on] for raw, on in zip(self.linearization.raw, self._on_points, strict=True)]
+        return float(np.sqrt((np.concatenate(rows) ** 2).mean()))
 
     @cached_property
     def fixture_error(self) -> float:
@@ -123,27 +152,56 @@ class Fit:
         The scatter of the poses' ends and headings, carried to the curve by the equilibrium. The
         fit estimates each pose's own; of a pose that is only predicted nobody knows them.
         """
+        moved = self._by_fixtures
+        rows = [square[on] for square, on in zip(moved, self._on_points, strict=True)]
+        return float(np.sqrt(np.concatenate(rows).mean()))
+
+    @property
+    def _by_fixtures(self) -> list[FloatArray]:
+        """Variance (R_j,) of each residual by what a pose's ends differ from declared ones."""
         size, std = self.problem.unknowns.size, self.problem.deviation_std
-        moved = [
+        return [
             ((directions[:, size:] * std) ** 2).sum(axis=1)
             for directions in self.linearization.raw_directions
         ]
-        return float(np.sqrt(np.concatenate(moved).mean()))
 
     @cached_property
     def hanging_error(self) -> float:
         """RMS displacement of points [m] by the rest curvature of each hanging's own."""
+        rows = [square[on] for square, on in zip(self._by_rest, self._on_points, strict=True)]
+        return float(np.sqrt(np.concatenate(rows).sum() / self._n_points))
+
+    @cached_property
+    def _by_rest(self) -> list[FloatArray]:
+        """Variance (R_j,) of each residual by the rest curvature of each hanging's own."""
         problem = self.problem
         if problem.rest_scatter.std == 0:
-            return 0.0
+            return [np.zeros(len(raw)) for raw in self.linearization.raw]
         moved = problem.moved_by_rest(self.point.theta, self.point.shapes, self.point.feet)
-        square = 0.0
-        for way in moved:
-            sizes = np.tile(
-                problem.rest_scatter.sizes, way.shape[1] // len(problem.rest_scatter.sizes)
-            )
-            square += float(((way * sizes) ** 2).sum())
-        return float(np.sqrt(square / self._n_points))
+        sizes = problem.rest_scatter.sizes
+        return [
+            ((way * np.tile(sizes, way.shape[1] // len(sizes))) ** 2).sum(axis=1) for way in moved
+        ]
+
+    @property
+    def _on_points(self) -> list[NDArray[np.bool_]]:
+        return [self.problem.measured[j].on_points for j in self.problem.used]
+
+    @property
+    def failed(self) -> bool:
+        """Whether it stopped so far from a minimum that its numbers may be off.
+
+        A Gauss-Newton step within the bounds would still lower the objective by more than one
+        standard deviation of one parameter does: 1/2, where the residual is noise.
+        """
+        if self.converged:
+            return False
+        lower, upper = self.problem.unknowns.bounds
+        inside = (self.point.theta > lower) & (self.point.theta < upper)
+        slope = self.normal.gradient[inside]
+        hessian = self.normal.hessian[np.ix_(inside, inside)]
+        step = np.linalg.solve(hessian + NO_INFORMATION * np.eye(len(slope)), slope)
+        return bool(slope @ step > self.inflation**2)
 
     @property
     def _n_points(self) -> int:
@@ -151,18 +209,21 @@ class Fit:
 
     @cached_property
     def expected_error(self) -> float:
-        """RMS distance [m] of the points of a pose that is only predicted, if nothing is missing.
+        """RMS error [m] of a pose that is only predicted, if nothing is missing.
 
-        Noise of the points, scatter of the fixtures, uncertain parameters, and how the cable
-        repeats.
+        Of distances of points, and of readings as `NoiseModel.units` count them. Noise, scatter of
+        the fixtures, uncertain parameters, and how the cable repeats.
         """
-        per_point = self.problem.n_residuals / self._n_points
-        square = per_point * (self.noise.std**2 + self.fixture_error**2) + self.hanging_error**2
-        size, covariance = self.problem.unknowns.size, self.covariance * self.inflation**2
-        for directions in self.linearization.raw_directions:
-            by = directions[:, :size]
-            square += float(((by @ covariance) * by).sum()) / self._n_points
-        return float(np.sqrt(square))
+        problem = self.problem
+        size, covariance = problem.unknowns.size, self.covariance * self.inflation**2
+        square, count = problem.n_residuals * self.noise.std**2, self._n_points
+        for k, j in enumerate(problem.used):
+            by = self.linearization.raw_directions[k][:, :size]
+            variance = ((by @ covariance) * by).sum(axis=1) + self._by_fixtures[k]
+            units = self.noise.units(problem.measured[j].kinds)
+            square += float((units**2 * (variance + self._by_rest[k])).sum())
+            count += int((~self._on_points[k]).sum())
+        return float(np.sqrt(square / count))
 
     @property
     def inflation(self) -> float:

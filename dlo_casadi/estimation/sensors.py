@@ -14,34 +14,42 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.ends import reaction_rows
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.chords import chord_places
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.rod.node import Node
 
 FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class Observed:
-    """What a model says of one pose: its curve, and its multipliers (n_border,) [N, N m]."""
+    """What a model says of one pose: its curve, and `readings` (n_reactions,) [N, N m].
+
+    Readings are what forces and moments on the fixtures a sensor would show, see `ends.REACTIONS`.
+    """
 
     curve: NodeCurve
-    lam: FloatArray
+    readings: FloatArray
 
 
 @dataclass(frozen=True)
 class ObservedChange:
-    """How that changes along q directions: `curve` (n + 1, d or 2 d, q), `lam` (n_border, q)."""
+    """How that changes along q directions.
+
+    `curve` (n + 1, d or 2 d, q), `readings` (n_reactions, q).
+    """
 
     curve: FloatArray
-    lam: FloatArray
+    readings: FloatArray
 
 
 class Sensor(Protocol):
-    """One measurement of one pose, of R residuals, at K points of the cable (K = 0: of no point).
+    """One measurement of one pose: `per_point` residuals of each of its K points, point by point.
 
-    The residuals of points come first, `per_point` of each, point by point.
+    Or of no point at all (K = 0), but of R residuals beside the curve.
     """
 
     @property
@@ -60,8 +68,13 @@ class Sensor(Protocol):
         ...
 
     @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
+        ...
+
+    @property
     def marked(self) -> bool:
-        """Whether the arc lengths of the points are known."""
+        """Whether the arc lengths of all its points are known."""
         ...
 
     @property
@@ -104,8 +117,24 @@ class Sensor(Protocol):
         ...
 
 
+class OfPoints(ABC):
+    """What sensors of points have in common."""
+
+    points: FloatArray
+
+    @property
+    @abstractmethod
+    def per_point(self) -> int:
+        """Residuals of a point."""
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: a point."""
+        return np.full(len(self.points) * self.per_point, "point")
+
+
 @dataclass(frozen=True)
-class _Points(ABC):
+class _Points(OfPoints):
     """Points in the board's or the world's frame, compared where they are on the curve."""
 
     points: FloatArray
@@ -125,11 +154,6 @@ class _Points(ABC):
     @abstractmethod
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
-
-    @property
-    @abstractmethod
-    def per_point(self) -> int:
-        """Residuals of a point."""
 
     @property
     def together(self) -> FloatArray:
@@ -223,3 +247,86 @@ class Markers(_Points):
     def nearest(self, curve: NodeCurve) -> FloatArray:
         """The known arc lengths (K,) [m]."""
         return self.s
+
+
+@dataclass(frozen=True)
+class Wrench:
+    """Forces and moments on the fixtures, component by component: R residuals [N], [N m].
+
+    Parameters
+    ----------
+    measured : dict
+        Of the cable on whatever holds it, in world axes, moments about the fixture, by their names,
+        of `ends.REACTIONS`: (dimension,) [N], (increment,) [N m].
+    node : type of Node
+    """
+
+    measured: dict[str, FloatArray]
+    node: type[Node]
+    per_point = 0
+    marked = True
+
+    @property
+    def _rows(self) -> dict[str, slice]:
+        """Where those that were measured stand among the model's readings."""
+        return {name: at for name, at in reaction_rows(self.node).items() if name in self.measured}
+
+    def beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Measured and the model's, by their names."""
+        return {name: (self.measured[name], seen.readings[at]) for name, at in self._rows.items()}
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: a force or a moment."""
+        return np.concatenate(
+            [np.full(at.stop - at.start, name.split("_")[1]) for name, at in self._rows.items()]
+        )
+
+    @property
+    def points(self) -> FloatArray:
+        """None."""
+        return np.zeros((0, 1))
+
+    @property
+    def weight(self) -> FloatArray:
+        """None."""
+        return np.zeros(0)
+
+    @property
+    def together(self) -> FloatArray:
+        """None: their bias is the session's."""
+        return np.zeros((len(self.kinds), 0))
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """None (0,)."""
+        return np.zeros(0)
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """None (0,)."""
+        return places
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """None (0,)."""
+        return np.zeros(0)
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """Zeros (R, q): no point of theirs moves."""
+        return np.zeros((len(self.kinds), moved.shape[2]))
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,)."""
+        return np.concatenate([known - model for known, model in self.beside(seen).values()])
+
+    def residual_along(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> FloatArray:
+        """Change (R, q) of the residual along directions."""
+        return -np.concatenate([along.readings[at] for at in self._rows.values()])
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) with W cov W^T = 1; all components are independent."""
+        return np.diag(noise.units(self.kinds) / noise.std)
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same readings."""
+        return self

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.equilibrium import first_nodes
 from dlo_casadi.estimation.chords import line_nodes
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
@@ -84,18 +83,16 @@ def _kinematics(
     for iteration in range(steps + 1):
         seen = sweep.observe(shapes, problem.unknowns.fixed, flat, each)
         for k, (j, item) in enumerate(zip(used, lines, strict=True)):
-            curve = problem.curve_of(seen.z[j])
+            now, change = seen.pose(j, model.cable.length)
             if iteration > 1:
-                feet[k] = item.located(Observed(curve, shapes.lam[j]), feet[k])
+                feet[k] = item.located(now, feet[k])
             elif not item.has_line:
-                feet[k] = item.nearest(curve)
+                feet[k] = item.nearest(now.curve)
             if iteration == steps and item is not problem.measured[j]:
-                feet[k] = problem.measured[j].nearest(curve)
+                feet[k] = problem.measured[j].nearest(now.curve)
                 continue
             rolled = replace(item, pose=item.pose.rolled(roll))
-            step, cost[k] = _kinematic_step(
-                rolled, model, curve, seen.slopes[j], shapes.x[j], feet[k]
-            )
+            step, cost[k] = _kinematic_step(rolled, model, now, change, shapes.x[j], feet[k])
             if iteration < steps:
                 shapes.x[j] = model.node.moved(shapes.x[j], step)
     return shapes, feet, cost
@@ -115,14 +112,15 @@ def _each_node(sweep: Sweep) -> Directions:
 def _kinematic_step(
     item: MeasuredPose,
     model: CableModel,
-    curve: NodeCurve,
-    slopes: FloatArray,
+    now: Observed,
+    change: ObservedChange,
     x: FloatArray,
     s: FloatArray,
 ) -> tuple[FloatArray, float]:
     """Increments (n_nodes, b) towards the points, at most half a radian, and what is left [m^2]."""
     chain, node = model.chain, model.node
     n, b, d = len(x), node.increment, node.dimension
+    curve, slopes = now.curve, change.curve
     bends = node.difference(x[:-1], x[1:])
     # 3 mm of noise a point against bends that change by 0.3 turns per length from cell to cell.
     weight = 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
@@ -131,9 +129,8 @@ def _kinematic_step(
         towards = [*curve.moved(s, slopes).transpose((1, 0, 2))]
         gaps = [*(item.points - curve.at(s)).T]
     else:  # a single photograph tells no depth
-        now = Observed(curve, np.zeros(0))
-        towards = [-item.residual_along(now, s, ObservedChange(slopes, np.zeros((0, n * b))))]
-        gaps = [item.residual(now, s)]
+        on = item.on_points
+        towards, gaps = [-item.residual_along(now, s, change)[on]], [item.residual(now, s)[on]]
     system: list[FloatArray] = [*towards, rough]
     target: list[FloatArray] = [*gaps, -weight * np.diff(bends, axis=0).ravel()]
     if item.pose.end is not None:

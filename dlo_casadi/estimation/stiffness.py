@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from dlo_casadi.assembly import Shapes
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.sweep import Sweep
@@ -67,10 +66,9 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
             if cold is None:
                 return shapes, np.inf
             moved = cold
-        z = sweep.seen(moved, at(log_ei), rest)
         total = sum(
-            float((item.distances(NodeCurve.of(model.cable.length, row)) ** 2).sum())
-            for row, item in zip(z, used, strict=True)
+            float((item.distances(seen.curve) ** 2).sum())
+            for seen, item in zip(sweep.seen(moved, at(log_ei), rest), used, strict=True)
         )
         return moved, total
 

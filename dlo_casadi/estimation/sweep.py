@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from dlo_casadi.assembly import Assembly, CurveSlopes, Directions, Given, Shapes
 from dlo_casadi.descent import descend
 from dlo_casadi.equilibrium import JOINT_BOUND, Pose
+from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 
@@ -36,10 +38,23 @@ DOWNHILL = 40
 
 @dataclass(frozen=True)
 class Observations:
-    """Measured curves `z` (m, n + 1, 2 or 4) and their derivatives (..., q) along directions."""
+    """What sensors would see of m poses, and how it changes along q directions.
+
+    Measured curves `z` (m, n + 1, d or 2 d) and `readings` (m, n_reactions), see
+    `ends.REACTIONS`; `slopes` and `reading_slopes` (..., q).
+    """
 
     z: FloatArray
     slopes: FloatArray
+    readings: FloatArray
+    reading_slopes: FloatArray
+
+    def pose(self, j: int, length: float) -> tuple[Observed, ObservedChange]:
+        """Of one pose, of a cable of that length [m]."""
+        return (
+            Observed(NodeCurve.of(length, self.z[j]), self.readings[j]),
+            ObservedChange(self.slopes[j], self.reading_slopes[j]),
+        )
 
 
 class Sweep:
@@ -354,17 +369,27 @@ class Sweep:
     def observe(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Directions
     ) -> Observations:
-        """Measured curves and their derivatives along directions."""
-        slopes = self.curve_slopes(shapes, p, rest)
-        return Observations(slopes.z, slopes.along(along))
+        """Measured curves and readings, and their derivatives along directions."""
+        given = self._given(shapes, p, rest)
+        slopes = self.assembly.curve_slopes(shapes, given)
+        return Observations(
+            slopes.z,
+            slopes.along(along),
+            self.assembly.readings(shapes, given),
+            self.assembly.readings_along(shapes, given, along),
+        )
 
     def curve_slopes(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> CurveSlopes:
         """Measured curves and what their derivatives are made of."""
         return self.assembly.curve_slopes(shapes, self._given(shapes, p, rest))
 
-    def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Measured curves (m, n + 1, 2 or 4) only."""
-        return self.assembly.curve(shapes, self._given(shapes, p, rest))
+    def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
+        """What sensors see of each pose."""
+        given, length = self._given(shapes, p, rest), self.model.cable.length
+        both = zip(
+            self.assembly.curve(shapes, given), self.assembly.readings(shapes, given), strict=True
+        )
+        return [Observed(NodeCurve.of(length, z), readings) for z, readings in both]
 
     def stable(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> NDArray[np.bool_]:
         """Whether each pose is a strict minimum of the energy under its end conditions."""

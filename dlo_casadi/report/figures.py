@@ -43,7 +43,7 @@ from dlo_casadi.report.geometry import (
 from dlo_casadi.report.overlay import write_overlays
 from dlo_casadi.report.room import Room, around, rooms, seen
 from dlo_casadi.report.scene import pull_marks, scene_of
-from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
+from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape, Stage
 
 FloatArray = NDArray[np.floating]
 
@@ -65,6 +65,8 @@ def write_figures(folder: Path, outcome: Outcome) -> None:
     if any(stage.shapes for stage in outcome.stages):
         draw_residuals(folder / "residuals.png", outcome)
         draw_rest_curvature(folder / "rest_curvature.png", outcome)
+    if outcome.measurement.readings and outcome.stages[-1].shapes:
+        draw_readings(folder / "readings.png", outcome)
     draw_errors(folder / "errors.png", outcome)
     if outcome.candidates:
         draw_candidates(folder / "candidates.png", outcome)
@@ -98,6 +100,7 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
     center, span = _common_frame(outcome, poses)
     if standing:
         span = standing[0].window
+    metre = _length_of_newton(outcome)
     width = max(3.1 * columns, 7.5)
     height = 0.82 * width / columns * float(span[1] / span[0])
     if rows == 1 and height > _TALLEST:
@@ -109,6 +112,8 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
                 _draw_in_room(axes, outcome, pose, lines, factor, room)
                 continue
             _draw_pose(axes, pose, lines, factor, np.asarray)
+            if lines and pose.name in lines[-1][0].shapes:
+                _draw_forces(axes, lines[-1][0].shapes[pose.name], metre)
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
         for axes in grid.ravel()[len(poses) :]:
@@ -122,8 +127,10 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
             Line2D([], [], color=color, ls=style, label=label_of(stage, outcome))
             for stage, color, style in lines
         ]
-        if standing:
+        if standing or outcome.measurement.readings:
             handles.append(Line2D([], [], color=FORCE, label="force on the ends"))
+        if outcome.measurement.readings:
+            handles.append(Line2D([], [], color=BLACK, ls=":", label="force as read"))
         if any(pose.role == "held_out" for pose in poses):
             handles.append(Patch(fc="white", ec=_HELD_OUT, lw=2, label="held out of the fit"))
         drawing.legend(handles=handles, loc="outside lower center", ncols=len(handles))
@@ -241,6 +248,33 @@ def _draw_pose(
             spine.set(visible=True, color=_HELD_OUT, linewidth=2)
 
 
+def _length_of_newton(outcome: Outcome) -> float:
+    """How long a newton is drawn in a plane [m/N]: the largest force a sixth of the cable."""
+    shapes = outcome.stages[-1].shapes.values() if outcome.stages else []
+    forces = [
+        float(np.linalg.norm(force))
+        for shape in shapes
+        for name, pair in shape.readings.items()
+        for force in pair
+        if name.endswith("force")
+    ]
+    return outcome.config.cable.length / 6 / max(forces, default=1.0)
+
+
+def _draw_forces(axes: Axes, shape: PoseShape, metre: float) -> None:
+    """Forces that were read at the ends, and what a sensor would show of the predicted ones."""
+    for name, place in (("start_force", shape.curve[0]), ("end_force", shape.curve[-1])):
+        for force, color, style in zip(
+            reversed(shape.readings.get(name, ())), (FORCE, BLACK), ("-", ":"), strict=False
+        ):
+            axes.annotate(
+                "",
+                place + metre * force,
+                place,
+                arrowprops={"arrowstyle": "->", "color": color, "ls": style, "shrinkA": 0},
+            )
+
+
 def _common_frame(outcome: Outcome, poses: Sequence[PoseInput]) -> tuple[FloatArray, FloatArray]:
     """Middle and size [m] of a window that holds everything drawn."""
     drawn = [pose.points for pose in poses if len(pose.points)]
@@ -299,6 +333,48 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
         )
 
 
+# ---- readings ----------------------------------------------------------------------------------
+
+
+def draw_readings(path: Path, outcome: Outcome) -> None:
+    """Forces and moments on the fixtures, measured minus predicted, in units of their noise."""
+    stage = outcome.stages[-1]
+    names = sorted({name for shape in stage.shapes.values() for name in shape.readings})
+    poses = [x for x in outcome.poses if x.name in stage.shapes and stage.shapes[x.name].readings]
+    with figure(path, (8.5, 0.9 + 2.4 * len(names))) as drawing:
+        grid = drawing.subplots(len(names), 1, squeeze=False, sharex=True)
+        for axes, name in zip(grid[:, 0], names, strict=True):
+            std, unit = outcome.measurement.std_of(name.split("_")[1])
+            axes.axhspan(-2, 2, color="#EDEDED", zorder=0)
+            axes.axhline(0, color=GREY, lw=0.8)
+            for k, pose in enumerate(poses):
+                if name not in stage.shapes[pose.name].readings:
+                    continue
+                known, model = stage.shapes[pose.name].readings[name]
+                color = _HELD_OUT if pose.role == "held_out" else BLUE
+                apart = 0.2 * (np.arange(len(known)) - (len(known) - 1) / 2)
+                axes.plot(k + apart, (known - model) / std, ".-", color=color, lw=0.6, ms=6)
+            count = len(
+                next(x.readings[name][0] for x in stage.shapes.values() if name in x.readings)
+            )
+            parts = f"{', '.join('xyz'[:count])} from left to right, " if count > 1 else ""
+            axes.set_title(f"{name}: {parts}noise {std:.3g} {unit}", loc="left")
+            axes.set_ylabel("residual / noise")
+        ticks = [pose.name for pose in poses]
+        grid[-1, 0].set_xticks(range(len(poses)), ticks, rotation=60, ha="right", fontsize=8)
+        handles = [Line2D([], [], color=BLUE, marker="o", ls="none", label="fit pose")]
+        if any(pose.role == "held_out" for pose in poses):
+            handles.append(
+                Line2D([], [], color=_HELD_OUT, marker="o", ls="none", label="held-out pose")
+            )
+        drawing.legend(handles=handles, loc="outside lower center", ncols=2)
+        drawing.suptitle(
+            f"{outcome.config.cable.name}: readings, measured minus predicted "
+            f"({label_of(stage, outcome)})",
+            fontsize=12,
+        )
+
+
 # ---- rest curvature ----------------------------------------------------------------------------
 
 
@@ -334,7 +410,7 @@ def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
 def draw_moment(path: Path, outcome: Outcome) -> None:
     """Bending moment against curvature of a cable with a free end, measured and fitted."""
     cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
-    weight = cable.mass / cable.length * float(np.linalg.norm(gravity))
+    weight = outcome.fit.mass / cable.length * float(np.linalg.norm(gravity))
     shown = [p for p in outcome.poses if p.role == "fit" and len(p.points) >= LEAST_POINTS]
     if not weight or not shown or cable.rest_shape != "straight":
         return  # the moment needs the weight, and the bend the shape without load

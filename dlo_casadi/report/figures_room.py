@@ -18,6 +18,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "world": {"color": GREY, "lw": 0.9},
     "weight": {"color": GREY, "lw": 0.9},
     "force": {"color": FORCE, "lw": 1.2},
+    "force-read": {"color": BLACK, "lw": 1.0, "ls": ":"},
     "taken": {"color": SKY, "lw": 1.2},
     "pulled": {"color": GREEN, "lw": 5, "solid_capstyle": "butt"},
     "pull": {"color": VERMILLION, "lw": 1.6},

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.errors import well_formed
-from dlo_casadi.session.outcome import Outcome, ParameterEstimate, RestCurvatureEstimate, StageName
+from dlo_casadi.session.outcome import (
+    Outcome,
+    ParameterEstimate,
+    ReadingErrors,
+    RestCurvatureEstimate,
+    StageName,
+)
 
 SCHEMA = "dlo-report/1"
 # In every report, in this order; `closed` only where an effect was added.
@@ -41,6 +47,9 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
             "std": measurement.std,
             "std_source": measurement.std_source,
             "correlation_length_m": measurement.correlation_length,
+            "readings": measurement.readings,
+            "force_std": measurement.force_std,
+            "moment_std": measurement.moment_std,
         },
         "stages": [_stage(name, outcome) for name in names],
         "repeatability": {
@@ -60,6 +69,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "unexplained": outcome.unexplained,
         "next_pose": outcome.next_pose,
         "structure": outcome.structure,
+        "hidden_weight": outcome.hidden_weight,
     }
     plain: dict[str, Any] = finite(document)
     return plain
@@ -118,6 +128,8 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
             "name": name,
             "rmse_fit": None,
             "rmse_held_out": None,
+            **_reading_errors(ReadingErrors(), ReadingErrors()),
+            "readings": {},
             "rmse_fit_measured_branch": None,
             "rmse_held_out_measured_branch": None,
             "other_branch": {},
@@ -136,6 +148,15 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
         "name": name,
         "rmse_fit": stage.rmse_fit,
         "rmse_held_out": stage.rmse_held_out,
+        **_reading_errors(stage.readings_fit, stage.readings_held_out),
+        "readings": {
+            pose: {
+                key: {"measured": known, "predicted": model}
+                for key, (known, model) in shape.readings.items()
+            }
+            for pose, shape in stage.shapes.items()
+            if shape.readings
+        },
         "rmse_fit_measured_branch": stage.rmse_fit_measured_branch,
         "rmse_held_out_measured_branch": stage.rmse_held_out_measured_branch,
         "other_branch": {
@@ -149,6 +170,15 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
         "held_out": asdict(outcome.held_out(stage)),
         "chi2_per_dof": stage.chi2_per_dof,
         "parameters": parameters,
+    }
+
+
+def _reading_errors(fit: ReadingErrors, held_out: ReadingErrors) -> dict[str, float | None]:
+    return {
+        "force_rmse_fit": fit.force,
+        "force_rmse_held_out": held_out.force,
+        "moment_rmse_fit": fit.moment,
+        "moment_rmse_held_out": held_out.moment,
     }
 
 

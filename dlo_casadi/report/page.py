@@ -15,6 +15,7 @@ from markupsafe import Markup, escape
 from dlo_casadi.report.page_charts import charts
 from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.page_pictures import pictures, scene_pictures
+from dlo_casadi.report.page_views import view_pictures_of
 from dlo_casadi.report.room import VIEWS
 from dlo_casadi.report.terminal import vector
 from dlo_casadi.session.outcome import Outcome
@@ -35,6 +36,7 @@ def report_page(outcome: Outcome) -> str:
         [_script_library(), page_script()],
         outcome.config.experiment.in_space,
         pictures=drawn,
+        photographs=view_pictures_of(outcome),
         room=drawn[0].room,
         scenes=scene_pictures(outcome),
         charts={name: as_data(text) for name, text in charts(outcome).items()},

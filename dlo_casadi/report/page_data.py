@@ -19,6 +19,7 @@ from dlo_casadi.report.terminal import (
     nuisance_rows,
     p_value_note,
     predicted_share,
+    reading_text,
     rest_rows,
     separation_text,
     timing_rows,
@@ -68,7 +69,7 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "footnotes": footnotes(outcome),
         "photographed": m.kind == "images",
         "next_pose": outcome.next_pose,
-        "next_pose_said": outcome.next_pose and sentence(separation_text(outcome.next_pose)),
+        "next_pose_said": outcome.next_pose and _said_of(outcome.next_pose),
         "unexplained": outcome.unexplained,
         "timing": timing_rows(outcome),
         "mesh": f"{outcome.discretization.n} {outcome.discretization.element}s, "
@@ -76,6 +77,11 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "versions": outcome.versions,
         "configuration": configuration_text(outcome.config),
     }
+
+
+def _said_of(proposal: dict[str, Any]) -> str:
+    """What a pose that is proposed would tell: by its shape, and by a reading."""
+    return f"{sentence(separation_text(proposal))} {reading_text(proposal['reading'])}"
 
 
 def sentence(line: str) -> str:
@@ -88,7 +94,7 @@ def sentence(line: str) -> str:
 
 def verdict_word(outcome: Outcome) -> str:
     """The verdict in one or two words."""
-    if not outcome.fit.converged:
+    if outcome.fit.failed:
         return "Fit failed"
     if outcome.verdict is None:
         return "Not diagnosed"

@@ -14,6 +14,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.report.page import page_script, render
 from dlo_casadi.report.page_data import configuration_text, sentence
 from dlo_casadi.report.page_pictures import pictures_of_failure
+from dlo_casadi.report.page_views import view_pictures
 from dlo_casadi.session.outcome import PoseInput
 
 
@@ -59,11 +60,12 @@ def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = (
         heading=sentence(heading),
         rest=rest,
         hints=hints([error.message, *(pose.problem for pose in shown)]),
-        read=sum(len(pose.points) > 0 for pose in shown),
+        read=sum(pose.readable for pose in shown),
         reached=bool(poses),
         skipped=[item for item in config.skipped if item.name not in {x.name for x in shown}],
         photographed=config.experiment.measurement.kind == "images",
         pictures=pictures_of_failure(config, shown),
+        photographs=view_pictures(shown),
         configuration=configuration_text(config),
     )
 

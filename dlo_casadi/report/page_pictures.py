@@ -184,8 +184,8 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
         lines.append(
             Line(
                 kind,
-                _svg(drawn[-1], 1),
-                _svg(behind.points(near), 2),
+                svg(drawn[-1], 1),
+                svg(behind.points(near), 2),
                 _solid(behind.room, shape.curve, 1),
                 _solid(behind.room, near, 2),
             )
@@ -202,6 +202,8 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
     last = None if after is None else after.shapes.get(pose.name)
     if behind.room is not None and last is not None:
         facts.append(("force", "forces on start, end", _newtons(last.forces)))
+    if last is not None:
+        facts += [("force-read", *fact) for fact in _readings(outcome, last)]
     declared = next(item for item in outcome.config.experiment.poses if item.name == pose.name)
     under, over = _around(declared, pose, last, behind.room)
     return Picture(
@@ -226,7 +228,7 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
 
 def _measured(pose: PoseInput, behind: Background) -> Line:
     solid = _solid(behind.room, pose.points, 2)
-    return Line("measured", _svg(behind.points(pose.points), 2), solid=solid)
+    return Line("measured", svg(behind.points(pose.points), 2), solid=solid)
 
 
 def _around(
@@ -240,7 +242,7 @@ def _around(
 
 
 def _drawn(mark: Mark) -> Solid:
-    return Solid(mark.kind, _svg(flat(mark.points), 1), _text(mark.points, 1), mark.label)
+    return Solid(mark.kind, svg(flat(mark.points), 1), _text(mark.points, 1), mark.label)
 
 
 def _solid(room: Room | None, points: FloatArray, decimals: int) -> str:
@@ -254,6 +256,19 @@ def _text(points: FloatArray, decimals: int) -> str:
 
 def _newtons(forces: FloatArray) -> str:
     return ", ".join(f"{np.linalg.norm(force):.3g}" for force in forces) + " N"
+
+
+def _readings(outcome: Outcome, shape: PoseShape) -> list[tuple[str, str]]:
+    """Each reading by its name: how far from the predicted one, in units and in its noise."""
+    facts = []
+    for name, (known, model) in shape.readings.items():
+        kind = name.split("_")[1]
+        std, unit = outcome.measurement.std_of(kind)
+        off = float(np.linalg.norm(known - model))
+        size = float(np.linalg.norm(known))
+        text = f"{size:.3g} {unit}, {off:.2g} {unit} from predicted"
+        facts.append((name.replace("_", " ") + " read", f"{text} ({off / std:.1f} std)"))
+    return facts
 
 
 def _seen(pose: PoseInput) -> str:
@@ -279,7 +294,7 @@ def _alt(outcome: Outcome, pose: PoseInput, behind: Background) -> str:
     )
 
 
-def _svg(points: FloatArray, decimals: int) -> str:
+def svg(points: FloatArray, decimals: int) -> str:
     """Points as SVG has them; nothing where the camera cannot see a point of it."""
     if not np.isfinite(points).all():
         return ""

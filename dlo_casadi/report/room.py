@@ -7,7 +7,7 @@ gravity. The page and the figures draw them from the same places.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, radians, sin
 
 import numpy as np
@@ -162,6 +162,9 @@ def around(
             over += room.clamp(at, orientation)
         if shape is not None:
             over.append(room.force(at, shape.forces[k]))
+            if f"{side}_force" in shape.readings:
+                measured_force, _ = shape.readings[f"{side}_force"]
+                over.append(replace(room.force(at, measured_force), kind="force-read"))
         # A line of no length at all would not be drawn.
         spot = np.stack([at, at + 0.1])
         over += [Mark(f"{kind} {side}", spot) for kind in ("fixture-casing", "fixture")]

@@ -17,9 +17,11 @@ from dlo_casadi.report.canvas import label_of
 from dlo_casadi.report.geometry import directions
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.session.outcome import (
+    MASS,
     BranchShape,
     Outcome,
     ParameterEstimate,
+    ReadingErrors,
     Stage,
     StageName,
 )
@@ -150,9 +152,10 @@ def nuisance_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
 def fixed_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
     """What was declared and kept."""
     cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
+    fitted = outcome.stages[-1].parameters
     rows = [
         ("length", f"{cable.length:g} m", "", "fixed"),
-        ("mass", f"{cable.mass:g} kg", "", "fixed"),
+        *([("mass", f"{cable.mass:g} kg", "", "fixed")] if MASS not in fitted else []),
         ("gravity", vector(gravity, "g", "m/s^2"), "", "fixed"),
     ]
     unknowns = outcome.fit.problem.unknowns
@@ -176,10 +179,20 @@ def footnotes(outcome: Outcome) -> list[str]:
             "Try: poses in which weight and stiffness compete more (ends close together), or "
             "hang a known weight on the cable and declare it under model.effects."
         )
-    elif stiffness is not None:
+    elif stiffness is not None and not outcome.measurement.readings:
         known = "EI is" if twisting is None else "EI and GJ are"
+        weight = outcome.fit.mass * math.hypot(*outcome.config.experiment.gravity)
+        ratio = f" EI over weight is {stiffness.value / weight:.4g} m^2." if weight else ""
         lines.append(
             f"Shapes give the ratio of stiffness to weight: {known} as good as the declared mass."
+            f"{ratio}"
+        )
+        lines += absolute_lines(outcome)
+    mass = outcome.stages[-1].parameters.get(MASS)
+    if mass is not None and mass.identifiable is False:
+        lines.append(
+            "The readings do not tell mass from EI: only their ratio is known. Try: end_force or "
+            "start_force of more poses, or a smaller force_std and force_bias."
         )
     if twisting is not None and twisting.identifiable is False:
         lines.append(
@@ -187,6 +200,23 @@ def footnotes(outcome: Outcome) -> list[str]:
             "end clamp rolled by up to half a turn."
         )
     return lines
+
+
+def absolute_lines(outcome: Outcome) -> list[str]:
+    """In which pose a reading of a force tells mass and stiffnesses best: all grow alike."""
+    ends = ("start", "end") if outcome.config.experiment.boundary.end != "free" else ("start",)
+    forces = {
+        (name, side): float(np.linalg.norm(force))
+        for name, shape in outcome.stages[-1].shapes.items()
+        for side, force in zip(ends, shape.forces, strict=False)
+    }
+    if not forces or not any(outcome.config.experiment.gravity):
+        return []
+    (pose, side), force = max(forces.items(), key=lambda item: item[1])
+    return [
+        f"One reading of {side}_force as in {pose}, {force:.3g} N, would tell it: to 1 % if noise "
+        f"and offset of the sensor are below {force / 100:.2g} N."
+    ]
 
 
 def rest_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
@@ -237,10 +267,23 @@ def error_table(outcome: Outcome) -> Table:
                 "held out": _mm(stage.rmse_held_out_measured_branch),
             }
             table.add_row(f"  {ON_BRANCH}", *(cells.get(column, "") for column in columns))
+    last = outcome.stages[-1]
+    if outcome.measurement.readings:
+        cells = {
+            "fit": _newtons(last.readings_fit),
+            "held out": _newtons(last.readings_held_out),
+        }
+        table.add_row("  forces, moments", *(cells.get(column, "") for column in columns))
     table.add_section()
     floor = [_mm(outcome.measurement.std)] + [""] * (len(columns) - 1)
     table.add_row(f"noise ({outcome.measurement.std_source})", *floor)
     return table
+
+
+def _newtons(errors: ReadingErrors) -> str:
+    """Errors of forces and moments, as far as there are any."""
+    found = ((errors.force, "N"), (errors.moment, "N m"))
+    return ", ".join(f"{value:.2g} {unit}" for value, unit in found if value is not None) or "-"
 
 
 # The errors of a stage, of which some poses were measured in another equilibrium.
@@ -280,7 +323,7 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     """What the diagnosis has led to, in sentences."""
     if outcome.doubts:
         head, *others = (f"{text[:1].upper()}{text[1:]}." for text in outcome.doubts)
-        word = "unexplained" if outcome.fit.converged else "the fit has failed"
+        word = "the fit has failed" if outcome.fit.failed else "unexplained"
         lines = [f"Verdict: {word}. {head}", *(f"  {text}" for text in others)]
     elif outcome.verdict is not None:
         lines = [_verdict(outcome)]
@@ -296,11 +339,18 @@ def verdict_lines(outcome: Outcome) -> list[str]:
             f"  Without naming a cause: pulled by {vector(force, '.3g', 'N')} on average "
             f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
+        experiment = outcome.config.experiment
+        if experiment.boundary.end == "free" and np.dot(force, experiment.gravity) < 0:
+            lines.append(
+                "  Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or "
+                "another stiffness may stand behind it."
+            )
     if outcome.next_pose is not None:
         lines.append(
             f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "
             f"{vector(outcome.next_pose['end'], '.3f', 'm')}; {separation_text(outcome.next_pose)}"
         )
+        lines.append(f"  {reading_text(outcome.next_pose['reading'])}")
     return lines
 
 
@@ -323,6 +373,19 @@ def separation_text(proposal: dict[str, Any]) -> str:
     if repeats <= MOST_REPEATS:
         return text + f"measure it {repeats} times."
     return text + f"even {MOST_REPEATS} measurements would not tell them apart."
+
+
+def reading_text(proposal: dict[str, Any]) -> str:
+    """What a reading of force or moment in the proposed pose would tell of rivals."""
+    unit = "N m" if proposal["name"].endswith("moment") else "N"
+    text = (
+        f"A reading of {proposal['name']} there differs by {proposal['difference']:.2g} {unit}, "
+        f"{proposal['separation']:.2g} standard deviations of one: "
+    )
+    if proposal["times"] is None or proposal["times"] > MOST_REPEATS:
+        return text + "it would not tell them apart."
+    times = proposal["times"]
+    return text + ("one suffices." if times == 1 else f"read it {times} times.")
 
 
 # What the residual may depend on, by the key of its normal score.

@@ -85,6 +85,11 @@ class Node(ABC):
     def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
         """Moments (..., increment) about the axes of nodes (..., coordinates), to the world's."""
 
+    @staticmethod
+    @abstractmethod
+    def in_world(x: ca.SX, moment: ca.SX) -> ca.SX:
+        """`to_world` of one moment (increment,) as an expression."""
+
     @classmethod
     @abstractmethod
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
@@ -143,6 +148,11 @@ class Heading(Node):
     def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
         """A moment in a plane is the same about both."""
         return vectors
+
+    @staticmethod
+    def in_world(x: ca.SX, moment: ca.SX) -> ca.SX:
+        """A moment in a plane is the same about both."""
+        return moment
 
     @classmethod
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
@@ -234,6 +244,11 @@ class Frame(Node):
     def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
         """Turned by the frames."""
         return Rotation.from_quat(x).apply(vectors)
+
+    @staticmethod
+    def in_world(x: ca.SX, moment: ca.SX) -> ca.SX:
+        """Turned by the frame."""
+        return rotated(x, moment)
 
     @classmethod
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:

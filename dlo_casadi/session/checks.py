@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
 from dlo_casadi.config import Pose as DeclaredPose
-from dlo_casadi.errors import MeasurementError
+from dlo_casadi.ends import reaction_rows
+from dlo_casadi.errors import EstimationError, MeasurementError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
+from dlo_casadi.model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.session.declared import declared_model, straight
 from dlo_casadi.session.hanging import pulled_elsewhere
 from dlo_casadi.session.headings import wrong_headings
@@ -31,6 +34,7 @@ from dlo_casadi.session.plausibility_in_space import (
     suspicions_in_space,
     wrong_orientations,
 )
+from dlo_casadi.session.plausibility_of_readings import Compared, misread
 from dlo_casadi.thresholds import CONTRADICTS, FITS, MUCH_BETTER, OUT_OF_STEP
 
 FloatArray = NDArray[np.floating]
@@ -41,6 +45,13 @@ NEVERTHELESS = (
 
 # Elements, poses and stiffnesses (over the declared one) that show which way a cable hangs.
 _MESH, _POSES = 12, 8
+# Coefficients of the rest curvature, and noise over the length, of a fit that shows what forces
+# shapes need: effects that are missing are below it.
+_REST, _FAITHFUL = 4, 2e-3
+_DECADES = (0, -1, 1)
+# Stiffness over weight is known if its relative standard deviation is below this: units are told
+# where forces are five times off.
+_SIZED = 0.5
 # Points of a line between which its length is measured.
 _SPARSE = 60
 # Of the length: no other explanation is looked for once one comes so near.
@@ -112,12 +123,62 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
     if not any(item.certain for item in found):
         doubtful = {item.pose for item in found}
         sound = [item for item in read if item.name not in doubtful]
+        found += _misread(config, sound)
         if in_space:
             lines_in_space = [(item.points, item.s) for item in sound]
             found += pulled_elsewhere(lines_in_space, config.experiment.gravity)
         else:
             found += hangs_elsewhere(config, sound)
     return found
+
+
+def _misread(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Readings held against the forces that the shapes need, by a coarse fit of some poses."""
+    declared = {pose.name: pose for pose in config.experiment.poses}
+    fitted = [item for item in read if item.role == "fit" and not item.views]
+    fitted = [item for item in fitted if declared[item.name].readings]
+    shown = fitted[:: max(1, -(-len(fitted) // _POSES))]
+    if not shown:
+        return ()
+    measured = [_posed(declared[item.name], item, item.points) for item in shown]
+    model = declared_model(config).model
+    model = replace(model, effects=(), priors={}, n=_MESH, n_rest=_REST)
+    try:
+        noise = _FAITHFUL * config.cable.length
+        fit = fit_model(model, measured, Tolerances(), noise, decades=_DECADES)
+    except EstimationError:
+        return ()
+    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    rows = reaction_rows(model.node)
+    compared = []
+    for name, at in rows.items():
+        side, kind = name.split("_")
+        own = [k for k, item in enumerate(shown) if name in declared[item.name].readings]
+        if not own:
+            continue
+        frames = None
+        if getattr(model, side) == "clamped":
+            held = (measured[k].pose.frames[side == "end"] for k in own)
+            frames = np.array([_axes_of(model, frame) for frame in held])
+        forces = np.array([seen[k].readings[rows[f"{side}_force"]] for k in own])
+        compared.append(
+            Compared(
+                name,
+                np.array([declared[shown[k].name].readings[name] for k in own]),
+                np.array([seen[k].readings[at] for k in own]),
+                frames,
+                forces if kind == "moment" else None,
+            )
+        )
+    return misread(compared, sized=fit.std(BENDING_STIFFNESS) < _SIZED * fit.p[0])
+
+
+def _axes_of(model: CableModel, frame: FloatArray) -> FloatArray:
+    """Axes (d, d) of a clamp in the world, in columns."""
+    if model.in_space:
+        return model.node.to_world(frame, np.eye(3)).T
+    c, s = np.cos(frame[0]), np.sin(frame[0])
+    return np.array([[c, -s], [s, c]])
 
 
 def _stretched(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:

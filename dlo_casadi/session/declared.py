@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
-from dlo_casadi.effects import EFFECTS, NUISANCES
+from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.model import END_ROLL, CableModel
@@ -47,13 +47,19 @@ class Declared:
         return p
 
 
-def nuisances(model: CableModel, tolerances: Tolerances, pixel: float | None = None) -> CableModel:
+def nuisances(
+    model: CableModel,
+    tolerances: Tolerances,
+    pixel: float | None = None,
+    readings: tuple[str, ...] = (),
+) -> CableModel:
     """Return the model with what is known of its effects before any shape as nuisances.
 
     What lies within a declared tolerance gets a Gaussian prior with the tolerance as standard
-    deviation; photographs with pixels of the size `pixel` [m] also a bias of edges.
+    deviation; photographs with pixels of the size `pixel` [m] also a bias of edges, `readings` one
+    of their sensors.
     """
-    setup = setup_of(model, tolerances=asdict(tolerances), pixel=pixel)
+    setup = setup_of(model, tolerances=asdict(tolerances), pixel=pixel, readings=readings)
     present = {effect.label for effect in model.effects}
     for kind in (*EFFECTS.values(), *NUISANCES.values()):
         if kind.name in present or not kind.applies(setup):
@@ -107,8 +113,11 @@ def declared_model(
             values[f"{item.name}.{name}"] = parameter.value
             if parameter.fixed:
                 fixed.append(f"{item.name}.{name}")
+    if config.cable.mass is None:
+        model = model.with_effect(UNKNOWN_MASS())
     tolerances = Tolerances(**setup.tolerances)
-    return Declared(nuisances(model, tolerances, pixel), values, tuple(fixed), tolerances)
+    model = nuisances(model, tolerances, pixel, setup.readings)
+    return Declared(model, values, tuple(fixed), tolerances)
 
 
 def straight(model: CableModel) -> CableModel:

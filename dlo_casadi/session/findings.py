@@ -24,7 +24,9 @@ def _effect_row(item: AddedEffect, fit: Fit) -> dict[str, Any]:
         "p_value": item.p_value,
         "rmse_cross_validated_before": item.before.rmse,
         "rmse_cross_validated_after": item.after.rmse,
-        "indistinguishable_from": [*(rival.candidate.name for rival in item.rivals), *item.untried],
+        "indistinguishable_from": list(
+            dict.fromkeys([*(rival.candidate.name for rival in item.rivals), *item.equivalents])
+        ),
     }
 
 
@@ -87,7 +89,14 @@ def next_pose_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
         "expected_difference_m": diagnosis.proposal.difference,
         # In standard deviations of one measured line.
         "expected_difference_std": diagnosis.proposal.separation,
+        # Of a sensor of forces and moments: in N or N m, and in standard deviations of one reading.
+        "reading": asdict(diagnosis.proposal.reading),
     }
+
+
+def hidden_weight_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
+    """The weight that the fit would not notice, or None."""
+    return None if diagnosis.weight is None else asdict(diagnosis.weight)
 
 
 def structure_rows(diagnosis: Diagnosis) -> dict[str, dict[str, Any]]:

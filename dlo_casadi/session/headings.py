@@ -25,7 +25,7 @@ _TELLING = np.pi / 2
 def wrong_headings(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
     """Headings of clamps that the lines contradict: of single poses, or of most of them."""
     cable, experiment = config.cable, config.experiment
-    weight = cable.mass * float(np.linalg.norm(experiment.gravity))
+    weight = cable.prior_mass * float(np.linalg.norm(experiment.gravity))
     layer = np.sqrt(cable.prior_bending_stiffness / max(weight, 1e-12))
     # The weight bends it by 1 / layer beside a clamp: within half of that by a quarter of a radian.
     reach = min(layer / 2, _PART * cable.length)

@@ -89,13 +89,14 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
 def _measured(pose: DeclaredPose, item: PoseInput, std: float) -> MeasuredPose:
     """A pose with its sensors; pixels have the standard deviation `std` [m] at weight one."""
     held = replace(conditions(pose), camera_center=item.camera_center)
-    if not item.views:
-        return MeasuredPose.of_points(
-            held, item.points, item.weight, pose.role == "held_out", item.s
-        )
-    found = [pixels_of(view, std) for view in item.views]
-    sensors = tuple(sensor for sensor in found if sensor is not None)
-    return MeasuredPose(held, sensors, pose.role == "held_out", item.points)
+    held_out = pose.role == "held_out"
+    if item.views:
+        found = [pixels_of(view, std, len(item.points) > 0) for view in item.views]
+        sensors = tuple(sensor for sensor in found if sensor is not None)
+        seen = MeasuredPose(held, sensors, held_out, item.points)
+    else:
+        seen = MeasuredPose.of_points(held, item.points, item.weight, held_out, item.s)
+    return seen.with_readings(pose.readings)
 
 
 def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
@@ -225,21 +226,68 @@ def _extract(
 
 
 def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
-    """Pictures (h, w, 3) of each step of the camera, as far as it comes, by the step's name.
+    """Pictures (h, w, 3) of each step of the camera, as far as it comes.
+
+    By the photograph's name and that of the step.
 
     Raises
     ------
     VisionError
-        If the photograph cannot be read.
+        If none of its photographs can be read.
     """
-    image = vision.read_image(pose.paths[0])
+    if _reader(config, pose) is _read_csv:
+        return {}
+    steps = _steps_in_space if config.experiment.in_space else _steps_in_plane
+    drawn: dict[str, np.ndarray] = {}
+    unread = None
+    for name, path in pose.photographs.items():
+        try:
+            image = vision.read_image(path)
+        except MeasurementError as error:
+            unread = error
+            continue
+        drawn |= {f"{name}_{step}": shown for step, shown in steps(config, pose, image).items()}
+    if unread is not None and not drawn:
+        raise unread
+    return drawn
+
+
+def _steps_in_plane(config: Config, pose: DeclaredPose, image: np.ndarray) -> dict[str, np.ndarray]:
     view, line, workings = None, None, vision.Workings()
     try:
         view = view_of(config, image)
         line = _extract(config, pose, image, view, workings)
     except MeasurementError:  # the pictures show how far it came; the table says why
         pass
-    return vision.draw_steps(image, view, workings, line, pose.start, pose.end)
+    pixels, gaps = (None, ()) if line is None else (line.pixels, line.gaps)
+    return vision.draw_steps(image, view, workings, pixels, pose.start, pose.end, gaps)
+
+
+def _steps_in_space(config: Config, pose: DeclaredPose, image: np.ndarray) -> dict[str, np.ndarray]:
+    measurement = config.experiment.measurement
+    assert measurement.kind == "images"
+    assert measurement.camera is not None
+    view, pixels, workings = None, None, vision.Workings()
+    fixtures = [at for at in (pose.start, pose.end) if at is not None]
+    flat = np.zeros((2, 2))
+    try:
+        viewpoint = vision.locate_camera(image, board_of(measurement), _camera(measurement.camera))
+        distance = float(viewpoint.in_camera(fixtures)[:, 2].mean())
+        view, flat = viewpoint.facing(distance), viewpoint.flattened(fixtures, distance)
+        pixels = vision.see_cable(
+            image,
+            viewpoint,
+            start=pose.start,
+            end=pose.end,
+            diameter=config.cable.diameter,
+            length=config.cable.length,
+            workings=workings,
+        ).pixels
+    except MeasurementError:  # as above
+        pass
+    return vision.draw_steps(
+        image, view, workings, pixels, flat[0], flat[1] if len(fixtures) == 2 else None
+    )
 
 
 def _marker_messages(config: Config, view: vision.View) -> list[str]:

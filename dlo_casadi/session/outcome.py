@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -20,6 +21,8 @@ from dlo_casadi.vision import Sight
 
 FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
+# Name of the cable's mass among a stage's parameters.
+MASS = "mass"
 Verdict = Literal["complete", "effect_found", "unexplained"]
 # Stages that a batch estimate must not be worse than.
 SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
@@ -100,6 +103,9 @@ class PoseShape:
     stable : bool
     forces : (2, d) [N]
         Of the cable on what holds its start and its end.
+    readings : mapping
+        Forces [N] and moments [N m] on the fixtures that were measured, by their names: measured,
+        and as a sensor would show the predicted ones.
     spread : (M,) or (M, 2) or None [m]
         Standard deviation across the curve of the next hanging, as the residual; None if it was
         not computed.
@@ -120,6 +126,7 @@ class PoseShape:
     measured_branch: BranchShape | None = None
     tipping: float | None = None
     spread: FloatArray | None = None
+    readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
 
     def expected(self, length: float, noise: float) -> FloatArray:
         """Standard deviations of the residual (K,), in space (K, 2), [m], noise included."""
@@ -128,6 +135,17 @@ class PoseShape:
         spread = self.spread.reshape((len(places), -1))
         std = np.stack([np.interp(self.s, places, column) for column in spread.T], axis=1)
         return np.hypot(std, noise).reshape(self.residual.shape)
+
+
+@dataclass(frozen=True)
+class ReadingErrors:
+    """Root mean square distance of readings of one role from predicted ones; None without any.
+
+    `force` [N], `moment` [N m].
+    """
+
+    force: float | None = None
+    moment: float | None = None
 
 
 @dataclass(frozen=True)
@@ -152,6 +170,8 @@ class Stage:
         the predicted one compared with that one.
     unpredicted : tuple of str
         Measured held-out poses without a prediction.
+    readings_fit, readings_held_out : ReadingErrors
+        As rmse_fit and rmse_held_out, of forces and moments on the fixtures.
     """
 
     name: StageName
@@ -165,6 +185,8 @@ class Stage:
     rmse_fit_measured_branch: float | None = None
     rmse_held_out_measured_branch: float | None = None
     unpredicted: tuple[str, ...] = ()
+    readings_fit: ReadingErrors = ReadingErrors()
+    readings_held_out: ReadingErrors = ReadingErrors()
 
     @property
     def other_branch(self) -> dict[str, BranchShape]:
@@ -272,6 +294,10 @@ class MeasurementSummary:
         Held-out poses without one: no error counts them.
     points : int
     std, correlation_length : float [m]
+    readings : int
+        Forces and moments on the fixtures, those of held-out poses too.
+    force_std, moment_std : float or None [N], [N m]
+        Of one component; None where there is no such reading.
     """
 
     kind: Literal["images", "centerlines"]
@@ -281,7 +307,16 @@ class MeasurementSummary:
     std: float
     std_source: Literal["declared", "estimated"]
     correlation_length: float
+    readings: int = 0
+    force_std: float | None = None
+    moment_std: float | None = None
     held_out_missing: tuple[str, ...] = ()
+
+    def std_of(self, kind: str) -> tuple[float, str]:
+        """Standard deviation of one component of a reading, force or moment, and its unit."""
+        std = self.force_std if kind == "force" else self.moment_std
+        assert std is not None
+        return std, "N" if kind == "force" else "N m"
 
 
 @dataclass(frozen=True)
@@ -317,7 +352,7 @@ class Repeatability:
     def of(cls, fit: Fit) -> Self:
         """What a fit has found."""
         rest = fit.problem.rest_scatter.std
-        if different_poses(fit.problem.history) >= DIFFERENT:
+        if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
             return cls(rest, float(np.sqrt(2) * fit.hanging_error), "poses")
         spread = repeatability(fit.problem.history, fit.model.cable.length)
         return cls(rest, spread or 0.0, None if spread is None else "repeats")
@@ -349,6 +384,8 @@ class Outcome:
         Tests of the residual "before" and "after", see `diagnosis.structure.Structure`.
     fit : Fit
         The last stage's fit, from which parameters.yaml is written.
+    hidden_weight : dict or None
+        A weight that the shapes do not tell from stiffness, see `HiddenWeight`.
     diagnosis : object or None
         The diagnosis's own result, for figures.
     """
@@ -369,6 +406,7 @@ class Outcome:
     unexplained: dict[str, Any] | None = None
     next_pose: dict[str, Any] | None = None
     structure: dict[str, dict[str, Any]] | None = None
+    hidden_weight: dict[str, Any] | None = None
     diagnosis: Any = None
     versions: dict[str, str] = field(default_factory=dict)
 

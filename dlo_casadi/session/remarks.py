@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +92,33 @@ def _cure(branch: PoseBranch | None) -> str:
     return f"`branch: {branch}` in these poses chooses it"
 
 
+def weight_warning(weight: Mapping[str, Any], expected: float) -> str:
+    """What a weight that nobody has declared would do, and what would tell.
+
+    Parameters
+    ----------
+    weight : mapping
+        See `HiddenWeight`.
+    expected : float [m]
+        Distance of a pose from its prediction if nothing is missing.
+    """
+    low, high = weight["stiffness_95"]
+    text = (
+        f"an undeclared weight is not told from stiffness: up to {weight['mass']:.2g} kg at "
+        f"{weight['position']:.2f} m would fit as well as none, and bending_stiffness may then be "
+        f"{low:.3g} to {high:.3g} N m^2. To tell: weigh the cable with all that hangs on it, or "
+        f"measure the force on the start, which differs by up to {weight['force']:.2g} N"
+    )
+    if weight["heading"] is None:
+        return text
+    far = weight["difference"] > UNSEEN * expected
+    return text + (
+        f"{', or a pose' if far else '. No pose would: even'} with start_heading "
+        f"{weight['heading']:.2f} the shapes differ by {1e3 * weight['difference']:.2g} mm RMS, "
+        f"and a pose is measured {1e3 * expected:.2g} mm from its prediction"
+    )
+
+
 def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
     """Simpler stages that come nearer to the fit poses than the batch estimate.
 
@@ -125,7 +153,7 @@ def doubts_of(
     noise : float [m]
     """
     lines, stage = [], stages[-1]
-    if not fit.converged:
+    if fit.failed:
         lines.append(
             f"the fit of stage {stage.name} has not converged: its numbers are where it stopped, "
             "not a minimum. Try: a bending_stiffness nearer to the truth, more poses, or "
@@ -204,6 +232,8 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
             f"however good the model (the noise is {1e3 * fit.noise.std:.2g} mm); ends measured "
             "pose by pose would help"
         )
+    if not fit.converged and not fit.failed:
+        lines.append("the fit crept to its minimum: it stopped within a standard deviation of it")
     unstable = [
         item.pose.name
         for item, ok in zip(fit.problem.measured, fit.stable, strict=True)

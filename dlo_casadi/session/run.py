@@ -17,7 +17,7 @@ from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SETTLED_MODES
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.profile import stiffness_intervals
+from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model import CableModel
@@ -27,6 +27,7 @@ from dlo_casadi.session.declared import Declared, declared_model, straight
 from dlo_casadi.session.findings import (
     candidate_rows,
     effect_rows,
+    hidden_weight_row,
     next_pose_row,
     structure_rows,
     unexplained_row,
@@ -56,6 +57,7 @@ from dlo_casadi.session.remarks import (
     fit_warnings,
     held_out_missing,
     reading_warnings,
+    weight_warning,
     worse_than_simpler,
 )
 from dlo_casadi.session.simpler import not_worse
@@ -122,7 +124,7 @@ def fit_session(
     stages = before_stages(config, declared, inputs, measured, fit.model.n, clock, progress)
     reported = _declared_names(config, fit.model)
     # A diagnosis that finds nothing replaces this stage, intervals and all.
-    intervals = {} if config.diagnosis.enabled else stiffness_intervals(fit)
+    intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
     stages.append(fit_stage("batch", fit, measured, intervals, reported))
     better = not_worse(fit, stages)
     if better is not fit:
@@ -151,6 +153,8 @@ def judged(outcome: Outcome) -> Outcome:
     fit, stages = outcome.fit, outcome.stages
     doubts = doubts_of(stages, outcome.poses, fit, outcome.measurement.std)
     said = [*fit_warnings(fit, outcome.discretization.error), *worse_than_simpler(stages)]
+    if outcome.hidden_weight is not None:
+        said.append(weight_warning(outcome.hidden_weight, fit.expected_error))
     return replace(
         outcome,
         verdict="unexplained" if outcome.verdict and doubts else outcome.verdict,
@@ -198,9 +202,9 @@ def close_the_loop(
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
     complete = not diagnosis.added and not diagnosis.unexplained
-    intervals = stiffness_intervals(fit if complete or diagnosis.added else outcome.fit)
+    intervals = profile_intervals(fit if complete or diagnosis.added else outcome.fit)
     if diagnosis.added:
-        first = stiffness_intervals(outcome.fit)
+        first = profile_intervals(outcome.fit)
         stages[-1] = fit_stage("batch", outcome.fit, measured, first, reported)
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [name for name in fit.model.names if name.split(".")[0] in labels]
@@ -224,6 +228,7 @@ def close_the_loop(
         unexplained=unexplained_row(diagnosis),
         next_pose=next_pose_row(diagnosis),
         structure=structure_rows(diagnosis),
+        hidden_weight=hidden_weight_row(diagnosis),
         diagnosis=diagnosis,
     )
     return judged(closed)
@@ -300,15 +305,19 @@ def _summary(
     config: Config, inputs: Sequence[PoseInput], measured: Sequence[MeasuredPose], fit: Fit
 ) -> MeasurementSummary:
     readable = [item for item in measured if item.readable]
+    readings = [name for item in readable for name in item.reactions]
+    kinds, points = {name.split("_")[1] for name in readings}, fit.noise.of_points
+    noise = points.readings
     return MeasurementSummary(
         kind=config.experiment.measurement.kind,
         poses_fit=sum(not item.held_out for item in readable),
         poses_held_out=sum(item.held_out for item in readable),
         points=sum(len(item.points) for item in readable),
-        std=fit.noise.of_points,
-        std_source="declared"
-        if fit.noise.declared or fit.noise.source == "declared"
-        else "estimated",
+        std=points.std,
+        std_source="declared" if points.source == "declared" else "estimated",
         correlation_length=fit.noise.length if fit.noise.share > 0 else 0.0,
+        readings=len(readings),
+        force_std=noise.force if "force" in kinds else None,
+        moment_std=noise.moment if "moment" in kinds else None,
         held_out_missing=held_out_missing(inputs, config.skipped),
     )

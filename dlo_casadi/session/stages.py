@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.algorithm1 import Algorithm1Result
 from dlo_casadi.estimation.band import Uncertainty, spread_across
@@ -25,9 +26,11 @@ from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model import END_ROLL, CableModel
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.session.outcome import (
+    MASS,
     BranchShape,
     ParameterEstimate,
     PoseShape,
+    ReadingErrors,
     RestCurvatureEstimate,
     Stage,
     StageName,
@@ -69,7 +72,28 @@ def pose_shape(
         np.stack([eq.lam_start, eq.lam]),
         branch,
         None if item.pose.branch else eq.tipping,
+        readings=item.readings_beside(prediction.seen),
     )
+
+
+def _reading_errors(
+    measured: Sequence[MeasuredPose], shapes: Mapping[str, PoseShape], held_out: bool
+) -> ReadingErrors:
+    """Errors of the readings of one role; none where one of its poses has no prediction."""
+    poses = [item for item in measured if item.held_out is held_out and item.reactions]
+    if any(item.pose.name not in shapes for item in poses):
+        return ReadingErrors()
+
+    def rms(kind: str) -> float | None:
+        squares = [
+            float(((known - model) ** 2).sum())
+            for item in poses
+            for name, (known, model) in shapes[item.pose.name].readings.items()
+            if name.endswith(kind)
+        ]
+        return float(np.sqrt(np.mean(squares))) if squares else None
+
+    return ReadingErrors(rms("force"), rms("moment"))
 
 
 def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArray:
@@ -129,6 +153,8 @@ def _stage(
         rms_distance(on_branch, measured, held_out=False),
         rms_distance(on_branch, measured, held_out=True),
         tuple(item.pose.name for item in lost if item.held_out and item.readable),
+        _reading_errors(measured, shapes, held_out=False),
+        _reading_errors(measured, shapes, held_out=True),
     )
 
 
@@ -232,21 +258,24 @@ def fit_stage(
     Parameters
     ----------
     intervals : mapping
-        Of the stiffnesses, by name.
+        Of the stiffnesses and of the mass's factor, by name.
     reported : sequence of str
         Qualified names of the parameters that are effects, not nuisances.
     """
     model = fit.model
-    parameters = {
-        name: ParameterEstimate(
-            fit.value(name),
-            fit.std(name),
-            "N m^2",
-            (interval.low, interval.high),
+    parameters: dict[str, ParameterEstimate] = {}
+    for full, interval in intervals.items():
+        key, unit, size = full, "N m^2", 1.0
+        if full == MASS_FACTOR:
+            key, unit, size = MASS, "kg", model.cable.mass
+        ends = tuple(None if end is None else size * end for end in (interval.low, interval.high))
+        parameters[key] = ParameterEstimate(
+            size * fit.value(full),
+            size * fit.std(full),
+            unit,
+            (ends[0], ends[1]),
             interval.identifiable,
         )
-        for name, interval in intervals.items()
-    }
     roll = [END_ROLL] if END_ROLL in model.names else []
     for qualified in (*roll, *reported):
         q = model.parameters[model.names.index(qualified)]

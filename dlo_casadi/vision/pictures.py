@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.durable import write_file
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.centerline import Centerline
 from dlo_casadi.vision.view import Array, View
 from dlo_casadi.vision.workings import Workings
 from dlo_casadi.vision.workplane import WorkPlane
@@ -32,9 +32,10 @@ def draw_steps(
     image: Picture,
     view: View | None,
     workings: Workings,
-    line: Centerline | None,
+    line: Array | None,
     start: ArrayLike,
     end: ArrayLike | None,
+    gaps: Sequence[int] = (),
 ) -> dict[str, Picture]:
     """Draw the steps that were reached.
 
@@ -45,11 +46,13 @@ def draw_steps(
     view : View or None
         None where the board was not found; the photograph is then all there is to see.
     workings : Workings
-        Filled by `extract_centerline`, as far as it came.
-    line : Centerline or None
-        Its result, if any.
+        Filled by `extract_centerline` or `see_cable`, as far as it came.
+    line : (K, 2) [px] or None
+        What that has found, if anything.
     start, end : (2,) [m]
-        The declared fixtures.
+        The declared fixtures, in the plane of the view.
+    gaps : sequence of int
+        Indices of the pixels after which a stretch of the line is missing.
 
     Returns
     -------
@@ -67,7 +70,7 @@ def draw_steps(
         pictures["3_strands"] = _strands(plane, workings)
     pictures["4_centerline"] = image.copy()
     if view is not None:
-        _draw_line(pictures["4_centerline"], view, workings, line)
+        _draw_line(pictures["4_centerline"], view, workings, line, gaps)
         _draw_fixtures(pictures["4_centerline"], view, first, last)
     return pictures
 
@@ -117,7 +120,9 @@ def _strands(plane: WorkPlane, workings: Workings) -> Picture:
     return picture
 
 
-def _draw_line(picture: Picture, view: View, workings: Workings, line: Centerline | None) -> None:
+def _draw_line(
+    picture: Picture, view: View, workings: Workings, line: Array | None, gaps: Sequence[int]
+) -> None:
     """Markers green, sound stretches blue with arrows from start to end, unsound profiles red."""
     size = _size(picture)
     thick = max(1, round(1.5 * size))
@@ -128,9 +133,9 @@ def _draw_line(picture: Picture, view: View, workings: Workings, line: Centerlin
         for at in view.to_pixels(trace.points[~trace.sound & trace.inside]):
             cv2.circle(picture, _pixel(at), thick, _RED, -1, cv2.LINE_AA)
     if line is not None:
-        for part in np.split(line.pixels, np.array(line.gaps, dtype=int) + 1):
+        for part in np.split(line, np.array(gaps, dtype=int) + 1):
             _polyline(picture, part, _BLUE, thick)
-        _arrows(picture, line.pixels, size)
+        _arrows(picture, line, size)
 
 
 def _draw_fixtures(picture: Picture, view: View, start: Array, end: Array | None) -> None:

@@ -124,7 +124,7 @@ def see_cable(
         )
     distance = float(fixtures[:, 2].mean())
     view = viewpoint.facing(distance)
-    flat = fixtures[:, :2] / fixtures[:, 2:] * distance * [1.0, -1.0]
+    flat = viewpoint.flattened(declared, distance)
     last = None if end is None else flat[1]
     line = measure_line(
         image,
@@ -263,8 +263,7 @@ def see_beside(
     viewpoint, distance = sight.viewpoint, sight.distance
     view = viewpoint.facing(distance)
     pixel = 1.0 / view.scale
-    at = viewpoint.in_camera(curve)
-    flat = at[:, :2] / at[:, 2:] * distance * [1.0, -1.0]
+    at, flat = viewpoint.in_camera(curve), viewpoint.flattened(curve, distance)
     t = chord_length(flat)
     beside = other_stretches(flat, t, sight.width * pixel)
     hidden = np.isfinite(beside)
@@ -295,8 +294,13 @@ def see_beside(
         )
         good = profiles.inside & (np.abs(apart - np.abs(beside[run])) < 0.5 * usual)
         good &= np.diff(np.floor(t[run] / spacing), prepend=-1.0) > 0
+        if not good.any():
+            continue
         pixels.append(view.to_pixels(points[good]).reshape(-1, 2))
-        std.append(np.full(int(good.sum()), np.hypot(np.median(sight.std), 0.5 * sight.width_std)))
+        # Both the outline and the rest of the line tell how far apart the two lie.
+        doubt = 0.5 * float(np.sqrt(np.mean((apart - np.abs(beside[run]))[good] ** 2))) / pixel
+        told = np.sqrt(np.median(sight.std) ** 2 + (0.5 * sight.width_std) ** 2 + doubt**2)
+        std.append(np.full(int(good.sum()), told))
         places.append(params[run][good])
     order = np.argsort(np.concatenate(places), kind="stable")
     again = replace(

@@ -83,6 +83,11 @@ class Viewpoint:
         """Undistorted rays (K, 2), q_xy / q_z, of pixels (K, 2) [px]."""
         return self.camera.undistort(np.asarray(pixels, float).reshape(-1, 2))
 
+    def flattened(self, points: ArrayLike, distance: float) -> Array:
+        """Places (K, 2) [m] in the plane of `facing` at which points (K, 3) [m] are seen."""
+        at = self.in_camera(points)
+        return np.asarray(at[:, :2] / at[:, 2:] * distance * [1.0, -1.0])
+
     def facing(self, distance: float) -> View:
         """View of the plane q_z = `distance` [m]: the undistorted photograph in metres, y up."""
         homography = np.diag([1.0, -1.0, distance])

@@ -14,7 +14,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.profile import (
     Interval,
-    stiffness_interval,
+    profile_interval,
     stiffness_profile,
     threshold,
 )
@@ -301,4 +301,4 @@ def identifiability(part: Part, replicas: tuple[Replica, ...], executor: Executo
 def _profile(replica: Replica) -> tuple[FloatArray, float, Interval]:
     fit = first_fit(replica)
     rises = stiffness_profile(fit, replica.stiffness * 10**DECADES)
-    return rises, threshold(fit), stiffness_interval(fit)
+    return rises, threshold(fit), profile_interval(fit)

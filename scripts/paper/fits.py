@@ -17,7 +17,7 @@ from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.profile import stiffness_interval
+from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.parallel import map_in_order
 from dlo_casadi.session.fitting import solved_by_ipopt
@@ -145,7 +145,7 @@ def _batch(
         seconds = perf_counter() - begin
         interval = None
         if n == FIRST:
-            found = stiffness_interval(fit)
+            found = profile_interval(fit)
             interval = (found.low, found.high)
         out.append(
             _seen(

@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, DloError
 from dlo_casadi.assembly import DEVIATIONS, Shapes
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Tolerances
 from dlo_casadi.estimation.hyperparameters import settle
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.profile import stiffness_interval
+from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -119,10 +118,10 @@ def simulate(truth: Truth, rng: np.random.Generator) -> list[MeasuredPose] | Non
     if not converged.all():
         return None
     measured = []
-    for pose, z in zip(published.poses(), sweep.seen(moved, truth.p, rest), strict=True):
+    for pose, seen in zip(published.poses(), sweep.seen(moved, truth.p, rest), strict=True):
         s = np.sort(rng.uniform(0.01, 0.99, POINTS)) * published.LENGTH
         factor = np.linalg.cholesky(truth.noise.covariance(s, np.ones(POINTS)))
-        points = NodeCurve.of(published.LENGTH, z).at(s) + factor @ rng.standard_normal((POINTS, 2))
+        points = seen.curve.at(s) + factor @ rng.standard_normal((POINTS, 2))
         measured.append(MeasuredPose.of_points(pose, points))
     return measured
 
@@ -163,7 +162,7 @@ def run_one(index: int, seed: int) -> dict[str, Any]:
         measured = simulate(truth, rng)
     # The guess is within a factor of five: one start is enough.
     fit = settle(fit_model(model_on(MESH), measured, TOLERANCES, decades=(0,)))
-    interval = stiffness_interval(fit)
+    interval = profile_interval(fit)
     rest = rest_curvature_of(fit)
     gap = rest.value - fit.model.rest.basis(places()) @ truth.coefficients
     bound_log, bound_rest = bound(fit, truth)

@@ -1,11 +1,12 @@
 """The compiled solver gives the shapes of equilibrium.py, for every effect of the cable."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.codegen import CompiledSolver, CompiledSpaceSolver
 from dlo_casadi.effects import EFFECTS, Cable, Load, MeasurementEffect
 from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.errors import DloError
@@ -31,6 +32,7 @@ VALUES = {
     "start_spring": (0.1, 0.3),
     "end_spring": (0.1, -0.3),
     "clamp_angle": (0.1, -0.2),
+    "clamp_compliance": (0.2, 0.05),
     "end_offset": (0.003, -0.002),
     "rest_curvature_drift": (0.1,),
     "plastic_set": (2.0, 0.1),
@@ -76,7 +78,6 @@ def test_every_effect_of_the_cable_has_values():
     in_plane = {n: e for n, e in EFFECTS.items() if e.in_plane}
     of_the_cable = {n for n, e in in_plane.items() if not issubclass(e, MeasurementEffect)}
     refused = {n for n, e in EFFECTS.items() if issubclass(e, Load) and e.n_springs}
-    refused.add("clamp_compliance")
     assert set(VALUES) == of_the_cable - refused
 
 
@@ -88,15 +89,38 @@ def test_a_load_that_depends_on_the_shape_is_refused(position):
         CompiledSolver(model, p, np.zeros(12))
 
 
-def test_clamps_that_give_way_are_refused():
-    model = CableModel(
-        CABLE, 12, start="clamped", effects=(EFFECTS["clamp_compliance"](end=False),)
-    )
-    with pytest.raises(DloError, match=r"no solver .* clamps give way"):
-        CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells))
+@pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
+@pytest.mark.parametrize("end", ["free", "clamped"])
+def test_clamps_that_give_way(element, end):
+    """One clamp, or one of two; and the slopes by what is declared of the clamps."""
+    effect = EFFECTS["clamp_compliance"](end=False)
+    model = CableModel(CABLE, 10, element, "clamped", end, effects=(effect,))
+    p, rest = np.array([0.3, 0.2]), np.zeros(model.chain.n_cells)
+    solver = CompiledSolver(model, p, rest, flags=("-O0",))
+    place = ENDS[0]
+    shape = solver.solve(place, headings=CLAMPS)
+    last = CLAMPS[1] if end == "clamped" else None
+    pose = Pose((0.0, 0.0), None if end == "free" else place, CLAMPS[0], last)
+    found = solve_equilibrium(model, p, rest, pose)
+    assert shape.points == pytest.approx(found.points, abs=1e-8)
+    assert shape.moments == pytest.approx(found.moments, abs=1e-6)
+    assert shape.energy == pytest.approx(found.energy, rel=1e-7)
+    slope, d = solver.sensitivity(shape, place, headings=CLAMPS), 1e-5
+    for k in (0, 1) if end == "clamped" else (0,):
+        moved = [np.array(CLAMPS, dtype=float) + d * side * np.eye(2)[k] for side in (1, -1)]
+        ahead, back = (solver.solve(place, headings=tuple(both)).points for both in moved)
+        assert slope.points[..., 2 + k] == pytest.approx((ahead - back) / (2 * d), abs=1e-6)
 
 
-@pytest.mark.parametrize("name", [name for name in VALUES if name != "clamp_angle"])
+def test_clamps_in_space_that_give_way_are_refused():
+    cable = replace(CABLE, torsional_stiffness=0.2)
+    model = CableModel(cable, 12, "arc", "clamped", "clamped", (0.0, 0.0, -9.81))
+    model = model.with_effect(EFFECTS["clamp_compliance"]())
+    with pytest.raises(DloError, match=r"no solver .* in space .* clamps that give way"):
+        CompiledSpaceSolver(model, model.nominal, np.zeros(model.chain.n_rests))
+
+
+@pytest.mark.parametrize("name", [name for name in VALUES if not name.startswith("clamp_")])
 @pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_effect(name, element):
     assert difference([name], element, "pinned", "pinned") < 1e-8
@@ -105,7 +129,8 @@ def test_effect(name, element):
 @pytest.mark.parametrize(("start", "end"), BOUNDARIES)
 @pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_all_effects_together(element, start, end):
-    names = [n for n in VALUES if n != "clamp_angle" or (start, end) == ("clamped", "clamped")]
+    both = (start, end) == ("clamped", "clamped")
+    names = [n for n in VALUES if both or not n.startswith("clamp_")]
     assert difference(names, element, start, end, n=6) < 1e-8  # more take long to generate
 
 

@@ -13,7 +13,7 @@ from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
-from dlo_casadi.diagnosis.equivalents import untried_equivalents
+from dlo_casadi.diagnosis.equivalents import equivalents
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
 from dlo_casadi.effects import BendingSoftening, LumpedMass
@@ -91,8 +91,8 @@ def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
     for key, value in effect.items():
         values[larger.names.index(f"point_force.{key}")] = value
     fit = fit_model(larger, measured, declared.tolerances, values=values, start=start)
-    assert untried_equivalents(fit, force, tried=()) == (untried,)
-    assert untried_equivalents(fit, force, tried=(untried,)) == ()
+    assert equivalents(fit, force, tried=()) == (untried,)
+    assert equivalents(fit, force, tried=(untried,)) == ()
 
 
 def test_effects_that_do_not_predict_a_pose_left_out_are_no_explanation(monkeypatch):

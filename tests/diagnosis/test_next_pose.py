@@ -5,11 +5,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis.next_pose import _separation
+from dlo_casadi.diagnosis.next_pose import _separation, next_reading
 from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.estimation.gauss_newton import Tolerances
+from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.sensors import Observed
+from dlo_casadi.rod.node import Heading
 
 LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4
 
@@ -37,3 +40,18 @@ def test_noise_that_is_one_for_the_whole_line_does_not_average():
     alike = NoiseModel(STD, share=0.98, length=100 * LENGTH, kernel="gaussian")
 
     assert separation(alike) == pytest.approx(GAP / STD, rel=0.02)
+
+
+@pytest.mark.parametrize(("gap", "times"), [(1.2, 1), (0.4, 3), (0.2, None)])
+def test_a_reading_is_repeated_until_noise_and_bias_hide_no_difference(gap, times):
+    """Noise of 0.15 N averages, a bias of 0.1 N does not: 3 sqrt(0.15^2 / n + 0.1^2) <= gap."""
+    fit = SimpleNamespace(
+        problem=SimpleNamespace(tolerances=Tolerances(force_bias=0.1)),
+        noise=NoiseModel(STD, readings=ReadingNoise(0.15, 0.1)),
+        model=SimpleNamespace(node=Heading, names=()),
+    )
+    zero = NodeCurve(LENGTH, np.zeros((2, 2)), None)
+    one, other = Observed(zero, np.zeros(6)), Observed(zero, np.array([0.0, 0, 0, gap, 0, 0]))
+    found = next_reading(fit, one, other)
+    assert (found.name, found.times) == ("end_force", times)
+    assert found.separation == pytest.approx(gap / np.hypot(0.15, 0.1))

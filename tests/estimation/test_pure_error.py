@@ -11,7 +11,7 @@ from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
-from dlo_casadi.estimation.repeats import repeatability, with_repeats
+from dlo_casadi.estimation.repeats import different_poses, repeatability, with_repeats
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -44,6 +44,19 @@ def test_repeats_tell_size_and_correlation():
     assert found.length == pytest.approx(truth.length, rel=0.3)
     # From the mean of the others: sqrt(1 + 1 / 15).
     assert repeatability(measured, LENGTH) == pytest.approx(truth.std * 1.033, rel=0.3)
+
+    # The same elsewhere, and nearly the same: ends 0.5 mm apart, of a cable of 1 m.
+    moved = []
+    for k, item in enumerate(measured):
+        away = np.array([0.3 * k, -0.1])
+        end = item.pose.end + away + [0.0, 5e-4 * (k % 2)]
+        pose = replace(item.pose, start=tuple(away), end=tuple(end))
+        moved.append(MeasuredPose.of_points(pose, item.points + away))
+    assert different_poses(moved, LENGTH) == 1
+    again = with_repeats(DECLARED, moved, LENGTH)
+    assert again.std == pytest.approx(found.std, rel=0.01)
+    turned = replace(moved[0], pose=replace(moved[0].pose, start_heading=0.002))
+    assert different_poses([turned, *moved], LENGTH) == 2
 
 
 def test_poses_that_repeat_to_the_noise_or_are_taken_once_leave_it_as_declared():

@@ -77,7 +77,7 @@ def test_markers_are_compared_in_all_directions_at_their_arc_lengths():
     np.testing.assert_allclose(item.distances(now.curve), [0.05, 0.01, 0.02], atol=1e-12)
     table = now.curve.numbers
     step = 1e-3 * np.random.default_rng(1).normal(size=table.shape)
-    ahead = Observed(NodeCurve.of(LENGTH, table + step), now.lam)
+    ahead = Observed(NodeCurve.of(LENGTH, table + step), now.readings)
     change = item.residual_along(now, places, ObservedChange(step[..., None], np.zeros((0, 1))))
     moved = item.residual(ahead, places) - item.residual(now, places)
     np.testing.assert_allclose(change[:, 0], moved, atol=1e-15)  # linear in the curve's numbers

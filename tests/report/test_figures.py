@@ -173,3 +173,21 @@ def test_a_prediction_is_drawn(tmp_path, end):
     draw_prediction(tmp_path / "shape.png", shape)
 
     assert drawn(tmp_path / "shape.png")[1] > 0.005
+
+
+def test_readings_are_drawn_beside_predicted_ones(outcome, tmp_path):
+    """Residuals over their noise, and arrows of one scale at the ends."""
+    stage = outcome.stages[-1]
+    names = list(stage.shapes)[:3]
+    read = {
+        "end_force": (np.array([0.1, -1.0]), np.array([0.12, -0.9])),
+        "end_moment": (np.ones(1),) * 2,
+    }
+    shapes = {k: replace(v, readings=read if k in names else {}) for k, v in stage.shapes.items()}
+    measurement = replace(outcome.measurement, readings=6, force_std=0.02, moment_std=0.01)
+    stages = (*outcome.stages[:-1], replace(stage, shapes=shapes))
+    shown = replace(outcome, stages=stages, measurement=measurement)
+    figures.draw_readings(tmp_path / "readings.png", shown)
+    figures.draw_poses(tmp_path, shown)
+    assert imread(tmp_path / "readings.png").shape[2] == 4
+    assert (tmp_path / "poses.png").is_file()

@@ -31,6 +31,7 @@ KEYS = {
     "unexplained": type(None),
     "next_pose": type(None),
     "structure": type(None),
+    "hidden_weight": type(None),
 }
 
 
@@ -65,6 +66,9 @@ def test_every_key_of_the_schema_is_there(outcome):
         "std",
         "std_source",
         "correlation_length_m",
+        "readings",
+        "force_std",
+        "moment_std",
     }
     assert set(report["discretization"]) == {"n", "element", "error_m"}
     names = ["initial", "stiffness_only", "algorithm1", "batch"]
@@ -74,6 +78,11 @@ def test_every_key_of_the_schema_is_there(outcome):
             "name",
             "rmse_fit",
             "rmse_held_out",
+            "force_rmse_fit",
+            "force_rmse_held_out",
+            "moment_rmse_fit",
+            "moment_rmse_held_out",
+            "readings",
             "rmse_fit_measured_branch",
             "rmse_held_out_measured_branch",
             "other_branch",

@@ -37,6 +37,7 @@ PROPOSAL = {
     "separates": ["lumped_mass", "point_force"],
     "expected_difference_m": 2.5e-3,
     "expected_difference_std": 8.2,
+    "reading": {"name": "end_force", "difference": 0.3, "separation": 4.0, "times": 2},
 }
 
 

@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console
 from test_figures import EFFECT, LOAD
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
-from dlo_casadi.report.page_data import stage_rows
+from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.report.page_data import page_data, stage_rows
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.terminal import (
     describe,
@@ -85,6 +87,7 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
         "separates": ["lumped_mass", "point_force"],
         "expected_difference_m": 2.5e-3,
         "expected_difference_std": 8.2,
+        "reading": {"name": "end_force", "difference": 0.3, "separation": 4.0, "times": 2},
     }
     text = said(
         replace(
@@ -98,6 +101,8 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
     )
 
     assert "the declared model lacked lumped_mass; with it the residual is noise" in text
+    assert "A reading of end_force there differs by 0.3 N" in text
+    assert "4 standard deviations of one: read it 2 times." in text
     assert "lumped_mass: mass 0.0500 ± 0.0020 kg (p = 1e-09)" in text
     assert "These data cannot tell it from point_force." in text
     assert (
@@ -151,6 +156,25 @@ def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):
 
     assert "Verdict: unexplained. The residual is not noise." in text
     assert "pulled by (0, 1) N on average at 0.300 m (0.280 to 0.320 m) from the start" in text
+
+
+def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
+    doubt = "fit poses are predicted 50 mm off, 0.6 mm are what noise lets expect"
+    found = replace(outcome, verdict="unexplained", doubts=(doubt,))
+    assert f"Verdict: unexplained. F{doubt[1:]}." in said(found)
+    assert report_dict(found)["warnings"][0] == doubt
+    assert page_data(found)["sentence"] == f"F{doubt[1:]}."
+    assert page_data(found)["verdict_word"] == "Unexplained"
+
+    fit, problem = outcome.fit, outcome.fit.problem
+    assert not replace(fit, converged=False).failed  # it is at its minimum
+    off = fit.point.theta + 0.5 * np.eye(problem.unknowns.size)[0]  # ln EI
+    p, rest = problem.unknowns.p(off), problem.unknowns.rest(off)
+    shapes, _ = problem.sweep.settled(fit.point.shapes, p, rest)
+    point = problem.evaluate(off, shapes, fit.point.feet)
+    stopped = replace(found, fit=replace(fit, point=point, converged=False))
+    assert "Verdict: the fit has failed. Fit poses" in said(stopped)
+    assert page_data(stopped)["verdict_word"] == "Fit failed"
 
 
 def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcome):

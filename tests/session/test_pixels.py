@@ -1,5 +1,7 @@
 """Pixels of a photograph as a sensor, against a curve that is known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,8 +11,9 @@ from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
-from dlo_casadi.session.pixels import Pixels
-from dlo_casadi.vision import Camera, Viewpoint, project_outline
+from dlo_casadi.session.outcome import ViewInput
+from dlo_casadi.session.pixels import Pixels, pixel_std, pixels_of
+from dlo_casadi.vision import Camera, Sight, Viewpoint, project_outline
 
 LENGTH, DIAMETER = 0.9, 0.008
 CAMERA = Camera(
@@ -84,6 +87,25 @@ def test_errors_of_the_cameras_place_are_part_of_the_covariance():
     white = pixels.whitening(NoiseModel(1e-4), S)
     covariance = 1e-8 * np.eye(len(S)) + 6e-6
     np.testing.assert_allclose(white @ covariance @ white.T, np.eye(len(S)), atol=1e-9)
+
+
+def test_pixels_near_the_ends_and_beside_each_other_are_left_out():
+    """Of a straight line of 1 px steps averaged over 4 px: one of every 8, none near an end."""
+    camera, count = viewpoint(0.0), 301
+    pixels = np.column_stack([np.arange(count) + 400.0, np.full(count, 500.0)])
+    places = np.column_stack([np.linspace(0.2, 0.6, count), np.zeros(count), np.zeros(count)])
+    sight = Sight(
+        camera, pixels, np.full(count, 0.05), np.ones(count, bool), 6.0, 0.1, DIAMETER, 1.2,
+        4.0 * np.sqrt(np.pi), 1.0, (), np.zeros(3), 1.0,
+    )  # fmt: skip
+    view = ViewInput("a", Path("a.jpg"), sight, places)
+    assert pixel_std([view]) == pytest.approx(0.05 * 1.2 / 1000)
+    found = pixels_of(view, pixel_std([view]))
+    u = found.pixels[:, 0] - 400.0
+    assert u.min() > 12.0
+    assert u.max() < count - 13.0
+    np.testing.assert_allclose(np.diff(u), 8.0)
+    np.testing.assert_allclose(found.weight, 1.0)
 
 
 @pytest.mark.parametrize("line", [True, False])

@@ -46,7 +46,7 @@ def blue(picture):
 def test_the_steps_of_a_cable_that_is_found():
     image, workings = draw(CABLE), Workings()
     line = extract(image, workings)
-    pictures = steps(image, workings, line)
+    pictures = steps(image, workings, line.pixels)
 
     assert list(pictures) == STEPS
     assert sum(map(len, workings.chosen)) > 100

@@ -1,0 +1,77 @@
+"""Sensors on the fixtures that do not show nothing where nothing pulls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import casadi as ca
+
+from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params
+from dlo_casadi.effects.setup import Setup
+from dlo_casadi.ends import REACTIONS
+from dlo_casadi.parameters import Parameter
+
+
+@dataclass(frozen=True)
+class SensorBias(MeasurementEffect):
+    """A constant offset (tare) of what sensors of force and moment on the fixtures show.
+
+        measured = true + bias
+
+    in world axes, the same in all poses: a nuisance of every reading within tolerances.force_bias
+    and moment_bias, and never blamed for a residual.
+
+    Parameters
+    ----------
+    start_force, start_moment, end_force, end_moment : bool
+        Which of them are measured. Each has its components in world axes, start_force_x [N] and so
+        on; a moment in a plane is one number [N m]. They vanish at 0.
+    """
+
+    name = "sensor_bias"
+    shown = False
+
+    start_force: bool = True
+    start_moment: bool = True
+    end_force: bool = True
+    end_moment: bool = True
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the components of what is measured."""
+        force = 0.01 * 9.81 * cable.mass
+        turns = ("_x", "_y", "_z") if len(cable.axes) == 3 else ("",)
+        components = {"force": tuple(f"_{axis}" for axis in cable.axes), "moment": turns}
+        found = []
+        for name in REACTIONS:
+            kind = name.split("_")[1]
+            unit, scale = ("N", force) if kind == "force" else ("N m", force * cable.length)
+            if getattr(self, name):
+                found += [Parameter(name + x, unit, scale=scale) for x in components[kind]]
+        return tuple(found)
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where forces or moments are measured."""
+        return super().applies(setup) and bool(setup.readings)
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """For what is measured."""
+        return cls("", *(name in setup.readings for name in REACTIONS))
+
+    def prior(self, setup: Setup) -> dict[str, float]:
+        """The tolerances force_bias and moment_bias."""
+        known = {kind: setup.tolerances.get(f"{kind}_bias") for kind in ("force", "moment")}
+        stds = {q.name: known[q.name.split("_")[1]] for q in self.parameters(setup.cable)}
+        return {name: std for name, std in stds.items() if std is not None}
+
+    def feel(self, reactions: Mapping[str, ca.SX], params: Params) -> dict[str, ca.SX]:
+        """Add the bias."""
+        return {
+            name: value + ca.vertcat(*(params[key] for key in params if key.startswith(name)))
+            if getattr(self, name)
+            else value
+            for name, value in reactions.items()
+        }

@@ -1,0 +1,311 @@
+"""What readings of forces and moments tell, on sessions simulated by this toolkit's own model.
+
+    python scripts/check_readings.py [--sets 4] [--tables clean mass loads clamps] [--jobs N]
+
+The cable and the poses of configs/cable.yaml, 0.3 mm of white noise, fixtures and sensors off by
+draws from their tolerances; forces of 15 mN and moments of 1 mN m of noise. Four tables:
+
+- clean: readings of the end's force on three poses, nothing hidden: false alarms of the diagnosis,
+  and how often intervals of EI hold the truth;
+- mass: the same with a mass that is not declared: errors of EI and mass, and coverage;
+- loads: a lumped mass against point_force, by the number of poses with readings of the end's force:
+  twice the log evidence of the right model over the wrong one;
+- clamps: a pin with a stiff spring against a clamp at another angle, the same, with readings of
+  force and moment at the start.
+
+A dead weight is a dead force: no reading of forces tells a lumped mass from a point force along
+gravity.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from dlo_casadi.assembly import Shapes
+from dlo_casadi.config import Config, load_config
+from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.durable import write_file
+from dlo_casadi.effects import EFFECTS
+from dlo_casadi.effects.mass_error import MASS_FACTOR
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.profile import profile_intervals
+from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import fine_enough, fit_declared
+from dlo_casadi.session.measure import conditions
+
+ROOT = Path(__file__).resolve().parent.parent
+STD, FORCE_STD, MOMENT_STD = 3e-4, 0.015, 1e-3  # m, N, N m
+TABLES = ("clean", "mass", "loads", "clamps")
+NUMBERS = (0, 3, 12)  # of poses with readings
+MASS, POSITION = 0.03, 0.3  # kg, m: of the lumped mass
+STIFFNESS, HEADING = 600.0, 0.35  # N m/rad, rad: of the spring at the start
+APART = 10.0  # of twice the log evidence, as BIC_APART of the diagnosis
+
+
+def measured_with(config: Config, readings: tuple[str, ...], number: int) -> Config:
+    """The configuration with places for readings on that many of the poses to fit."""
+    poses, left = [], number
+    for pose in config.experiment.poses:
+        given = {}
+        if pose.role == "fit" and left:
+            given = {name: (0.0,) * (1 if "moment" in name else 2) for name in readings}
+            left -= 1
+        poses.append(pose.model_copy(update=given))
+    measurement = config.experiment.measurement.model_copy(
+        update={"std": STD, "force_std": FORCE_STD, "moment_std": MOMENT_STD}
+    )
+    update = {"poses": tuple(poses), "measurement": measurement}
+    return replace(config, experiment=config.experiment.model_copy(update=update))
+
+
+def simulate(config: Config, generator, hidden: dict[str, dict[str, float]], factor: float = 1.0):
+    """Measured poses and the true EI; None where a pose has no stable equilibrium.
+
+    Parameters
+    ----------
+    hidden : dict
+        Parameters of effects by their names.
+    factor : float
+        True mass over that which the model starts from.
+    """
+    model = declared_model(config).model.with_mesh(40)
+    cable, tolerances = model.cable, config.experiment.tolerances
+    model = replace(model, cable=replace(cable, mass=factor * cable.mass))
+    for name in hidden:
+        if name not in [effect.name for effect in model.effects]:
+            model = model.with_effect(EFFECTS[name]())
+    p = model.nominal.copy()
+    p[0] = cable.mass * 9.81 * cable.length**2 * generator.uniform(0.1, 0.4)
+    for k, q in enumerate(model.parameters):
+        if np.isfinite(q.prior_std) and not q.log:
+            p[k] += q.prior_std * generator.standard_normal()
+    for name, values in hidden.items():
+        for key, value in values.items():
+            p[model.names.index(f"{name}.{key}")] = value
+    places = model.chain.cells.mean(axis=1) / cable.length
+    rest = sum(
+        generator.normal(0, 0.2) * np.cos(np.pi * k * places) * 2 * np.pi / cable.length
+        for k in range(4)
+    )
+    poses = [conditions(pose) for pose in config.experiment.poses]
+    predictions = predict_poses(model, p, rest, poses)
+    if any(item is None or not item.equilibrium.stable for item in predictions):
+        return None
+    deviation = np.zeros((len(poses), 6))
+    deviation[:, :2] = tolerances.end * generator.standard_normal((len(poses), 2))
+    shapes = Shapes(
+        np.array([item.equilibrium.x for item in predictions]),
+        np.array([item.equilibrium.multipliers for item in predictions]),
+        deviation,
+    )
+    sweep = Sweep(model, poses)
+    shapes, converged = sweep.solve(shapes, p, rest)
+    if not converged.all():
+        return None
+    measured = []
+    for pose, seen, own in zip(
+        config.experiment.poses, sweep.seen(shapes, p, rest), poses, strict=True
+    ):
+        s = np.linspace(0.01, 0.99, 60) * cable.length
+        points = seen.curve.at(s) + STD * generator.standard_normal((len(s), 2))
+        item = MeasuredPose.of_points(own, points, held_out=pose.role == "held_out")
+        item = item.with_readings(pose.readings)
+        read = {
+            name: true
+            + (MOMENT_STD if "moment" in name else FORCE_STD) * generator.standard_normal(len(true))
+            for name, (_, true) in item.readings_beside(seen).items()
+        }
+        item = MeasuredPose.of_points(own, points, held_out=pose.role == "held_out")
+        measured.append(item.with_readings(read))
+    return measured, float(p[0])
+
+
+def drawn(config: Config, generator, hidden=None, factor: float = 1.0):
+    """The first simulated session in which all poses are stable."""
+    while True:
+        found = simulate(config, generator, hidden or {}, factor)
+        if found is not None:
+            return found
+
+
+def load_bench() -> Config:
+    """configs/cable.yaml with lines in place of photographs."""
+    config = load_config(ROOT / "configs" / "cable.yaml")
+    other = load_config(ROOT / "tests" / "data" / "bench" / "short_clean" / "session.yaml")
+    experiment = config.experiment.model_copy(update={"measurement": other.experiment.measurement})
+    return replace(config, experiment=experiment)
+
+
+def inside(interval, value: float) -> bool:
+    """Whether an interval holds a value."""
+    low, high = interval.low, interval.high
+    return (low is None or low <= value) and (high is None or value <= high)
+
+
+def clean(generator) -> dict:
+    """Nothing hidden: what the diagnosis adds, and whether EI's interval holds the truth."""
+    config = measured_with(load_bench(), ("end_force",), 3)
+    measured, stiffness = drawn(config, generator)
+    fit, _ = fit_declared(config, declared_model(config), measured)
+    diagnosis = diagnose(fit)
+    after, _ = fine_enough(diagnosis.after, diagnosis.after.model.n)
+    interval = profile_intervals(after)["bending_stiffness"]
+    return {
+        "added": [item.candidate.name for item in diagnosis.added],
+        "unexplained": diagnosis.unexplained,
+        "inside": inside(interval, stiffness),
+        "error": after.value("bending_stiffness") / stiffness - 1,
+        "std": after.std("bending_stiffness") / stiffness,
+    }
+
+
+def mass(generator) -> dict:
+    """A mass that is not declared."""
+    config = load_bench()
+    unknown = config.cable.model_copy(update={"mass": None})
+    config = measured_with(replace(config, cable=unknown), ("end_force",), 3)
+    measured, stiffness = drawn(config, generator, factor=1.1)
+    fit, _ = fit_declared(config, declared_model(config), measured)
+    found = profile_intervals(fit)
+    return {
+        "EI": fit.value("bending_stiffness") / stiffness - 1,
+        "EI_inside": inside(found["bending_stiffness"], stiffness),
+        "mass": fit.value(MASS_FACTOR) / 1.1 - 1,
+        "mass_inside": inside(found[MASS_FACTOR], 1.1),
+    }
+
+
+def told(generator, hidden, wrong: str, readings, number: int, held: str, other: str) -> dict:
+    """Twice the log evidence of the right model over the wrong one."""
+    config = measured_with(load_bench(), readings, number)
+    (right,) = hidden
+    gains = {}
+    for name, side in ((right, held), (wrong, other)):
+        boundary = config.experiment.boundary.model_copy(update={"start": side})
+        poses = tuple(
+            pose.model_copy(update={"start_heading": 0.0 if side == "clamped" else None})
+            for pose in config.experiment.poses
+        )
+        update = {"boundary": boundary, "poses": poses}
+        as_held = replace(config, experiment=config.experiment.model_copy(update=update))
+        if name == right:
+            measured, _ = drawn(as_held, generator, hidden)
+        items = [
+            replace(item, pose=conditions(pose)) for item, pose in zip(measured, poses, strict=True)
+        ]
+        declared = declared_model(as_held)
+        effect = EFFECTS[name]
+        model = declared.model
+        if name in [one.name for one in model.effects]:
+            kept = {k: v for k, v in model.priors.items() if not k.startswith(f"{name}.")}
+            model = replace(model, priors=kept)
+        else:
+            model = model.with_effect(effect())
+        declared = replace(declared, model=model, values=dict(START.get(name, {})))
+        try:
+            fit, _ = fit_declared(as_held, declared, items, 20)
+            gains[name] = 2 * fit.log_evidence
+        except EstimationError:  # no shape of the model comes near the measured ones
+            gains[name] = -1e9
+    return {"number": number, "gain": gains[right] - gains[wrong]}
+
+
+# Where fits of effects start whose place or stiffness has no slope at their nominal value.
+START = {
+    "lumped_mass": {"lumped_mass.mass": 0.02, "lumped_mass.position": POSITION},
+    "point_force": {"point_force.fy": -0.2, "point_force.position": POSITION},
+    "start_spring": {"start_spring.stiffness": STIFFNESS, "start_spring.heading": HEADING},
+}
+
+
+def loads(generator, number: int) -> dict:
+    """A lumped mass."""
+    lump = {"lumped_mass": {"mass": MASS, "position": POSITION}}
+    return told(generator, lump, "point_force", ("end_force",), number, "pinned", "pinned")
+
+
+def clamps(generator, number: int) -> dict:
+    """A pin with a spring."""
+    spring = {"start_spring": {"stiffness": STIFFNESS, "heading": HEADING}}
+    reads = ("start_force", "start_moment")
+    return told(generator, spring, "clamp_angle", reads, number, "pinned", "clamped")
+
+
+def run_one(index: int, seed: int, tables: tuple[str, ...]) -> dict:
+    """One set of each table; its random numbers depend on seed and index alone."""
+    rows: dict = {}
+    begin = time.perf_counter()
+    for table, work in (("clean", clean), ("mass", mass)):
+        if table in tables:
+            rows[table] = work(generator_of(seed, index))
+    for table, power in (("loads", loads), ("clamps", clamps)):
+        if table in tables:  # the same cable for each number
+            rows[table] = [power(generator_of(seed, index), number) for number in NUMBERS]
+    return rows | {"seconds": time.perf_counter() - begin}
+
+
+def main() -> None:
+    """Simulate, fit, count."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sets", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tables", nargs="+", choices=TABLES, default=TABLES)
+    parser.add_argument("--output", type=Path)
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
+    args = parser.parse_args()
+    rows = []
+    with open_executor(args.jobs) as executor:
+        work = partial(run_one, seed=args.seed, tables=tuple(args.tables))
+        for done in map_as_completed(executor, work, range(args.sets)):
+            rows.append(done.value)
+            print(json.dumps(done.value), flush=True)
+    if args.output:
+        write_file(args.output, json.dumps(rows))
+    print_tables(rows)
+
+
+def print_tables(rows: list[dict]) -> None:
+    """What the sets have shown."""
+    found = [row["clean"] for row in rows if "clean" in row]
+    if found:
+        alarms = sum(bool(row["added"]) or row["unexplained"] for row in found)
+        print(f"clean: {alarms} false alarms of {len(found)}, EI inside {share(found, 'inside')}")
+    known = [row["mass"] for row in rows if "mass" in row]
+    for what in ("EI", "mass") if known else ():
+        worst = max(abs(row[what]) for row in known)
+        rms = float(np.sqrt(np.mean([row[what] ** 2 for row in known])))
+        print(
+            f"mass unknown: {what} off by {rms:.2%} RMS, {worst:.2%} at most, inside "
+            f"{share(known, f'{what}_inside')}"
+        )
+    for table, what in (("loads", "lumped_mass | point_force"), ("clamps", "spring | clamp")):
+        if table not in rows[0]:
+            continue
+        print(f"{what}, poses with readings: share told apart (by {APART:g}), median")
+        for k, number in enumerate(NUMBERS):
+            gains = [row[table][k]["gain"] for row in rows]
+            told_apart = float(np.mean(np.array(gains) > APART))
+            print(f"  {number:3d}: {told_apart:.0%}, {np.median(gains):.1f}")
+
+
+def share(rows: list[dict], key: str) -> str:
+    """How many of some rows hold the truth."""
+    return f"{sum(row[key] for row in rows)} of {len(rows)}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""Weights that a cable with a free tip does not tell from its stiffness."""
+
+import numpy as np
+import pytest
+
+from dlo_casadi.diagnosis.candidates import candidates, setup_of
+from dlo_casadi.diagnosis.equivalents import equivalents
+from dlo_casadi.diagnosis.hidden_weight import hidden_weight
+from dlo_casadi.effects import EFFECTS, Cable, LumpedMass
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.gauss_newton import Tolerances
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model import CableModel
+from dlo_casadi.session.remarks import weight_warning
+
+EI, MASS = 0.06, 0.35
+MODEL = CableModel(Cable(0.65, 0.4, 0.015, 0.03), 10, start="clamped", end="free", n_rest=3)
+
+
+def fitted(std, points, mass):
+    """A cable with a weight near its middle, fitted without it; std of the points [m]."""
+    heavy, rng = MODEL.with_effect(LumpedMass()), np.random.default_rng(0)
+    p, rest = np.array([EI, mass, 0.3]), np.zeros(MODEL.chain.n_cells)
+    poses = [Pose((0.0, 0.0), None, h, name=f"{h:.1f}") for h in np.linspace(-3.0, 0.0, 10)]
+    s = np.linspace(0.65 / points, 0.65, points)
+    measured = [
+        MeasuredPose.of_points(
+            pose, shape.curve.at(s) + rng.normal(scale=std, size=(points, 2)), s=s
+        )
+        for pose, shape in zip(poses, predict_poses(heavy, p, rest, poses), strict=True)
+    ]
+    return fit_model(MODEL, measured, Tolerances(), std)
+
+
+def test_a_weight_that_fits_as_well_as_none_widens_the_interval_of_the_stiffness():
+    """Two markers a pose, 6 mm off: without the weight EI is half of what it is."""
+    fit = fitted(6e-3, 2, MASS)
+    assert fit.chi2_per_dof < 1.5
+    assert fit.value("bending_stiffness") + 3 * fit.std("bending_stiffness") < EI
+    weight = hidden_weight(fit)
+    low, high = weight.stiffness_95
+    assert low < EI < high
+    assert weight.mass > MASS
+    assert weight.force == pytest.approx(9.81 * weight.mass)
+    assert weight.difference < fit.expected_error
+    said = weight_warning(vars(weight), fit.expected_error)
+    assert "measure the force on the start, which differs by up to" in said
+    assert ". No pose would: even with start_heading" in said
+
+    force = next(c for c in candidates(MODEL, setup_of(MODEL)) if c.name == "point_force")
+    model = force.add_to(MODEL)
+    values = dict(zip(model.names, fit.values_in(model), strict=True))
+    values |= {"point_force.fy": 2.0, "point_force.position": 0.3}
+    lifted = fit_model(
+        model, fit.problem.history, Tolerances(), start=fit, values=np.array([*values.values()])
+    )
+    # Whatever the data have decided on: nothing lifts a cable with a free tip.
+    assert equivalents(lifted, force, tuple(EFFECTS)) == ("lumped_mass", "bending_stiffness")
+
+
+def test_a_weight_that_shows_is_not_hidden():
+    """Sixty points a pose to 0.1 mm tell a twentieth of the cable's mass."""
+    assert hidden_weight(fitted(1e-4, 60, 0.0)) is None

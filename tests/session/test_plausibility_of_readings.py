@@ -1,0 +1,145 @@
+"""Mistakes of readings, each made with forces of a cable in a plane or in space, and named."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.config import load_config
+from dlo_casadi.effects import Cable
+from dlo_casadi.ends import reaction_rows
+from dlo_casadi.equilibrium import Pose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model import CableModel
+from dlo_casadi.session.checks import find_suspicions
+from dlo_casadi.session.declared import declared_model, straight
+from dlo_casadi.session.measure import conditions, read_inputs
+from dlo_casadi.session.plausibility_of_readings import Compared, misread
+
+ROOT = Path(__file__).parents[2]
+CABLE = Cable(0.8, 0.2, 0.012, 0.04)
+ARM = np.array([0.05, -0.01, 0.02])
+
+
+def across(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross product, in a plane one number."""
+    return np.cross(a, b) if a.size == 3 else np.array([a[0] * b[1] - a[1] * b[0]])
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["plane", "space"])
+def read(request):
+    """Forces, moments and clamps (6, d, d) of six poses."""
+    rng = np.random.default_rng(0)
+    space = request.param
+    d = 3 if space else 2
+    ends = np.column_stack([rng.uniform(0.3, 0.6, 6), rng.uniform(-0.3, 0.3, size=(6, d - 1))])
+    if space:
+        cable, gravity = replace(CABLE, torsional_stiffness=0.02), (0.0, 0.0, -9.81)
+        frames = Rotation.from_rotvec(rng.normal(scale=0.6, size=(6, 3)))
+        poses = [
+            Pose((0.0,) * 3, tuple(end), None, None, (0.0, 0.0, 0.0, 1.0), tuple(frame.as_quat()))
+            for end, frame in zip(ends, frames, strict=True)
+        ]
+        axes = frames.as_matrix()
+    else:
+        cable, gravity, headings = CABLE, (0.0, -9.81), rng.normal(scale=0.8, size=6)
+        poses = [
+            Pose((0.0, 0.0), tuple(end), 0.0, heading)
+            for end, heading in zip(ends, headings, strict=True)
+        ]
+        axes = np.array([[[np.cos(h), -np.sin(h)], [np.sin(h), np.cos(h)]] for h in headings])
+    model = CableModel(cable, 8, start="clamped", end="clamped", gravity=gravity)
+    found = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), poses)
+    rows = reaction_rows(model.node)
+    force, moment = (
+        np.array([one.seen.readings[rows[name]] for one in found])
+        for name in ("end_force", "end_moment")
+    )
+    return force, moment, axes
+
+
+def said_of(read, force: np.ndarray, moment: np.ndarray, mass: float = 0.8) -> list[str]:
+    """What is said of readings whose true forces the shapes give at another mass."""
+    model_force, model_moment, axes = read
+    noise = np.random.default_rng(1).normal(scale=0.01, size=force.shape)
+    found = misread(
+        [
+            Compared("end_force", force + noise * np.abs(force).max(), model_force / mass, axes),
+            Compared("end_moment", moment, model_moment / mass, axes, model_force / mass),
+        ]
+    )
+    return [item.message for item in found if item.certain]
+
+
+def in_frames(axes: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (m, d) about the clamps' axes; a moment in a plane stays."""
+    return vectors if vectors.shape[1] == 1 else np.einsum("mji,mj->mi", axes, vectors)
+
+
+def test_the_convention_itself_is_no_mistake(read):
+    force, moment, _ = read
+    assert said_of(read, force, moment) == []
+    assert said_of(read, force, moment, mass=2.0) == []
+
+
+def test_forces_on_the_cable_in_place_of_the_fixture(read):
+    force, moment, _ = read
+    found = said_of(read, -force, -moment)
+    assert len(found) == 2
+    assert all("with the other sign" in text for text in found)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_axes_of_the_sensor(read, sign):
+    force, moment, axes = read
+    found = said_of(read, sign * in_frames(axes, force), sign * in_frames(axes, moment))
+    assert f"Try: {'world axes, R f' if sign > 0 else '-R f'}" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("unit", "of_force", "of_moment"),
+    [("grams-force", 101.97, 1.0), ("kilograms-force", 0.10197, 1.0), ("N mm", 1.0, 1e3)],
+)
+def test_other_units(read, unit, of_force, of_moment):
+    force, moment, _ = read
+    found = said_of(read, of_force * force, of_moment * moment)
+    assert any(f"in {unit}?" in text for text in found), found
+
+
+def test_moments_about_the_sensor(read):
+    force, moment, axes = read
+    arms = axes @ ARM[: force.shape[1]]
+    about = np.array([across(-arm, own) for arm, own in zip(arms, force, strict=True)])
+    (found,) = said_of(read, force, moment + about)
+    numbers = found.split("about a point (")[1].split(")")[0].split(", ")
+    # Least squares on exact moments: the scale is the only other unknown.
+    np.testing.assert_allclose(
+        np.array(numbers, dtype=float), 1e3 * ARM[: len(numbers)], atol=0.1, rtol=5e-3
+    )
+
+
+def test_axes_of_another_world(read):
+    force, moment, _ = read
+    turn = Rotation.from_rotvec([0.0, 0.0, 1.2]).as_matrix()[: force.shape[1], : force.shape[1]]
+    found = said_of(read, force @ turn, moment if moment.shape[1] == 1 else moment @ turn)
+    assert "turned by 69 degrees" in found[0].replace("-69", "69")
+
+
+def test_a_session_whose_readings_have_the_other_sign():
+    """Forces of a straight cable of the declared stiffness, a guess, are near enough to tell."""
+    config = load_config(ROOT / "tests/data/bench/short_clean/session.yaml")
+    inputs = read_inputs(config, lambda *_: None)
+    model = straight(declared_model(config).model).with_mesh(10)
+    declared = config.experiment.poses
+    found = predict_poses(
+        model, model.nominal, np.zeros(model.chain.n_rests), [conditions(x) for x in declared]
+    )
+    poses = tuple(
+        pose.model_copy(update={"end_force": tuple(-one.equilibrium.lam)})
+        for pose, one in zip(declared, found, strict=True)
+    )
+    experiment = config.experiment.model_copy(update={"poses": poses})
+    said = find_suspicions(replace(config, experiment=experiment), inputs)
+    assert any("end_force" in x.message and "other sign" in x.message for x in said), said
