@@ -229,7 +229,8 @@ def test_the_configurations_follow_the_schema(path):
         ("length", "lenght", "'lenght' was unexpected"),
         ("start: pinned", "start: free", "'free' is not one of"),
         ("[0.0, -9.81]", "[0.0, -9.81, 0.0, 0.0]", "is not valid under any"),
-        ("mass: 0.23", "mass: heavy", "'heavy' is not of type 'number'"),
+        ("mass: 0.23", "mass: heavy", "'heavy' is not valid under any"),
+        ("diameter: 0.0128", "diameter: wide", "'wide' is not of type 'number'"),
     ],
 )
 def test_the_schema_finds_mistakes(old, new, said, tmp_path):
