@@ -14,6 +14,9 @@ FloatArray = NDArray[np.floating]
 
 # A clamp's turning decays as (1 - s/L)^5 from it, as in a plane.
 _DECAY = 5
+# Rolls so near to half a turn [rad] are as near to none the other way round: arcs to four sides
+# differ by as much, 1.2 rad in a pose whose lowest equilibrium is the other one.
+HALF_TURN = 1.0
 
 
 def parallel_frames(tangents: FloatArray, first: Rotation) -> Rotation:
@@ -86,12 +89,15 @@ def guessed_frames_of(
     side = down - (down @ along) * along
     if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
         side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    found = []
+    found: list[FloatArray] = []
+    others: list[FloatArray] = []
     for quarter in range(4):
         turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
         tangents = arc_tangents(u, chord, turned)
-        found.append(into_clamps(u, tangents, (first, last), turns))
-    return found
+        nearest, *other = ways_into_clamps(u, tangents, (first, last), turns)
+        found.append(nearest)
+        others += other
+    return found + others
 
 
 def _hanging(
@@ -120,7 +126,19 @@ def into_clamps(
     clamps: tuple[Rotation | None, Rotation | None],
     turns: float,
 ) -> FloatArray:
+    """The first of `ways_into_clamps`."""
+    return ways_into_clamps(u, tangents, clamps, turns)[0]
+
+
+def ways_into_clamps(
+    u: FloatArray,
+    tangents: FloatArray,
+    clamps: tuple[Rotation | None, Rotation | None],
+    turns: float,
+) -> list[FloatArray]:
     """Frames (k, 4) along tangents (k, 3), bent into the clamps, their roll spread evenly.
+
+    Between two clamps whose roll is nearly half a turn also those rolled the other way round.
 
     Parameters
     ----------
@@ -141,13 +159,16 @@ def into_clamps(
     for bend in bends:
         axes = Rotation.from_rotvec(bend).apply(axes)
     frames = parallel_frames(axes, first or smallest_turn(np.array([1.0, 0.0, 0.0]), axes[0]))
-    if last is not None:
-        missing = roll_between(frames[-1], last)
-        roll = missing if first is None else u * (missing + 2 * np.pi * turns)
-        frames = frames * Rotation.from_rotvec(
-            np.broadcast_to(roll, u.shape)[:, None] * np.array([1.0, 0.0, 0.0])
-        )
-    return same_sign(frames.as_quat())
+    if last is None:
+        return [same_sign(frames.as_quat())]
+    missing = roll_between(frames[-1], last)
+    rolls = [np.broadcast_to(missing, u.shape)]
+    if first is not None:
+        rolls = [u * (missing + 2 * np.pi * turns)]
+        if abs(missing) > np.pi - HALF_TURN:
+            rolls.append(rolls[0] - u * np.copysign(2 * np.pi, missing))
+    about = [Rotation.from_rotvec(roll[:, None] * np.array([1.0, 0.0, 0.0])) for roll in rolls]
+    return [same_sign((frames * roll).as_quat()) for roll in about]
 
 
 def same_sign(quaternions: FloatArray) -> FloatArray:

@@ -23,8 +23,8 @@ from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
-# Doubles of a workspace per node, and beside those four coarse shapes; as in the template.
-_NUMBERS, _COARSE_SHAPES = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 4
+# Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
+_NUMBERS, _COARSE_SHAPES = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 8
 # Fewest elements of the coarse mesh, and elements of the fine one in each of its elements. Of 240
 # random clamped problems with n = 12, the lowest equilibrium that the fine mesh finds was missed in
 # 2, 1, 0 with 4, 5, 6 coarse elements; a cold solve takes 159, 195, some 230 us.
@@ -38,7 +38,7 @@ TEXTS = {
     "START_FRAME": "start_orientation",
     "END_FRAME": "end_orientation",
     "BRANCH": """\
- *   branch     in   DLO_LOWEST: four first guesses are followed, with a free end three, and the
+ *   branch     in   DLO_LOWEST: four to eight first guesses are followed, with a free end three, and the
  *                   stable equilibrium of lowest energy is taken.""",
     "SNAP": "snap-through, or a twist at which the cable loops",
     "POSE": """{0.0, 0.0, 0.0}, {0.6 * DLO_LENGTH, 0.1 * DLO_LENGTH, 0.1 * DLO_LENGTH},

@@ -181,7 +181,7 @@ def test_first_guesses_are_those_of_python_number_for_number(tmp_path, ends, gra
         held = replace(pose, end=None) if ends[1] == "free" else pose
         at = np.array([*held.ends, held.turns])
         found = []
-        for which in range(5):
+        for which in range(9):
             frames = np.zeros((model.n + 1, 4))
             if library.dlo_guess(at.ctypes.data, which, frames.ctypes.data, work.ctypes.data):
                 found.append(frames)
