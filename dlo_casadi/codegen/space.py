@@ -38,8 +38,8 @@ TEXTS = {
     "START_FRAME": "start_orientation",
     "END_FRAME": "end_orientation",
     "BRANCH": """\
- *   branch     in   DLO_LOWEST: four to eight first guesses are followed, with a free end three, and the
- *                   stable equilibrium of lowest energy is taken.""",
+ *   branch     in   DLO_LOWEST: four to eight first guesses are followed, with a free end three,
+ *                   and the stable equilibrium of lowest energy is taken.""",
     "SNAP": "snap-through, or a twist at which the cable loops",
     "POSE": """{0.0, 0.0, 0.0}, {0.6 * DLO_LENGTH, 0.1 * DLO_LENGTH, 0.1 * DLO_LENGTH},
                            {0.0, 0.0, 0.0, 1.0}, {0.0, 0.0, 0.0, 1.0}, 0.0""",
