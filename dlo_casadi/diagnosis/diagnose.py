@@ -302,7 +302,11 @@ class _Search:
             # What a second effect explains may be what the first one, if wrong, has left.
             apart = np.inf if added and not explaining else BIC_APART
             chosen = _choose(confirmed, apart)
-            while chosen and not explaining and _misleads(chosen[0].fit, current, validation):
+            while (
+                chosen
+                and not (explaining or chosen[0].candidate.nuisance)
+                and _misleads(chosen[0].fit, current, validation)
+            ):
                 confirmed.remove(chosen[0])
                 chosen = _choose(confirmed, apart)
             if chosen is None:
@@ -503,8 +507,12 @@ def _improving(
     for item in tried:
         if item is None or item.bic <= 0 or not item.validation.complete:
             continue
-        # An effect that explains the fitted poses but predicts the others worse is none.
-        if item.validation.error > validation.error:
+        # An effect that explains the fitted poses but predicts the others worse is none. A nuisance
+        # is in the model already; without its prior it predicts about as well.
+        worse = item.validation.error > validation.error
+        if item.candidate.nuisance:
+            worse = item.validation.clearly_worse_than(validation)
+        if worse:
             continue
         if doubt is None or validation.chance_of_gain(item.validation) < doubt:
             out.append(item)

@@ -1,5 +1,7 @@
 """One pose taken several times, each time a little different for reasons that nobody knows."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -53,5 +55,6 @@ def test_only_a_clear_gain_counts_where_poses_do_not_repeat(errors, doubt, kept)
     """Mean squares of what is left out, hanging by hanging; 1 without the effect."""
     counts = np.full(5, 40.0)
     before = CrossValidation(counts * 1.0, counts, True)
-    tried = Confirmed(None, None, CrossValidation(counts * errors, counts, True), 100.0, 90.0)
+    added = SimpleNamespace(candidate=SimpleNamespace(nuisance=False))
+    tried = Confirmed(added, None, CrossValidation(counts * errors, counts, True), 100.0, 90.0)
     assert diagnose._improving([tried], before, doubt) == ([tried] if kept else [])
