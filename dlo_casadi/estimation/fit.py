@@ -54,8 +54,8 @@ SEARCH_STD = 0.004
 # RMS distance over length that a search in space leaves, from which on the model lacks something,
 # and the standard deviation over length by which such a fit weighs the points. In four sessions in
 # which an effect is missing the searches left 0.0025 to 0.0083, in three with nothing or little
-# missing 0.0008 to 0.0013. Weighed by 0.004 the fit of a taper loses its torsional stiffness (0.0003
-# of 0.005 N m^2), by 0.01 it keeps it; a drift's is off either way.
+# missing 0.0008 to 0.0013. Weighed by 0.004 the fit of a taper loses its torsional stiffness
+# (0.0003 of 0.005 N m^2), by 0.01 it keeps it; a drift's is off either way.
 MISFIT, MISFIT_STD = 0.002, 0.01
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
