@@ -40,6 +40,7 @@ from dlo_casadi.thresholds import (
     DIFFERENT,
     LEAST_NOISE_DEGREES,
     LEFT,
+    MISLEADING,
     REFITTED,
     SIGNIFICANCE,
     UNSEEN,
@@ -543,7 +544,7 @@ def _misleads(fit: Fit, before: Fit, validation: CrossValidation) -> bool:
     `validation` follows the branches on which poses were measured, without the effect.
     """
     told = _told(fit)
-    return told > validation.rmse and told > _told(before)
+    return told > validation.rmse and told > MISLEADING * _told(before)
 
 
 def _told(fit: Fit) -> float:
