@@ -414,6 +414,10 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     if len(metadata.coefficients) != model.n_coefficients:
         found = f": {model.n_coefficients} numbers belong here, found {len(metadata.coefficients)}"
         raise _DamagedError(("rest_curvature",), found)
+    coefficients = [f"rest_curvature[{k}]" for k in range(model.n_coefficients)]
+    for name in metadata.names:
+        if name not in (*model.names, *coefficients):
+            raise _DamagedError(("covariance", "names"), f": nothing is called {show(name)}")
     rest = _stacked(document["state"]["rest_curvature"], Frame.strains, "state")
     return Parameters(
         model,
@@ -427,7 +431,8 @@ def _metadata(document: dict[str, Any], source: Path) -> Metadata:
     """What a document tells beside the model."""
     rows = document["parameters"]
     names = tuple(document["covariance"]["names"])
-    covariance = np.array(document["covariance"]["values"], dtype=float)
+    rows_of = np.array(document["covariance"]["values"], dtype=float)
+    covariance = _numbers(rows_of.ravel(), len(names) ** 2, "covariance", "values")
     covariance = covariance.reshape(len(names), len(names))
     interval = rows["bending_stiffness"].get("interval_95")
     scatter = document.get("scatter") or {}

@@ -102,6 +102,8 @@ def spoilt(image: NDArray[np.uint8]) -> str:
     white = float(np.mean(grey >= _WHITE))
     if white > _MUCH_WHITE:
         return f" The picture is overexposed: {100 * white:.0f} % of it are white; less light."
+    if min(grey.shape) < 2:
+        return ""
     step = float(np.subtract(*np.percentile(grey, [99.9, 0.1])))
     slope = np.hypot(*np.gradient(grey.astype(np.float32)))
     blur = step / (np.sqrt(2 * np.pi) * max(float(np.percentile(slope, 99.9)), 1e-3))
