@@ -398,7 +398,8 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     except EstimationError:
         # The coarse mesh was too far off to be followed: start again from the measured shapes.
         names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]
-        std = fit.noise.std if fit.noise.source == "declared" else None
+        known = fit.noise.before or fit.noise
+        std = known.std if known.source == "declared" else None
         return fit_model(
             model,
             problem.history,
@@ -406,7 +407,7 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
             std,
             free=names,
             values=fit.p,
-            readings=fit.noise.readings,
+            readings=known.readings,
         )
     problem, point, converged = refine(
         moved.problem, moved.point, estimate=not fit.noise.known, rounds=2, modes=modes
