@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.screening import Screened
+from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.afresh import Start, fit_afresh, start_afresh
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.parallel import map_in_order
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -59,6 +64,39 @@ def confirm(base: Fit, screened: Screened) -> Confirmed | None:
     """Refit with a candidate added; None if no equilibria can be followed to it."""
     fit = refit_with(base, screened)
     return None if fit is None else Confirmed.of(screened, base, fit)
+
+
+def screened_afresh(
+    base: Fit, listed: Sequence[Candidate], executor: Executor
+) -> list[tuple[Screened, Start]]:
+    """Candidates of a base that is astray, started from the measured shapes, best first.
+
+    The score is what a candidate gains there, at the noise of a search; without one that starts
+    from the measured shapes, too.
+    """
+    without = start_afresh(base, base.model)
+    begun = partial(_start_with, base)
+    out = []
+    for candidate, start in zip(listed, map_in_order(executor, begun, listed), strict=True):
+        if start is None or without is None:
+            continue
+        score = max(2 * (without.guess.objective - start.guess.objective), 0.0)
+        p_value = survival(score, len(candidate.frees), np.inf)
+        out.append((Screened(candidate, score, p_value, {}), start))
+    return sorted(out, key=lambda pair: -pair[0].score)
+
+
+def _start_with(base: Fit, candidate: Candidate) -> Start | None:
+    return start_afresh(base, candidate.add_to(base.model), candidate.scans)
+
+
+def confirm_afresh(base: Fit, screened: Screened, start: Start) -> Confirmed | None:
+    """Fit with a candidate added, from where it was started; None if that is no equilibrium."""
+    try:
+        fit = fit_afresh(base, start)
+        return None if fit is None else Confirmed.of(screened, base, fit)
+    except EstimationError:
+        return None
 
 
 def refit_with(base: Fit, screened: Screened) -> Fit | None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.causes import refit_from
-from dlo_casadi.diagnosis.confirm import Confirmed, confirm
+from dlo_casadi.diagnosis.confirm import Confirmed, confirm, confirm_afresh, screened_afresh
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.equivalents import equivalents
 from dlo_casadi.diagnosis.hidden_weight import HiddenWeight, hidden_weight
@@ -41,6 +41,7 @@ from dlo_casadi.thresholds import (
     LEAST_NOISE_DEGREES,
     LEFT,
     MISLEADING,
+    NEAREST,
     REFITTED,
     SIGNIFICANCE,
     UNSEEN,
@@ -288,13 +289,18 @@ class _Search:
         ranked: list[Ranked] = []
         for k in range(self.max_effects):
             self.step("search for a missing effect", k, self.max_effects)
-            screened = self.first if k == 0 else screen(current, self.center, self.exclude)
+            astray = current.noise.source == "misfit"
+            tried: list[Confirmed | None] = []
+            if astray and pull is None:
+                screened, tried = self._afresh(current)
+            else:
+                screened = self.first if k == 0 else screen(current, self.center, self.exclude)
             p_values = {
                 item.candidate.name: _corrected(item.p_value, len(screened)) for item in screened
             }
             if k == 0 and pull is not None:
                 tried = self._causes(pull, screened)
-            else:
+            elif not astray:
                 tried = self._leading(current, screened, p_values)
             explaining = _explaining(current, tried)
             confirmed = explaining or _improving(tried, validation, self.doubt)
@@ -318,7 +324,7 @@ class _Search:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = _corrected(single, len(screened))
             closed = winner.fit if explaining else _closed(winner.fit)
-            if not closed.errors_known and current.noise.source != "misfit":
+            if not (closed.errors_known or astray):
                 again = _p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
             if p_value > self.significance:
@@ -337,11 +343,21 @@ class _Search:
         significant = [
             item for item in screened if p_values[item.candidate.name] < self.significance
         ]
-        leading = sorted(significant, key=lambda item: -item.score)
-        if current.noise.source != "misfit":  # beside which scores are no order
-            leading = leading[:REFITTED]
+        leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         return list(map_in_order(self.executor, partial(confirm, current), worthy))
+
+    def _afresh(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None]]:
+        """Fits from the measured shapes of the candidates that come nearest to them.
+
+        Beside a misfit scores are no order, and a refit leads where the declared model has gone.
+        """
+        listed = _listed(current, self.center, self.exclude)
+        begun = screened_afresh(current, listed, self.executor)
+        least = min((start.guess.objective for _, start in begun), default=0.0)
+        near = [pair for pair in begun if pair[1].guess.objective <= NEAREST * least]
+        tried = [confirm_afresh(current, *pair) for pair in near[:REFITTED]]
+        return [item for item, _ in begun], tried
 
     def _causes(self, pull: Pull, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that give the pull's forces.
@@ -411,6 +427,14 @@ class _Search:
 
 def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]) -> list[Screened]:
     """Score tests of all candidates at a fit, best first."""
+    listed = _listed(fit, center, exclude)
+    return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
+
+
+def _listed(
+    fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]
+) -> list[Candidate]:
+    """All effects that may be missing."""
     problem, shapes = fit.problem, fit.point.shapes
     setup = setup_of(
         fit.model,
@@ -421,8 +445,7 @@ def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str])
         directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
         largest_bend=float(problem.sweep.bends(shapes, fit.p, fit.rest).max()),
     )
-    listed = candidates(fit.model, setup, exclude)
-    return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
+    return candidates(fit.model, setup, exclude)
 
 
 def _explaining(current: Fit, tried: Iterable[Confirmed | None]) -> list[Confirmed]:

@@ -220,7 +220,7 @@ def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]
             "of the poses."
         )
     if model.in_space and Fit(problem, best, False).residual_rms > MISFIT * model.cable.length:
-        return _fit_to_misfit(problem, best, theta, decades)
+        return _fit_to_misfit(problem, best)
     problem, point, converged = refine(problem, best, estimate=not problem.noise.known, first=True)
     return Fit(problem, point, converged)
 
@@ -239,49 +239,44 @@ def _search(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) 
     found = _best(loose, theta, decades)
     if found is None:
         return None
-    problem.refresh(found.theta, found.shapes, found.feet)
-    return problem.evaluate(found.theta, found.shapes, found.feet)
+    return problem.taken_over(found)
 
 
-def _fit_to_misfit(
-    problem: BatchProblem, near: Point, theta: FloatArray, decades: Sequence[float]
-) -> Fit:
+def _fit_to_misfit(problem: BatchProblem, near: Point) -> Fit:
     """Fit a model that lacks something, its points taken for no surer than it can meet them.
 
     Where an effect is missing, a fit to a fraction of a millimetre bends all that it may bend and
-    ends in folds of single poses; to some millimetres it stays where what is missing can be added.
+    ends in folds of single poses.
     """
     model, known = problem.unknowns.model, problem.noise
     noise = replace(known.doubted(MISFIT_STD * model.cable.length), source="misfit", before=known)
     scatter = problem.tolerances.deviation(model.node)
     loose = problem.changed(noise, ROUGHNESS_START, scatter, RestScatter())
-    found = _best(loose, theta, decades) or near
-    loose.refresh(found.theta, found.shapes, found.feet)
-    point = loose.evaluate(found.theta, found.shapes, found.feet)
+    point = loose.taken_over(near)
     return Fit(loose, *loose.descend(point))
 
 
 def fitted_closely(fit: Fit) -> Fit:
-    """Fit the model of a fit to its misfit anew, now that it may meet the points as they are.
+    """A fit to its misfit, continued to the noise; itself where more than noise is left.
 
     Raises
     ------
     EstimationError
-        As `fit_model`.
+        If the points are hardly more than the unknowns that they determine.
     """
-    model, problem, known = fit.model, fit.problem, fit.noise.before
+    problem, known = fit.problem, fit.noise.before
     assert known is not None
-    free = [name for name, chosen in zip(model.names, fit.free_in(model), strict=True) if chosen]
-    return fit_model(
-        model,
-        problem.history,
-        problem.tolerances,
-        known.std if known.known else None,
-        free=free,
-        values=fit.p,
-        decades=(0,),
-        readings=known.readings,
-    )
+    length = fit.model.cable.length
+    # Through the scale of the search: at the noise a first step would bend all that is left.
+    loosely = known.doubted(SEARCH_STD * length)
+    loose = problem.changed(loosely, problem.roughness_std, problem.scatter, problem.rest_scatter)
+    near, _ = loose.descend(loose.taken_over(fit.point), STEPS_OF_A_RIVAL, tolerance=1e-2)
+    if Fit(loose, near, False).residual_rms > MISFIT * length:
+        return fit
+    scatter = problem.tolerances.deviation(fit.model.node)
+    tight = problem.changed(known, ROUGHNESS_START, scatter, RestScatter())
+    closely = Fit(*refine(tight, tight.taken_over(near), estimate=not known.known, first=True))
+    return fit if closely.residual_rms > MISFIT * length else closely
 
 
 def _best(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Point | None:

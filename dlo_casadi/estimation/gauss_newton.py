@@ -253,6 +253,11 @@ class BatchProblem:
             for mine, theirs in zip(self.used, other.used, strict=True)
         }
 
+    def taken_over(self, near: Point) -> Point:
+        """Return a point of a problem that weighs otherwise in this one, with the metric there."""
+        self.refresh(near.theta, near.shapes, near.feet)
+        return self.evaluate(near.theta, near.shapes, near.feet)
+
     def evaluate(self, theta: FloatArray, shapes: Shapes, feet: list[FloatArray]) -> Point:
         """Objective at given unknowns and equilibria."""
         seen = self.observed(theta, shapes)
@@ -375,6 +380,10 @@ class BatchProblem:
         for _ in range(max_iterations):
             limit = point.objective + 1e-9 * abs(point.objective)
             before, trial = damping, self._ahead(point, lin, damping, limit, WATCHED)
+            excess = max(1.0, point.data / max(self.n_residuals, 1))
+            if trial is None and self._promised(point, lin) < tolerance * excess:
+                # What a pose's deviations do to the poses after it, through a state, is left out.
+                return point, True
             while trial is None:
                 damping = max(10 * damping, 1e-4)
                 if damping > 1e8:
@@ -392,6 +401,14 @@ class BatchProblem:
             if sum(gains) < tolerance * excess:
                 return point, False
         return point, False
+
+    def _promised(self, point: Point, lin: Linearization) -> float:
+        """Decrease of the objective that an undamped step promises."""
+        normal = self.normal_equations(point, lin)
+        matrix = normal.hessian + NO_INFORMATION * np.eye(len(normal.hessian))
+        shared = normal.gradient @ np.linalg.solve(matrix, normal.gradient)
+        own = sum(slope @ np.linalg.solve(block, slope) for block, _, slope in normal.inner)
+        return float(shared + own) / 2
 
     def _ahead(
         self, point: Point, lin: Linearization, damping: float, limit: float, more: int

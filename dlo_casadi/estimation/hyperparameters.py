@@ -102,8 +102,7 @@ def refine(
             rest.std - problem.rest_scatter.std
         ) < 0.05 * max(rest.std, problem.rest_scatter.std)
         problem = problem.changed(noise, roughness, scatter, rest)
-        problem.refresh(point.theta, point.shapes, point.feet)
-        point = problem.evaluate(point.theta, point.shapes, point.feet)
+        point = problem.taken_over(point)
         point, converged = problem.descend(point)
         if moved < 0.1 and changed < 0.02 and same:
             break

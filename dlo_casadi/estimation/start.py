@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.equilibrium import first_nodes
 from dlo_casadi.estimation.chords import line_nodes
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
+from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem, Point
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
@@ -162,15 +162,12 @@ class Guess:
     feet : list of (K_j,) [m]
     objective : float
         What the linearised balance of forces promises at this theta.
-    settled : bool
-        Whether the last step was below SETTLED.
     """
 
     theta: FloatArray
     shapes: Shapes
     feet: list[FloatArray]
     objective: float = np.inf
-    settled: bool = False
 
 
 def all_at_once(
@@ -197,8 +194,8 @@ def all_at_once(
     moving = ~held
     columns = sweep.used_deviations
     own = np.diag(1 / problem.deviation_std**2 + 1e-12)
-    objective, settled = guess.objective, guess.settled
-    for _ in range(0 if settled else iterations):
+    objective = guess.objective
+    for _ in range(iterations):
         p, rest = unknowns.p(theta), unknowns.rest(theta)
         slopes = unknowns.slopes(theta)
         try:
@@ -228,7 +225,7 @@ def all_at_once(
             objective += float(e @ e + now @ own @ now - slope @ solved[:, -1]) / 2
             inner.append(solved)
         damped = hessian[np.ix_(moving, moving)]
-        damped = damped + 1e-6 * np.diag(np.diag(damped))
+        damped += np.diag(1e-6 * np.diag(damped) + NO_INFORMATION)
         step = np.zeros_like(theta)
         step[moving] = -np.linalg.solve(damped, gradient[moving])
         step = np.clip(theta + np.clip(step, -3, 3), lower, upper) - theta
@@ -246,10 +243,9 @@ def all_at_once(
         feet = point.feet
         if not np.all(np.isfinite(shapes.x)):
             return None
-        settled = size < SETTLED
-        if settled:
+        if size < SETTLED:
             break
-    return Guess(theta, shapes, feet, objective, settled)
+    return Guess(theta, shapes, feet, objective)
 
 
 def equilibria_near(problem: BatchProblem, guess: Guess) -> Point | None:
