@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dlo_casadi.effects import EFFECTS, Effect, Setup
+import numpy as np
+
+from dlo_casadi.effects import EFFECTS, Effect, PointLoad, Setup
+from dlo_casadi.effects.effect import Cable
 from dlo_casadi.model import CableModel
 
 
@@ -46,6 +49,29 @@ class Candidate:
             kept = {k: v for k, v in model.priors.items() if k not in self.frees}
             return replace(model, priors=kept)
         return model.with_effect(self.effect)
+
+    def add_linear_to(self, model: CableModel) -> CableModel:
+        """Return the model with this effect in the parameters that it is screened in."""
+        return self.add_to(model) if self.nuisance else model.with_effect(self.effect.linear())
+
+    def contains(self, other: Candidate, cable: Cable) -> bool:
+        """Whether this is a load at one place that may be the other one."""
+        loads = isinstance(self.effect, PointLoad) and isinstance(other.effect, PointLoad)
+        own, others = (
+            {q.name for q in item.effect.linear().parameters(cable)} for item in (self, other)
+        )
+        return loads and own > others
+
+    def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
+        """Qualified parameters, within their bounds, from those that it is screened in."""
+        prefix = f"{self.effect.label}."
+        own = self.effect.of_linear(
+            cable, {name.removeprefix(prefix): value for name, value in values.items()}
+        )
+        return {
+            prefix + q.name: float(np.clip(own[q.name], q.lower, q.upper))
+            for q in self.effect.parameters(cable)
+        }
 
 
 def setup_of(model: CableModel, **seen: Any) -> Setup:

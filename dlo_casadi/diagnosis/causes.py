@@ -43,11 +43,7 @@ def start_from(pull: Pull, candidate: Candidate) -> dict[str, float]:
     arms = np.concatenate([np.array(slopes(at)) for at in places])
     found = np.linalg.lstsq(arms, pull.force_per_pose.ravel(), rcond=None)[0]
     values = dict(zip(names, map(float, found), strict=True)) | {"position": pull.position}
-    own = candidate.effect.of_linear(model.cable, values)
-    return {
-        f"{effect.label}.{q.name}": float(np.clip(own[q.name], q.lower, q.upper))
-        for q in candidate.effect.parameters(model.cable)
-    }
+    return candidate.of_linear(model.cable, values)
 
 
 def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:

@@ -9,11 +9,11 @@ from functools import partial
 
 import numpy as np
 
+from dlo_casadi.diagnosis.afresh import Start, fit_afresh, start_afresh
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.afresh import Start, fit_afresh, start_afresh
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.parallel import map_in_order
@@ -74,20 +74,20 @@ def screened_afresh(
     The score is what a candidate gains there, at the noise of a search; without one that starts
     from the measured shapes, too.
     """
-    without = start_afresh(base, base.model)
-    begun = partial(_start_with, base)
+    cable, without = base.model.cable, start_afresh(base, None)
+    found = map_in_order(executor, partial(start_afresh, base), listed)
+    begun = [(item, start) for item, start in zip(listed, found, strict=True) if start is not None]
     out = []
-    for candidate, start in zip(listed, map_in_order(executor, begun, listed), strict=True):
-        if start is None or without is None:
-            continue
-        score = max(2 * (without.guess.objective - start.guess.objective), 0.0)
-        p_value = survival(score, len(candidate.frees), np.inf)
-        out.append((Screened(candidate, score, p_value, {}), start))
+    for candidate, start in begun:
+        inside = [pair for pair in begun if candidate.contains(pair[0], cable)]
+        if inside:
+            smaller = min(inside, key=lambda pair: pair[1].guess.objective)
+            start = start_afresh(base, candidate, smaller) or start
+        if without is not None:
+            score = max(2 * (without.guess.objective - start.guess.objective), 0.0)
+            p_value = survival(score, len(candidate.frees), np.inf)
+            out.append((Screened(candidate, score, p_value, {}), start))
     return sorted(out, key=lambda pair: -pair[0].score)
-
-
-def _start_with(base: Fit, candidate: Candidate) -> Start | None:
-    return start_afresh(base, candidate.add_to(base.model), candidate.scans)
 
 
 def confirm_afresh(base: Fit, screened: Screened, start: Start) -> Confirmed | None:

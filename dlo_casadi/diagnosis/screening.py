@@ -230,17 +230,7 @@ class Screen:
             parameter = self.model.parameters[i]
             value = self.p[i] + change * parameter.scale
             values[name] = float(np.clip(value, parameter.lower, parameter.upper))
-        return Screened(candidate, score, p_value, self._own(candidate, values))
-
-    def _own(self, candidate: Candidate, values: dict[str, float]) -> dict[str, float]:
-        """Qualified parameters of the candidate's effect from those of its score test."""
-        effect, cable = candidate.effect, self.model.cable
-        prefix = f"{effect.label}."
-        own = effect.of_linear(cable, {k.removeprefix(prefix): v for k, v in values.items()})
-        bounded = {
-            q.name: float(np.clip(own[q.name], q.lower, q.upper)) for q in effect.parameters(cable)
-        }
-        return {prefix + name: value for name, value in bounded.items()}
+        return Screened(candidate, score, p_value, candidate.of_linear(self.model.cable, values))
 
     def _below(self, candidate: Candidate, step: FloatArray) -> NDArray[np.bool_]:
         """Which parameters would fall below a bound at which they vanish.

@@ -25,6 +25,10 @@ _KINEMATIC_STEPS = 8
 _STEPS_WITHOUT_DEPTH = 20
 # A step of all nodes below this [rad] has settled what is solved for all at once.
 SETTLED = 1e-3
+# No node turns farther in a step [rad]: linearised, balance holds for moderate turns. A judgement.
+LONGEST = 0.7
+# A step is taken back where the objective has risen beyond this factor, and this part is tried.
+RISE, PART = 1.5, 0.3
 
 
 def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, list[FloatArray]]:
@@ -170,13 +174,36 @@ class Guess:
     objective: float = np.inf
 
 
+@dataclass(frozen=True)
+class _Step:
+    """A Gauss-Newton step from inconsistent values.
+
+    Parameters
+    ----------
+    objective : float
+        Of the unknowns as they are, once the linearised forces balance.
+    theta : (size,)
+    shapes : Vector
+    deviation : (m, n_deviations)
+    feet : list of (K_j,) [m]
+        Of the shapes as they are.
+    """
+
+    objective: float
+    theta: FloatArray
+    shapes: Vector
+    deviation: FloatArray
+    feet: list[FloatArray]
+
+
 def all_at_once(
     problem: BatchProblem, guess: Guess, held: NDArray[np.bool_], iterations: int
 ) -> Guess | None:
     """Gauss-Newton on shapes, multipliers and unknowns together, from inconsistent values.
 
     The force balance is linearised about the measured shapes and solved along with the fit, so
-    that no equilibrium is needed before the parameters are about right.
+    that no equilibrium is needed before the parameters are about right. A step after which the
+    objective is RISE times as large is taken back, and a part of it tried.
 
     Parameters
     ----------
@@ -186,66 +213,79 @@ def all_at_once(
     Returns
     -------
     Guess or None
-        None if the matrices became singular or the shapes not finite.
+        None if the first matrices are singular.
     """
-    unknowns, sweep = problem.unknowns, problem.sweep
-    theta, shapes, feet = guess.theta, guess.shapes, guess.feet
-    lower, upper = unknowns.bounds
-    moving = ~held
-    columns = sweep.used_deviations
-    own = np.diag(1 / problem.deviation_std**2 + 1e-12)
-    objective = guess.objective
-    for _ in range(iterations):
-        p, rest = unknowns.p(theta), unknowns.rest(theta)
-        slopes = unknowns.slopes(theta)
-        try:
-            along = sweep.directions(shapes, p, rest, slopes, unknowns.rest_slopes)
-            force = sweep.imbalance(shapes, p, rest)
-            assert along.tangent is not None
-            correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
-        except np.linalg.LinAlgError:
-            return None
-        point = problem.evaluate(theta, shapes, feet)
-        ahead = problem.linearize_along(point, along, _only(along, correction))
-        gap = theta - problem.mean
-        hessian, gradient = problem.precision.copy(), problem.precision @ gap
-        objective = float(gap @ gradient) / 2
-        inner = []
-        rows = zip(problem.used, ahead.residuals, ahead.by_theta, ahead.by_deviation, strict=True)
-        for j, e, a, b in rows:
-            now = shapes.deviation[j, columns]
-            block = b.T @ b + own
-            cross, slope = b.T @ a, b.T @ e + own @ now
-            try:
-                solved = np.linalg.solve(block, np.column_stack([cross, slope]))
-            except np.linalg.LinAlgError:  # a shape about to snap moves without bounds
+    last: tuple[Guess, _Step] | None = None
+    share = 1.0
+    for _ in range(iterations + 1):
+        step = _step(problem, guess, held)
+        if step is None or (last and step.objective > RISE * last[1].objective):
+            if last is None:
                 return None
-            hessian += a.T @ a - cross.T @ solved[:, :-1]
-            gradient += a.T @ e - cross.T @ solved[:, -1]
-            objective += float(e @ e + now @ own @ now - slope @ solved[:, -1]) / 2
-            inner.append(solved)
-        damped = hessian[np.ix_(moving, moving)]
-        damped += np.diag(1e-6 * np.diag(damped) + NO_INFORMATION)
-        step = np.zeros_like(theta)
-        step[moving] = -np.linalg.solve(damped, gradient[moving])
-        step = np.clip(theta + np.clip(step, -3, 3), lower, upper) - theta
-        objective += float(gradient @ step + step @ hessian @ step / 2)
-        deviation = shapes.deviation.copy()
-        for j, solved in zip(problem.used, inner, strict=True):
-            deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
-        change = correction + problem.shape_step(along, step, deviation - shapes.deviation)
-        size = float(np.abs(change.x).max())
-        damp = min(1.0, 0.7 / max(size, 1e-12))
-        shapes = replace(
-            sweep.moved(shapes, Vector(damp * change.x, change.y)), deviation=deviation
-        )
-        theta = theta + step
-        feet = point.feet
-        if not np.all(np.isfinite(shapes.x)):
-            return None
-        if size < SETTLED:
+            share *= PART
+        else:
+            last, share = (replace(guess, objective=step.objective, feet=step.feet), step), 1.0
+        size = float(np.abs(last[1].shapes.x).max())
+        if share * size < SETTLED:
             break
-    return Guess(theta, shapes, feet, objective)
+        guess = _moved(problem, *last, min(share, LONGEST / size))
+    return None if last is None else last[0]
+
+
+def _moved(problem: BatchProblem, guess: Guess, step: _Step, share: float) -> Guess:
+    """A share of a step; multipliers, unknown at first, take the whole of theirs."""
+    deviation = guess.shapes.deviation + share * step.deviation
+    change = Vector(share * step.shapes.x, step.shapes.y)
+    shapes = replace(problem.sweep.moved(guess.shapes, change), deviation=deviation)
+    return Guess(guess.theta + share * step.theta, shapes, guess.feet)
+
+
+def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step | None:
+    """Where the linearised balance and residuals lead; None where matrices are singular."""
+    unknowns, sweep = problem.unknowns, problem.sweep
+    theta, shapes = guess.theta, guess.shapes
+    columns, moving = sweep.used_deviations, ~held
+    own = np.diag(1 / problem.deviation_std**2 + 1e-12)
+    p, rest = unknowns.p(theta), unknowns.rest(theta)
+    try:
+        along = sweep.directions(shapes, p, rest, unknowns.slopes(theta), unknowns.rest_slopes)
+        force = sweep.imbalance(shapes, p, rest)
+        assert along.tangent is not None
+        correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
+    except np.linalg.LinAlgError:
+        return None
+    if not np.all(np.isfinite(correction.x)):
+        return None
+    point = problem.evaluate(theta, shapes, guess.feet)
+    ahead = problem.linearize_along(point, along, _only(along, correction))
+    gap = theta - problem.mean
+    hessian, gradient = problem.precision.copy(), problem.precision @ gap
+    objective = float(gap @ gradient) / 2
+    inner = []
+    rows = zip(problem.used, ahead.residuals, ahead.by_theta, ahead.by_deviation, strict=True)
+    for j, e, a, b in rows:
+        now = shapes.deviation[j, columns]
+        block = b.T @ b + own
+        cross, slope = b.T @ a, b.T @ e + own @ now
+        try:
+            solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+        except np.linalg.LinAlgError:  # a shape about to snap moves without bounds
+            return None
+        hessian += a.T @ a - cross.T @ solved[:, :-1]
+        gradient += a.T @ e - cross.T @ solved[:, -1]
+        objective += float(e @ e + now @ own @ now - slope @ solved[:, -1]) / 2
+        inner.append(solved)
+    damped = hessian[np.ix_(moving, moving)]
+    damped += np.diag(1e-6 * np.diag(damped) + NO_INFORMATION)
+    step = np.zeros_like(theta)
+    step[moving] = -np.linalg.solve(damped, gradient[moving])
+    lower, upper = unknowns.bounds
+    step = np.clip(theta + np.clip(step, -3, 3), lower, upper) - theta
+    deviation = np.zeros_like(shapes.deviation)
+    for j, solved in zip(problem.used, inner, strict=True):
+        deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
+    change = correction + problem.shape_step(along, step, deviation)
+    return _Step(objective, step, change, deviation, point.feet)
 
 
 def equilibria_near(problem: BatchProblem, guess: Guess) -> Point | None:
