@@ -97,13 +97,13 @@ def space_problem(
 ) -> SpaceProblem:
     """A cable of 1 m of any ratio of stiffness to weight between two clamps.
 
-    EI over weight L^3 from 0.003 to 3, GJ over EI from 0.3 to 1, rest curvature up to half a turn;
-    chords from 0.5 to 0.9 L, both ends turned by up to 60 degrees against the chord, the end rolled
-    by up to 180 degrees.
+    EI over weight L^3 from 0.003 to 30, EI over GJ from 0.7 to 3, rest curvature up to half a turn;
+    chords of any direction to gravity from 0.5 to 0.9 L, both ends turned by up to 60 degrees
+    against the chord, the end rolled by up to 180 degrees and twisted by up to two turns more.
     """
     mass = 0.1
-    stiffness = 9.81 * mass * np.exp(rng.uniform(np.log(0.003), np.log(3.0)))
-    cable = Cable(1.0, mass, 0.01, stiffness, torsional_stiffness=stiffness * rng.uniform(0.3, 1.0))
+    stiffness = 9.81 * mass * np.exp(rng.uniform(np.log(0.003), np.log(30.0)))
+    cable = Cable(1.0, mass, 0.01, stiffness, torsional_stiffness=stiffness / rng.uniform(0.7, 3.0))
     gravity = (0.0, 0.0, -9.81)
     model = CableModel(cable, n, element, "clamped", "clamped", gravity)
     rest = model.rest_basis @ rng.normal(size=model.n_coefficients)
@@ -121,6 +121,7 @@ def space_problem(
                 tuple(end),
                 start_orientation=tuple(first.as_quat()),
                 end_orientation=tuple((last * roll).as_quat()),
+                turns=float(rng.integers(-2, 3)),
             )
         )
     return SpaceProblem(model, rest, tuple(found))
