@@ -17,7 +17,6 @@ from dlo_casadi.codegen.kernels import (
     table_to_c,
     with_helpers,
 )
-from dlo_casadi.equilibrium import total_dead_load
 from dlo_casadi.errors import DloError
 from dlo_casadi.model import CableModel
 
@@ -96,7 +95,7 @@ def _extra(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
         length,
         length / model.n,
         *model.gravity,
-        *total_dead_load(model, p),
+        *np.array(model.dead_load(p)).ravel(),
         *_clamps(model, p),
         *bends.T.ravel(),
     ]

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.ends import reaction_rows
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sensors import Observed
+from dlo_casadi.pose import Pose
 from dlo_casadi.thresholds import APART
 
 FloatArray = NDArray[np.floating]

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from dlo_casadi.equilibrium import Equilibrium, Pose
+from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 
 FloatArray = NDArray[np.floating]
 

@@ -10,15 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
-from dlo_casadi.equilibrium import (
-    NEARBY,
-    Branch,
-    Equilibrium,
-    Pose,
-    PoseBranch,
-    continued,
-    solve_equilibrium,
-)
+from dlo_casadi.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.curve import NodeCurve
@@ -26,6 +18,8 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Branch, Pose, PoseBranch
+from dlo_casadi.solve import continued, solve_equilibria, solve_equilibrium
 from dlo_casadi.thresholds import EITHER
 
 FloatArray = NDArray[np.floating]
@@ -99,22 +93,33 @@ def predict_poses(
     """
     out: list[Prediction | None] = []
     last: tuple[Pose, FloatArray] | None = None
-    for pose, start in zip(poses, starts or [None] * len(poses), strict=True):
-        try:
-            if start is None and last is not None and pose.branch == "previous":
+    given = list(starts or [None] * len(poses))
+    # Poses that depend on no other one are solved together.
+    alone = (
+        [] if model.has_state else [j for j, pose in enumerate(poses) if pose.branch != "previous"]
+    )
+    solved = solve_equilibria(model, p, rest, [poses[j] for j in alone], [given[j] for j in alone])
+    found = dict(zip(alone, solved, strict=True))
+    for j, (pose, start) in enumerate(zip(poses, given, strict=True)):
+        if j in found:
+            eq = found[j]
+        elif start is None and last is not None and pose.branch == "previous":
+            try:
                 eq = continued(model, p, rest, pose, *last)
-            else:
-                eq = solve_equilibrium(model, p, rest, pose, x_init=start)
-        except EquilibriumError:
+            except EquilibriumError as error:
+                eq = error
+        else:
+            (eq,) = solve_equilibria(model, p, rest, [pose], [start])
+        if isinstance(eq, EquilibriumError):
             out.append(None)
             continue
         last = pose, eq.x
-        shapes, given = eq.shapes, Given.of(p, rest, pose.vector[None])
-        curve = NodeCurve.of(model.cable.length, model.assembly.curve(shapes, given)[0])
-        readings = model.assembly.readings(shapes, given)[0]
+        shapes, held = eq.shapes, Given.of(p, rest, pose.vector[None])
+        curve = NodeCurve.of(model.cable.length, model.assembly.curve(shapes, held)[0])
+        readings = model.assembly.readings(shapes, held)[0]
         out.append(Prediction(eq, Observed(curve, readings), rest))
         if model.has_state:
-            rest = model.assembly.state_after(shapes, given)[0][0]
+            rest = model.assembly.state_after(shapes, held)[0][0]
     return out
 
 

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Assembly, CurveSlopes, Directions, Given, Shapes
 from dlo_casadi.descent import descend
-from dlo_casadi.equilibrium import JOINT_BOUND, Pose
+from dlo_casadi.equilibrium import JOINT_BOUND
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.band import BandMatrix, Vector
 
 FloatArray = NDArray[np.floating]

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from dlo_casadi.config import Config
-from dlo_casadi.equilibrium import PoseBranch
 from dlo_casadi.estimation.band import COVERED
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.pose import PoseBranch
 from dlo_casadi.thresholds import DIFFERENT
 from dlo_casadi.vision import Sight
 
@@ -238,7 +238,7 @@ class PoseInput:
     center : (float, float), optional [m]
         Middle of the photograph in the board frame.
     camera_center : (float, float, float), optional [m]
-        Where a calibrated camera stood, see `equilibrium.Pose`.
+        Where a calibrated camera stood, see `pose.Pose`.
     pixel : float, optional [m]
         Size of a pixel on the board.
     weight : (K,), optional

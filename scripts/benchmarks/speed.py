@@ -20,9 +20,9 @@ from scipy.optimize import minimize
 from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.initial import arc_headings
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
