@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
@@ -28,7 +28,7 @@ WEIGHTS = 0.05 * 1.6 ** np.arange(9)
 # Directions of the clamp that are tried for a pose that would tell.
 HEADINGS = 12
 # Decrease of twice the objective that 95 % of true values are within.
-PROFILE_95 = float(chi2.ppf(0.95, 1))
+PROFILE_95 = float(chdtri(1, 0.05))
 
 
 @dataclass(frozen=True)

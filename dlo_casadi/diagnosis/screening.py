@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, f
+from scipy.special import chdtrc, fdtrc
 
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.diagnosis.candidates import Candidate
@@ -275,5 +275,5 @@ def survival(score: float, dof: int, noise_dof: float) -> float:
         With which the noise is known; inf where it is declared.
     """
     if np.isinf(noise_dof):
-        return float(chi2.sf(score, dof))
-    return float(f.sf(score / dof, dof, noise_dof))
+        return float(chdtrc(dof, score))
+    return float(fdtrc(dof, noise_dof, score / dof))

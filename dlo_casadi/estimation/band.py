@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.curve import NodeCurve
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.floating]
 
 # Share of the next hangings inside the band, and the standard deviations to its edges.
 COVERED = 0.9
-EDGE = float(norm.isf((1 - COVERED) / 2))
+EDGE = -float(ndtri((1 - COVERED) / 2))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dlo_casadi.config import Config
 from dlo_casadi.estimation.band import COVERED
@@ -427,7 +427,7 @@ class Outcome:
                 continue
             std = shape.expected(self.fit.model.cable.length, self.measurement.std)
             score = ((shape.residual / std) ** 2).reshape((len(std), -1)).sum(axis=1)
-            inside.append(score <= chi2.ppf(COVERED, std.size // len(std)))
+            inside.append(score <= chdtri(std.size // len(std), 1 - COVERED))
         return float(np.concatenate(inside).mean()) if inside else None
 
     def held_out(self, stage: Stage) -> HeldOut:
