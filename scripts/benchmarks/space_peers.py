@@ -285,8 +285,8 @@ def run(poses: int = 4) -> dict[str, Any]:
         }
         rows.append(row)
         print(
-            f"{name:20s} n {n:3d} {1e3 * row['seconds']:11.3f} ms   largest error of a node: median "
-            f"{1e3 * row['error_m']:8.4f} mm, most {1e3 * row['largest_error_m']:8.4f} mm",
+            f"{name:20s} n {n:3d} {1e3 * row['seconds']:11.3f} ms   largest error of a node "
+            f"{1e3 * row['error_m']:8.4f} mm (median), most {1e3 * row['largest_error_m']:8.4f} mm",
             flush=True,
         )
     return out | {"rows": rows, "faster_than": _faster(rows), "load_after": os.getloadavg()}

@@ -1,6 +1,6 @@
 """Plan a motion of the gripper that holds a cable's end with OMPL in C++, and draw it.
 
-    python scripts/planner/plan.py --output DIR [--space] [--parameters results/<run>/parameters.yaml]
+    python scripts/planner/plan.py --output DIR [--space] [--parameters PARAMETERS.yaml]
 
 Generates the solver, builds cable_planner against it, plans, measures the clearance again and
 writes shapes.txt and plan.png. Without parameters a made-up cable of 0.9 m is used, pinned in the
@@ -118,7 +118,9 @@ def _tube(axes: plt.Axes, obstacle: Capsule) -> None:
         + (np.cos(tilt) * np.sin(about))[..., None] * other
     )
     middle = np.where((tilt < 0)[..., None], a, b)
-    axes.plot_surface(*np.moveaxis(middle + obstacle.radius * shell, -1, 0), color="0.75", alpha=0.5)
+    axes.plot_surface(
+        *np.moveaxis(middle + obstacle.radius * shell, -1, 0), color="0.75", alpha=0.5
+    )
 
 
 def draw(shapes: FloatArray, scene: Scene, path: Path) -> None:

@@ -22,8 +22,8 @@ def missing():
 @pytest.mark.parametrize(
     ("where", "iterations", "limits"),
     [
-        ((), "600", ("bend_radius", "clearance")),
-        (("--space",), "200", ("bend_radius", "force", "twist", "clearance")),
+        ((), "300", ("bend_radius", "clearance")),
+        (("--space",), "100", ("bend_radius", "force", "twist", "clearance")),
     ],
     ids=["plane", "space"],
 )
@@ -38,9 +38,11 @@ def test_a_path_is_planned_checked_and_drawn(tmp_path, where, iterations, limits
     assert (tmp_path / "plan.png").stat().st_size > 10_000
 
 
-def test_the_same_from_python(tmp_path):
+@pytest.mark.parametrize("where", [(), ("--space",)], ids=["plane", "space"])
+def test_the_same_from_python(tmp_path, where):
     pytest.importorskip("ompl", reason="the PyPI package ompl is not installed")
-    command = [sys.executable, str(PLANNER / "plan_python.py"), "--output", str(tmp_path)]
+    script = str(PLANNER / "plan_python.py")
+    command = [sys.executable, script, "--output", str(tmp_path), *where]
     run = subprocess.run([*command, "--seconds", "4"], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert (tmp_path / "plan_python.png").stat().st_size > 10_000
