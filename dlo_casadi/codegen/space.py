@@ -46,9 +46,10 @@ TEXTS = {
 
 
 def coarse_elements(model: CableModel) -> int:
-    """Elements of the mesh on which first guesses are followed: with a free end all."""
-    coarse = model.n if model.end == "free" else max(LEAST_COARSE, round(model.n / COARSENING))
-    return min(model.n, coarse)
+    """Arcs of the mesh on which first guesses are followed; 0 where that is the mesh itself."""
+    count = min(model.n, max(LEAST_COARSE, round(model.n / COARSENING)))
+    itself = count == model.n and model.element == "arc"
+    return 0 if model.end == "free" or itself else count
 
 
 def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:
@@ -107,7 +108,7 @@ def meshes_of(
     """Kernels of the fine mesh and, where there is one, of the coarse mesh, by their names in C."""
     found = {"kernel": kernels_of(model, p, rest, inline)}
     count = coarse_elements(model)
-    if count < model.n:
+    if count:
         coarse = model.with_mesh(count, "arc")
         means = coarse_rest(model, coarse, rest)
         found["coarse_kernel"] = kernels_of(coarse, p, means, inline)
