@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from dlo_casadi.effects import EFFECTS as EFFECTS
     from dlo_casadi.effects import Cable as Cable
     from dlo_casadi.equilibrium import Equilibrium as Equilibrium
-    from dlo_casadi.equilibrium import Pose as Pose
-    from dlo_casadi.equilibrium import solve_equilibrium as solve_equilibrium
     from dlo_casadi.errors import ConfigError as ConfigError
     from dlo_casadi.errors import DloError as DloError
     from dlo_casadi.errors import EquilibriumError as EquilibriumError
@@ -23,10 +21,12 @@ if TYPE_CHECKING:
     from dlo_casadi.errors import MeasurementError as MeasurementError
     from dlo_casadi.errors import VisionError as VisionError
     from dlo_casadi.model import CableModel as CableModel
+    from dlo_casadi.pose import Pose as Pose
     from dlo_casadi.prediction import PredictedShape as PredictedShape
     from dlo_casadi.prediction import predict as predict
     from dlo_casadi.session import Outcome as Outcome
     from dlo_casadi.session import run_session as run_session
+    from dlo_casadi.solve import solve_equilibrium as solve_equilibrium
 
 # Module -> its public names. They are imported when they are first asked for, so that the command
 # answers at once and an interrupt finds it ready.
@@ -35,7 +35,7 @@ _PUBLIC = {
     "codegen": ("CompiledSolver",),
     "config": ("Config", "load_config"),
     "effects": ("EFFECTS", "Cable"),
-    "equilibrium": ("Equilibrium", "Pose", "solve_equilibrium"),
+    "equilibrium": ("Equilibrium",),
     "errors": (
         "ConfigError",
         "DloError",
@@ -45,8 +45,10 @@ _PUBLIC = {
         "VisionError",
     ),
     "model": ("CableModel",),
+    "pose": ("Pose",),
     "prediction": ("PredictedShape", "predict"),
     "session": ("Outcome", "run_session"),
+    "solve": ("solve_equilibrium",),
 }
 _HOMES = {name: f"{__name__}.{module}" for module, names in _PUBLIC.items() for name in names}
 

@@ -19,8 +19,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from dlo_casadi.config import Config, load_config
-from dlo_casadi.equilibrium import Branch
 from dlo_casadi.errors import ConfigError
+from dlo_casadi.pose import Branch
 from dlo_casadi.prediction import PredictedShape, predict
 from dlo_casadi.report.notebook import outcome_figure, outcome_html, outcome_text
 from dlo_casadi.report.parameters_file import parameters_of

@@ -231,8 +231,12 @@ class Assembly:
     def energy(self, shapes: Shapes, given: Given) -> FloatArray:
         """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers."""
         total, slope, _ = self.balance(shapes, given)
-        work = shapes.lam * slope.y[:, :, 0] * self.model.are_multipliers
-        return total - work.sum(axis=1)
+        return total - self.work(shapes, slope)
+
+    def work(self, shapes: Shapes, slope: Vector) -> FloatArray:
+        """Work (m,) [J] of the multipliers in the Lagrangian, whose gradient is given."""
+        own = shapes.lam * slope.y[:, :, 0] * self.model.are_multipliers
+        return np.asarray(own.sum(axis=1))
 
     def imbalance_by(self, shapes: Shapes, given: Given, along: Directions) -> Vector:
         """Change of the gradient at fixed nodes and multipliers, along p, rest and deviation."""
@@ -311,7 +315,8 @@ class Assembly:
     def _stacked(cells: FloatArray) -> FloatArray:
         """Values (m, n_cells, strains, ...) of cells as (m, n_rests, ...), strain after strain."""
         by_strain = np.moveaxis(cells, 2, 1)
-        return by_strain.reshape((len(cells), -1, *cells.shape[3:]))
+        m, n_cells, strains, *columns = cells.shape
+        return by_strain.reshape((m, n_cells * strains, *columns))
 
     def state_after(self, shapes: Shapes, given: Given) -> tuple[FloatArray, ...]:
         """Rest strains (m, n_rests) that poses leave; their slopes by both nodes, rest and p.

@@ -44,13 +44,16 @@ class Minima:
     Parameters
     ----------
     shapes : Shapes
+    balanced : (m,) bool
+        Whether the forces balance.
     converged : (m,) bool
-        Whether the shape balances and is a strict minimum.
+        Whether the shape is a strict minimum, too; a neutral one is none.
     energy : (m,) [J]
     iterations : (m,) int
     """
 
     shapes: Shapes
+    balanced: BoolArray
     converged: BoolArray
     energy: FloatArray
     iterations: NDArray[np.intp]
@@ -69,7 +72,7 @@ def descend(assembly: Assembly, shapes: Shapes, given: Given, max_iterations: in
     m = len(shapes.x)
     node, wanted = assembly.node, assembly.model.n_multipliers
     now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
-    converged, iterations = np.zeros(m, dtype=bool), np.full(m, max_iterations)
+    balanced, iterations = np.zeros(m, dtype=bool), np.full(m, max_iterations)
     shift = np.zeros(m)
     active = np.arange(m)
     for iteration in range(max_iterations):
@@ -88,13 +91,19 @@ def descend(assembly: Assembly, shapes: Shapes, given: Given, max_iterations: in
         share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
         now.x[active] = node.moved(here.x, share[:, None, None] * step.x[..., 0])
         now.lam[active] = here.lam + share[:, None] * step.y[..., 0]
-        done = (size < TOLERANCE) & (shift[active] == 0)
-        converged[active[done]] = True
+        done = size < TOLERANCE
+        balanced[active[done]] = True
         iterations[active[done]] = iteration + 1
         active = active[~done & np.isfinite(size)]
         if not len(active):
             break
-    return Minima(now, converged, assembly.energy(now, given), iterations)
+    total, force, matrix = assembly.balance(now, given)
+    with np.errstate(invalid="ignore"):
+        energy = total - assembly.work(now, force)
+    there = np.flatnonzero(balanced)
+    converged = np.zeros(m, dtype=bool)
+    converged[there] = matrix.subset(there).negative() == wanted
+    return Minima(now, balanced, converged, energy, iterations)
 
 
 def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFactor, FloatArray]:
@@ -102,11 +111,20 @@ def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFa
     scale = matrix.scale
     shift = np.where(before > LEAST_SHIFT * scale, before / SHRINKAGE, 0.0)
     unit = np.eye(matrix.diagonal.shape[2])
+
+    def shifted(index: NDArray[np.intp]) -> BandFactor:
+        part = matrix.subset(index)
+        diagonal = part.diagonal + shift[index, None, None, None] * unit
+        return replace(part, diagonal=diagonal).factor()
+
+    everyone = np.arange(len(scale))
+    factor = shifted(everyone)
+    wrong = np.flatnonzero(factor.negative != wanted)
+    if not len(wrong):
+        return factor, shift
     for _ in range(MOST_SHIFTS):
-        shifted = replace(matrix, diagonal=matrix.diagonal + shift[:, None, None, None] * unit)
-        factor = shifted.factor()
-        wrong = factor.negative != wanted
-        if not wrong.any():
+        shift[wrong] = np.maximum(GROWTH * shift[wrong], FIRST_SHIFT * scale[wrong])
+        wrong = wrong[shifted(wrong).negative != wanted]
+        if not len(wrong):
             break
-        shift = np.where(wrong, np.maximum(GROWTH * shift, FIRST_SHIFT * scale), shift)
-    return factor, shift
+    return shifted(everyone), shift

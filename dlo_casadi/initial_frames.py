@@ -66,7 +66,7 @@ def guessed_frames_of(
     bent: FloatArray,
     turns: float,
 ) -> list[FloatArray]:
-    """First guesses of frames (k, 4), see `equilibrium.guessed_frames`.
+    """First guesses of frames (k, 4), see `guesses.guessed_frames`.
 
     Parameters
     ----------

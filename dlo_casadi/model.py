@@ -185,7 +185,7 @@ class CableModel:
 
     @property
     def n_pose(self) -> int:
-        """Numbers that declare one pose, see `equilibrium.Pose.vector`."""
+        """Numbers that declare one pose, see `pose.Pose.vector`."""
         return EndConditions.size(self.node) + SIGHT_SIZE
 
     @property
@@ -295,7 +295,7 @@ class CableModel:
 
     @cached_property
     def _pose(self) -> ca.SX:
-        """What is declared of one pose, see `equilibrium.Pose.vector`."""
+        """What is declared of one pose, see `pose.Pose.vector`."""
         return ca.SX.sym("pose", self.n_pose)
 
     @property

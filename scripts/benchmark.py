@@ -4,8 +4,9 @@
 
 Parts that need an extra which is not installed are left out, and named; one that is asked for by
 --only without it is refused. Prints the compiler and its flags; saves benchmark.json and
-benchmark.png. Everything runs on one machine in one run; medians and 99th percentiles are over all
-solves, "best" is the median over the poses of each pose's fastest.
+figures. Everything runs on one machine in one run; medians and 99th percentiles are over all
+solves, "best" is the median over the poses of each pose's fastest. Single solves are timed by what
+they take of the processor.
 """
 
 import argparse
@@ -21,14 +22,23 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmarks import fleet, memory, peers, random_cables, space_speed, speed
+from benchmarks import (
+    fleet,
+    memory,
+    peers,
+    random_cables,
+    space_ipopt,
+    space_peers,
+    space_speed,
+    speed,
+)
 
 from dlo_casadi.durable import make_folder, write_file
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 
 PARTS = (
     *("speed", "growth", "throughput", "random", "starts", "ipopt", "memory", "peers", "fleet"),
-    *("space", "space_random"),
+    *("space", "space_random", "space_peers"),
 )
 # Parts that need more than the package: the extras, and what of them is imported.
 EXTRAS = {"fleet": ("table,dask", ("pyarrow", "distributed"))}
@@ -126,22 +136,25 @@ def run_space() -> dict[str, Any]:
     out: dict[str, Any] = {}
     for element, sizes in (("arc", (12, 24, 48, 96)), ("quadratic", (6, 12, 24, 48))):
         out[element] = {n: space_speed.timed(n, element) for n in sizes}
-    per_element = [
-        (n, space_speed.timed(n, "arc", repeats=max(5, 100 // n))["cold"]["best"] / n)
-        for n in (10, 30, 100, 300, 1000)
-    ]
-    times = [seconds for _, seconds in per_element]
-    out["growth"] = {"per_element": per_element, "spread": max(times) / min(times)}
+    rows = [(n, space_speed.per_element(n, "arc")) for n in (10, 20, 50, 100, 200, 500, 1000)]
+    times = np.array([seconds for _, seconds in rows])
+    line = np.exp(np.log(times).mean())
+    out["growth"] = {
+        "per_element": rows,
+        "largest_over_smallest": times.max() / times.min(),
+        "farthest_from_the_line": np.abs(times / line - 1).max(),
+    }
     return out
 
 
 def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
-    """Random clamped cables in space: statuses, checks by the Python model, energies."""
+    """Random clamped cables in space: statuses, checks by the Python model, IPOPT's energies."""
     out: dict[str, Any] = {}
     for element in ELEMENTS_IN_SPACE:
         rng = np.random.default_rng(0)
         solver = random_cables.AnyCable(random_cables.space_problem(rng, 1, 12, element))
-        counts = {"ok": 0, "wrong": 0, "same": 0, "lower": 0, "higher": 0, "python_failed": 0}
+        counts = {"ok": 0, "wrong": 0, "same": 0, "lower": 0, "higher": 0, "ipopt_failed": 0}
+        ipopt = space_ipopt.Ipopt(random_cables.space_problem(rng, 1, 12, element).model)
         worst, total = 0.0, 0.0
         for _ in range(cables):
             problem = random_cables.space_problem(rng, poses, 12, element)
@@ -153,7 +166,7 @@ def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
                 counts["wrong"] += not right
                 worst = max(worst, error)
             for i in np.flatnonzero(statuses == 0)[: compared // cables]:
-                counts[random_cables.compare_in_space(problem, shapes[i], i)] += 1
+                counts[random_cables.compare_in_space(problem, shapes[i], i, ipopt)] += 1
         out[element] = {
             "problems": cables * poses,
             **counts,
@@ -225,6 +238,7 @@ def main() -> int:
         "fleet": fleet.run,
         "space": run_space,
         "space_random": lambda: run_space_random(chosen.cables, 100, chosen.ipopt_problems),
+        "space_peers": space_peers.run,
     }
     result: dict[str, Any] = {"compiler": speed.compiler(), "flags": list(speed.FLAGS)}
     result["left_out"] = list(missing)
@@ -234,6 +248,8 @@ def main() -> int:
         print(part, json.dumps(result[part], indent=1), flush=True)
         if part == "growth":
             draw(result[part], chosen.output / "benchmark.png")
+        if part == "space_peers":
+            space_peers.draw(result[part]["rows"], chosen.output / "space_peers.png")
     write_file(chosen.output / "benchmark.json", json.dumps(result, indent=1) + "\n")
     return 0
 

@@ -32,7 +32,6 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.durable import write_file
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
@@ -40,6 +39,7 @@ from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.rest_scatter import SMOOTHNESS, RestScatter, modes_in
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.pose import Pose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import conditions

@@ -26,9 +26,9 @@ from dlo_casadi.effects import (
     StiffSection,
     UnknownPull,
 )
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.chain import ELEMENTS
 
 CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)

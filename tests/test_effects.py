@@ -38,10 +38,11 @@ from dlo_casadi.effects import (
     Tether,
     UnknownPull,
 )
-from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
+from dlo_casadi.solve import solve_equilibrium
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 # Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).

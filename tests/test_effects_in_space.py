@@ -26,8 +26,9 @@ from dlo_casadi.effects import (
     Sight,
     Tether,
 )
-from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
+from dlo_casadi.solve import solve_equilibrium
 
 FLAT = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 CABLE = replace(FLAT, torsional_stiffness=0.03)

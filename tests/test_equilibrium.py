@@ -23,9 +23,13 @@ from dlo_casadi.effects import (
     LumpedMass,
     PointForce,
 )
-from dlo_casadi.equilibrium import Equilibrium, Pose, Status, solve_equilibrium
+from dlo_casadi.equilibrium import Equilibrium, Status
 from dlo_casadi.errors import EquilibriumError
+from dlo_casadi.guesses import guesses
+from dlo_casadi.ipopt import by_ipopt
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
+from dlo_casadi.solve import solve_equilibria, solve_equilibrium
 
 DATA = Path(__file__).parent / "data"
 SCRIPTS = Path(__file__).parents[1] / "scripts"
@@ -352,7 +356,9 @@ def test_second_mode_is_flagged_and_avoided():
     model = CableModel(Cable(1.0, 0.1, 0.01, 0.3), 16, gravity=WEIGHTLESS)
     pose = Pose((0.0, 0.0), (0.8, 0.0))
     s = model.chain.places
-    double = solve(model, 0.3, pose, x_init=0.9 * np.cos(2 * np.pi * s)[:, None])
+    bent = 0.9 * np.cos(2 * np.pi * s)
+    double = by_ipopt(model, np.array([0.3]), np.zeros(len(model.chain.cells)), pose, bent)
+    assert double is not None
     assert double.status is Status.UNSTABLE
     assert not double.stable
     np.testing.assert_allclose(double.points[8], [0.4, 0.0], atol=1e-6)  # odd about its middle
@@ -539,3 +545,25 @@ def test_unreachable_pose_is_named_with_numbers():
     assert "Try:" in str(caught.value)
     assert caught.value.pose == "pose_07"
     assert caught.value.p_des == (0.6, 0.6)
+
+
+def test_poses_solved_together_are_those_solved_alone_and_ipopt_finds_nothing_lower():
+    """One of them is out of reach, one names its branch."""
+    model = CableModel(Cable(1.0, 0.1, 0.01, 0.02), 12, start="clamped", end="clamped")
+    p, rest = model.nominal, np.full(model.chain.n_cells, 0.8)
+    ends = [((0.6, 0.1), None), ((0.2, -0.5), None), ((1.1, 0.0), None), ((0.5, 0.3), "cw")]
+    poses = [Pose((0.0, 0.0), end, 0.3, -0.4, branch=branch) for end, branch in ends]
+    together = solve_equilibria(model, p, rest, poses)
+    assert isinstance(together[2], EquilibriumError)
+    for pose, eq in zip(poses, together, strict=True):
+        if isinstance(eq, EquilibriumError):
+            continue
+        alone = solve_equilibrium(model, p, rest, pose)
+        np.testing.assert_allclose(eq.x, alone.x, atol=1e-12)
+        found = [by_ipopt(model, p, rest, pose, phi) for phi in guesses(model, p, rest, pose)]
+        stable = [other for other in found if other is not None and other.stable]
+        assert eq.energy <= min(other.energy for other in stable) + 1e-12
+        held = by_ipopt(model, p, rest, pose, eq.phi)
+        assert held is not None
+        assert held.stable
+        np.testing.assert_allclose(held.x, eq.x, atol=1e-9)

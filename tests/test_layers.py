@@ -12,7 +12,8 @@ PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 CHAIN = ["errors", "thresholds", "parameters", "rod", "rest", "ends", "effects", "assembly"]
-CHAIN += ["model", "whole_pose", "descent", "initial", "initial_frames", "equilibrium"]
+CHAIN += ["model", "whole_pose", "descent", "initial", "initial_frames", "pose"]
+CHAIN += ["guesses", "equilibrium", "ipopt", "solve"]
 MECHANICS = set(CHAIN)
 PARALLEL = {"executors", "parallel"}
 

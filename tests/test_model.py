@@ -19,9 +19,10 @@ from dlo_casadi.effects import (
     StiffnessGradient,
     StiffSection,
 )
-from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
+from dlo_casadi.solve import solve_equilibrium
 from dlo_casadi.whole_pose import potential
 
 CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)

@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.descent import descend
 from dlo_casadi.effects import EFFECTS, Cable
-from dlo_casadi.equilibrium import EquilibriumError, Pose, solve_equilibrium
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.initial_frames import same_sign
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
+from dlo_casadi.solve import solve_equilibrium
 
 LENGTH, EI, GJ = 0.8, 0.02, 0.015
 DOWN = (0.0, 0.0, -9.81)

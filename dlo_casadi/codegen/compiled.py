@@ -31,9 +31,9 @@ from dlo_casadi.codegen.shapes import (
     SpaceShape,
     SpaceSlope,
 )
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.codegen.kernels import Kernels, c_number, kernels_of, table_to_c
-from dlo_casadi.equilibrium import resting_headings, total_dead_load
+from dlo_casadi.guesses import resting_headings
 from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -39,7 +39,8 @@ def _extra(model: CableModel, p: FloatArray) -> list[float]:
     offsets, length = model.held(p, 0, 0)
     compliance = clamp_compliances(model, p)
     hold = [1 / c if c > 0 else 0.0 for c in compliance]
-    return [float(length), down, *total_dead_load(model, p), *np.array(offsets).ravel()[2:], *hold]
+    dead_load, turns = np.array(model.dead_load(p)).ravel(), np.array(offsets).ravel()[2:]
+    return [float(length), down, *dead_load, *turns, *hold]
 
 
 def clamp_compliances(model: CableModel, p: FloatArray) -> list[float]:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
@@ -28,7 +28,7 @@ WEIGHTS = 0.05 * 1.6 ** np.arange(9)
 # Directions of the clamp that are tried for a pose that would tell.
 HEADINGS = 12
 # Decrease of twice the objective that 95 % of true values are within.
-PROFILE_95 = float(chi2.ppf(0.95, 1))
+PROFILE_95 = float(chdtri(1, 0.05))
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ def _place(fit: Fit, weight: Candidate) -> float:
     """Arc length [m] at which a weight makes the stiffness most uncertain."""
     _, position = weight.frees
     screen, variances = Screen(fit, [weight]), []
-    for scan in weight.scans:
-        hessian, _, names = screen.normal(scan)
+    for scan in range(len(weight.scans)):
+        hessian, _, names = screen.normal([weight], scan)
         kept = [k for k, name in enumerate(names) if name != position]
         covariance = np.linalg.pinv(hessian[np.ix_(kept, kept)], hermitian=True)
         own = kept.index(names.index(BENDING_STIFFNESS))

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.ends import reaction_rows
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.prediction import Prediction, predict_each
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sensors import Observed
+from dlo_casadi.pose import Pose
 from dlo_casadi.thresholds import APART
 
 FloatArray = NDArray[np.floating]
@@ -82,34 +82,32 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     margin = 0.1 * np.maximum(high - low, 0.1 * first.model.cable.length)
     generator = np.random.default_rng(SEED)
     places = np.linspace(0.0, first.model.cable.length, 101)
-    best: (
-        tuple[float, FloatArray, tuple[NodeCurve, NodeCurve], tuple[Observed, Observed]] | None
-    ) = None
+    tried: list[Pose] = []
     for _ in range(TRIED):
         end = generator.uniform(low - margin, high + margin)
         nearest = poses[int(((ends - end) ** 2).sum(axis=1).argmin())]
         reach = float(np.linalg.norm(end - np.array(nearest.start)))
-        if not 0.03 < reach / first.model.cable.length < 0.97:
+        if 0.03 < reach / first.model.cable.length < 0.97:
+            tried.append(replace(nearest, end=tuple(map(float, end)), name="next"))
+    rivals = [predict_each(fit.model, fit.p, _rest_now(fit), tried) for fit in (first, second)]
+    best: tuple[float, Pose, Prediction, Prediction] | None = None
+    for pose, one, other in zip(tried, *rivals, strict=True):
+        if one is None or other is None:
             continue
-        pose: Pose = replace(nearest, end=tuple(map(float, end)), name="next")
-        pair = [
-            predict_poses(fit.model, fit.p, _rest_now(fit), [pose])[0] for fit in (first, second)
-        ]
-        if pair[0] is None or pair[1] is None:
-            continue
-        curves, seen = (pair[0].curve, pair[1].curve), (pair[0].seen, pair[1].seen)
-        gap = curves[0].at(places) - curves[1].at(places)
+        gap = one.curve.at(places) - other.curve.at(places)
         difference = float(np.sqrt((gap**2).sum(axis=1).mean()))
         # Beyond a tenth of the length the rivals sit on different branches: no clean test.
         if difference > 0.1 * first.model.cable.length:
             continue
         if best is None or difference > best[0]:
-            best = (difference, end, curves, seen)
+            best = (difference, pose, one, other)
     if best is None:
         return None
-    difference, end, curves, seen = best
+    difference, pose, one, other = best
+    end = np.array(pose.end)
     place = tuple(round(float(x), 4) for x in end)
-    return NextPose(place, difference, _separation(first, end, curves), next_reading(first, *seen))
+    separation = _separation(first, end, (one.curve, other.curve))
+    return NextPose(place, difference, separation, next_reading(first, one.seen, other.seen))
 
 
 def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:

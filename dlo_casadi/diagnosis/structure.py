@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from dlo_casadi.diagnosis.screening import survival
 from dlo_casadi.estimation.hyperparameters import rest_scatter_of
@@ -19,7 +19,7 @@ FloatArray = NDArray[np.floating]
 
 # Largest normal score of a test: tails beyond a probability of 1e-12 tell no more.
 _TAIL = 1e-12
-LARGEST_SCORE = float(norm.isf(_TAIL))
+LARGEST_SCORE = -float(ndtri(_TAIL))
 
 NO_DEVIATION = (np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
 
@@ -185,7 +185,7 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
     along = vectors[:, kept].T @ (slope * scale)
     score, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
     p_value = survival(score, max(dof, 1), noise_dof)
-    return float(norm.isf(np.clip(p_value, _TAIL, 1 - _TAIL)))
+    return -float(ndtri(np.clip(p_value, _TAIL, 1 - _TAIL)))
 
 
 def _span(fit: Fit, j: int) -> float:

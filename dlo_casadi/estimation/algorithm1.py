@@ -28,12 +28,15 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium import JOINT_BOUND, Pose, check_reach, stats_of
+from dlo_casadi.equilibrium import JOINT_BOUND
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.initial import arc_headings
+from dlo_casadi.ipopt import stats_of
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.chain import Chain
+from dlo_casadi.solve import check_pose
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
@@ -473,7 +476,7 @@ def _usable(
                 "  Try: estimation: {algorithm1: false}"
             )
         try:
-            check_reach(model, model.nominal, pose)
+            check_pose(model, model.nominal, pose)
         except EquilibriumError:
             continue
         used.append(item)

@@ -7,20 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
-from dlo_casadi.equilibrium import Equilibrium, Pose
+from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 
 FloatArray = NDArray[np.floating]
 
 # Share of the next hangings inside the band, and the standard deviations to its edges.
 COVERED = 0.9
-EDGE = float(norm.isf((1 - COVERED) / 2))
+EDGE = -float(ndtri((1 - COVERED) / 2))
 
 
 @dataclass(frozen=True)

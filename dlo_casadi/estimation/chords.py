@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.initial_frames import into_clamps
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.chain import Chain
 
 FloatArray = NDArray[np.floating]

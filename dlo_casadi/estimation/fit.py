@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Shapes
-from dlo_casadi.equilibrium import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
 from dlo_casadi.estimation.hyperparameters import (
@@ -26,6 +25,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import END_ROLL, STIFFNESSES, CableModel
+from dlo_casadi.solve import continued, solve_equilibrium
 from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]

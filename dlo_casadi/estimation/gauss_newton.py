@@ -39,6 +39,9 @@ NO_INFORMATION = 1e-6
 LONGEST_MOVE = 1.5
 # Cables come back to the same shape, unless the data tell otherwise.
 NO_REST_SCATTER = RestScatter()
+# A step that lowers the objective by less has converged: one standard deviation of one parameter is
+# a decrease of 1/2.
+CONVERGED = 1e-4
 # A descent creeps where so many steps together gain no more than the last one may.
 CREEPING = 4
 # Steps that may follow one uphill before it is taken back, and how far up it may lead.
@@ -359,15 +362,14 @@ class BatchProblem:
     # ---- solution ----------------------------------------------------------------------------
 
     def descend(
-        self, point: Point, max_iterations: int = 40, tolerance: float = 1e-4
+        self, point: Point, max_iterations: int = 40, tolerance: float = CONVERGED
     ) -> tuple[Point, bool]:
         """Levenberg-Marquardt from an equilibrium point.
 
         Parameters
         ----------
         tolerance : float
-            Predicted decrease of the objective at which the fit has converged; a decrease of
-            1/2 is one standard deviation of one parameter.
+            Decrease of the objective at which the fit has converged, see CONVERGED.
 
         Returns
         -------

@@ -10,11 +10,13 @@ chosen by likelihood.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtrs
 from scipy.optimize import minimize
 
 FloatArray = NDArray[np.floating]
@@ -97,11 +99,18 @@ class NoiseModel:
 
     def covariance(self, s: FloatArray, weight: FloatArray) -> FloatArray:
         """Covariance matrix (K, K) [m^2] at arc lengths s."""
-        unit = np.eye(len(s)) * (1 - self.share + 1e-9)
+        return (
+            self.std**2 * self.correlation(np.abs(s[:, None] - s[None])) * np.outer(weight, weight)
+        )
+
+    def correlation(self, distance: FloatArray) -> FloatArray:
+        """Correlation matrix (K, K) of points at distances (K, K) [m] along the cable."""
         if self.share > 0:
-            distance = np.abs(s[:, None] - s[None])
-            unit += self.share * correlation(self.kernel, distance / self.length)
-        return self.std**2 * unit * np.outer(weight, weight)
+            unit = self.share * correlation(self.kernel, distance / self.length)
+        else:
+            unit = np.zeros_like(distance)
+        unit.flat[:: len(unit) + 1] += 1 - self.share + 1e-9
+        return unit
 
     def units(self, kinds: NDArray[np.str_]) -> FloatArray:
         """What a unit of each residual counts as [m] (R,): one of its stds as one of a point's.
@@ -176,6 +185,18 @@ class NoiseSample:
         """Residuals of a point."""
         return len(self.residuals) // len(self.places)
 
+    @cached_property
+    def distance(self) -> FloatArray:
+        """Distances (K, K) [m] between the points along the cable."""
+        return np.abs(self.places[:, None] - self.places[None])
+
+    @cached_property
+    def scaled(self) -> FloatArray:
+        """Residuals, shared, own directions (K, per_point, 1 + b + a) over the points' weights."""
+        stacked = np.column_stack([self.residuals, self.shared, self.own])
+        by_point = stacked.reshape((len(self.places), self.per_point, -1))
+        return np.asarray(by_point / self.weight[:, None, None])
+
 
 def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[float, float]:
     """Restricted -2 log likelihood with the scale profiled out, and that scale [m].
@@ -190,18 +211,20 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
     logdet, count = 0.0, 0
     gram = np.zeros((samples[0].shared.shape[1] + 1,) * 2)
     for sample in samples:
-        factor = np.linalg.cholesky(unit.covariance(sample.places, sample.weight))
-        factor = np.kron(factor, np.eye(sample.per_point))
-        stacked = np.column_stack([sample.residuals, sample.shared, sample.own])
-        y = solve_triangular(factor, stacked, lower=True)
-        head, own = y[:, : len(gram)], y[:, len(gram) :]
-        logdet += 2 * float(np.log(np.diag(factor)).sum())
-        if own.shape[1]:
-            basis, triangle = np.linalg.qr(own)
-            head = head - basis @ (basis.T @ head)
-            logdet += 2 * float(np.log(np.abs(np.diag(triangle))).sum())
-        gram += head.T @ head
-        count += len(sample.residuals) - own.shape[1]
+        factor = np.linalg.cholesky(unit.correlation(sample.distance))
+        points, each, columns = sample.scaled.shape
+        # LAPACK itself: of matrices this small SciPy's checks take longer than the solution.
+        y = dtrtrs(factor.T, sample.scaled.reshape((points, -1)), lower=0, trans=1)[0]
+        y = y.reshape((points * each, columns))
+        products, k = y.T @ y, len(gram)
+        logdet += 2 * each * float(np.log(factor.diagonal() * sample.weight).sum())
+        gram += products[:k, :k]
+        if columns > k:
+            own = np.linalg.cholesky(products[k:, k:])
+            left = dtrtrs(own.T, products[k:, :k], lower=0, trans=1)[0]
+            logdet += 2 * float(np.log(own.diagonal()).sum())
+            gram -= left.T @ left
+        count += len(y) - (columns - k)
     quadratic = gram[0, 0]
     if len(gram) > 1:
         shared, cross = gram[1:, 1:], gram[1:, 0]

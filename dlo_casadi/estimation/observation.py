@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.sensors import (
@@ -22,6 +21,7 @@ from dlo_casadi.estimation.sensors import (
     Sensor,
     Wrench,
 )
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.node import Frame, Heading
 
 FloatArray = NDArray[np.floating]

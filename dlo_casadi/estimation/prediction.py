@@ -10,15 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
-from dlo_casadi.equilibrium import (
-    NEARBY,
-    Branch,
-    Equilibrium,
-    Pose,
-    PoseBranch,
-    continued,
-    solve_equilibrium,
-)
+from dlo_casadi.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.curve import NodeCurve
@@ -26,6 +18,8 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Branch, Pose, PoseBranch
+from dlo_casadi.solve import continued, solve_equilibria, solve_equilibrium
 from dlo_casadi.thresholds import EITHER
 
 FloatArray = NDArray[np.floating]
@@ -77,6 +71,21 @@ class MeasuredBranch:
     branch: PoseBranch | None
 
 
+def predict_each(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    poses: Sequence[Pose],
+    starts: Sequence[FloatArray | None] | None = None,
+) -> list[Prediction | None]:
+    """Predict poses each of which is the first one; see `predict_poses`."""
+    solved = solve_equilibria(model, p, rest, poses, starts)
+    kept = [j for j, eq in enumerate(solved) if isinstance(eq, Equilibrium)]
+    found = [eq for eq in solved if isinstance(eq, Equilibrium)]
+    seen = dict(zip(kept, _seen(model, p, rest, [poses[j] for j in kept], found), strict=True))
+    return [seen.get(j) for j in range(len(poses))]
+
+
 def predict_poses(
     model: CableModel,
     p: FloatArray,
@@ -97,25 +106,55 @@ def predict_poses(
     starts : sequence of (n_nodes, coordinates) or None, optional
         Nodes from which a pose is solved instead, whichever branch that leads to.
     """
+    given = list(starts or [None] * len(poses))
+    alone = [
+        j
+        for j, (pose, start) in enumerate(zip(poses, given, strict=True))
+        if not model.has_state and (pose.branch != "previous" or start is not None)
+    ]
+    apart = predict_each(model, p, rest, [poses[j] for j in alone], [given[j] for j in alone])
+    known = dict(zip(alone, apart, strict=True))
     out: list[Prediction | None] = []
     last: tuple[Pose, FloatArray] | None = None
-    for pose, start in zip(poses, starts or [None] * len(poses), strict=True):
-        try:
-            if start is None and last is not None and pose.branch == "previous":
+    for j, (pose, start) in enumerate(zip(poses, given, strict=True)):
+        if j in known:
+            found = known[j]
+        elif start is None and last is not None and pose.branch == "previous":
+            found = None
+            with suppress(EquilibriumError):
                 eq = continued(model, p, rest, pose, *last)
-            else:
-                eq = solve_equilibrium(model, p, rest, pose, x_init=start)
-        except EquilibriumError:
-            out.append(None)
+                (found,) = _seen(model, p, rest, [pose], [eq])
+        else:
+            (found,) = predict_each(model, p, rest, [pose], [start])
+        out.append(found)
+        if found is None:
             continue
-        last = pose, eq.x
-        shapes, given = eq.shapes, Given.of(p, rest, pose.vector[None])
-        curve = NodeCurve.of(model.cable.length, model.assembly.curve(shapes, given)[0])
-        readings = model.assembly.readings(shapes, given)[0]
-        out.append(Prediction(eq, Observed(curve, readings), rest))
+        last = pose, found.equilibrium.x
         if model.has_state:
-            rest = model.assembly.state_after(shapes, given)[0][0]
+            held = Given.of(p, rest, pose.vector[None])
+            rest = model.assembly.state_after(found.equilibrium.shapes, held)[0][0]
     return out
+
+
+def _seen(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    poses: Sequence[Pose],
+    equilibria: Sequence[Equilibrium],
+) -> list[Prediction]:
+    """Equilibria of poses as camera and sensors would see them."""
+    if not poses:
+        return []
+    x, lam = zip(*((eq.x, eq.multipliers) for eq in equilibria), strict=True)
+    shapes = Shapes.declared(np.array(x), np.array(lam))
+    given = Given.of(p, rest, np.array([pose.vector for pose in poses]))
+    length, assembly = model.cable.length, model.assembly
+    curves, readings = assembly.curve(shapes, given), assembly.readings(shapes, given)
+    return [
+        Prediction(eq, Observed(NodeCurve.of(length, z), shown), rest)
+        for eq, z, shown in zip(equilibria, curves, readings, strict=True)
+    ]
 
 
 def predicted_shapes(

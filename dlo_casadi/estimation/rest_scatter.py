@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from dlo_casadi.model import CableModel
 
@@ -39,7 +39,7 @@ SMOOTHNESS = (0.5, 0.25, 0.12)
 # Ranges of what is systematic that are tried, shares of the RMS distance of the poses' shapes.
 RANGES = (0.25, 1.0)
 # Decrease of -2 log likelihood from which a size is not taken as zero: 1 % of chi-square.
-TELLING = float(chi2.isf(0.01, 1))
+TELLING = float(chdtri(1, 0.01))
 # Poses that are used at most, evenly picked.
 MOST_POSES = 40
 # Smallest and largest size in units of the first guess that are looked at.
@@ -289,7 +289,7 @@ def estimate_rest_scatter(likelihood: RestLikelihood) -> ScatterEstimate:
     joint = min(both, key=lambda r: both[r].deviance, default=None)
     gain = 0.0 if joint is None else max(chosen.deviance - both[joint].deviance, 0.0)
     # The best of the ranges; at a bound of zero half of chi-square's probability.
-    p_systematic = float(min(1.0, 0.5 * len(RANGES) * chi2.sf(gain, 1)))
+    p_systematic = float(min(1.0, 0.5 * len(RANGES) * chdtrc(1, gain)))
     if joint is not None and gain > TELLING:
         chosen, range_ = both[joint], joint
     without = likelihood.best(smoothness, range_, std=False, guess=guess)

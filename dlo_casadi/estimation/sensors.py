@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.ends import reaction_rows
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.chords import chord_places
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.node import Node
 
 FloatArray = NDArray[np.floating]

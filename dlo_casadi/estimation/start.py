@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Directions, Shapes
-from dlo_casadi.equilibrium import first_nodes
 from dlo_casadi.estimation.chords import line_nodes
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem, Point
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.guesses import first_nodes
 from dlo_casadi.model import CableModel
 from dlo_casadi.rod.band import Vector
 

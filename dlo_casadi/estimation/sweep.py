@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Assembly, CurveSlopes, Directions, Given, Shapes
 from dlo_casadi.descent import descend
-from dlo_casadi.equilibrium import JOINT_BOUND, Pose
+from dlo_casadi.equilibrium import JOINT_BOUND
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.band import BandMatrix, Vector
 
 FloatArray = NDArray[np.floating]
@@ -90,10 +91,16 @@ class Sweep:
         if rest.ndim == 2:
             return rest
         out = np.repeat(rest[None], self.m, axis=0)
-        if self.model.has_state:
+        # Poses that leave what they find need not be gone through in order.
+        if self.model.has_state and not self._stays(shapes, p, out):
             for j in range(self.m - 1):
                 out[j + 1] = self._after(j, shapes, p, out)[0]
         return out
+
+    def _stays(self, shapes: Shapes, p: FloatArray, rests: FloatArray) -> bool:
+        """Whether every pose leaves the rest curvature that it finds."""
+        after = self.assembly.state_after(shapes, Given.of(p, rests, self._ends))[0]
+        return bool(np.all(after == rests))
 
     def _after(self, j: int, shapes: Shapes, p: FloatArray, rests: FloatArray) -> FloatArray:
         """Rest curvature (1, n_rests) after pose j."""

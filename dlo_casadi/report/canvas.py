@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -50,20 +50,27 @@ def figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
     """Open a figure of a size [inch] and save it to a file when it is drawn."""
     with styled(size) as drawing:
         yield drawing
-        save_figure(path, drawing, dpi=_DPI)
+        save_figure(path, drawing, _DPI)
 
 
-def save_figure(path: Path, drawing: Figure, **options: Any) -> None:
+def save_figure(path: Path, drawing: Figure, dpi: float, **options: Any) -> None:
     """Write a figure in the format of the file's ending, whole or not at all."""
-    form = path.suffix[1:]
-    write_file(path, lambda stream: drawing.savefig(stream, format=form, **options))
+    form, layout = path.suffix[1:], drawing.get_layout_engine()
+    drawing.set_dpi(dpi)
+    if layout is not None:
+        # A figure that still has an engine is drawn twice: for its layout, and for the file.
+        layout.execute(drawing)
+        drawing.set_layout_engine(None)
+    write_file(path, lambda stream: drawing.savefig(stream, format=form, dpi=dpi, **options))
 
 
 @contextmanager
-def styled(size: tuple[float, float]) -> Iterator[Figure]:
+def styled(
+    size: tuple[float, float], layout: Literal["constrained"] | None = "constrained"
+) -> Iterator[Figure]:
     """Open a figure of a size [inch], to be drawn in the style of all figures."""
     with mpl.rc_context(_STYLE):
-        drawing = Figure(figsize=size, layout="constrained")
+        drawing = Figure(figsize=size, layout=layout)
         FigureCanvasAgg(drawing)
         yield drawing
 

@@ -55,8 +55,7 @@ def draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome:
     zoom = min(_LARGEST[0] / (right - left), _LARGEST[1] / (bottom - top))
     width, height = (right - left) * zoom, (bottom - top) * zoom
     width = max(width, _NARROWEST)
-    with styled((width / _DPI, (height + _STRIP) / _DPI)) as drawing:
-        drawing.set_layout_engine("none")  # the axes have their place
+    with styled((width / _DPI, (height + _STRIP) / _DPI), layout=None) as drawing:
         share = _STRIP / (height + _STRIP)
         axes = drawing.add_axes((0, share, 1, 1 - share))
         extent = (left - 0.5, right - 0.5, bottom - 0.5, top - 0.5)
@@ -73,7 +72,7 @@ def draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome:
         drawing.legend(
             loc="lower center", ncols=3, fontsize=9, frameon=False, title=f"{pose.name} ({role})"
         )
-        save_figure(path, drawing, dpi=_DPI, pil_kwargs={"quality": 88})
+        save_figure(path, drawing, _DPI, pil_kwargs={"quality": 88})
 
 
 def _window(

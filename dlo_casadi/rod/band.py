@@ -298,7 +298,7 @@ class BandFactor:
         total = np.zeros(len(self.schur), dtype=np.intp)
         singular = np.zeros(len(self.schur), dtype=bool)
         for values in self._eigenvalues:
-            total += (values.reshape((len(total), -1)) < 0).sum(axis=1)
+            total += (values < 0).sum(axis=tuple(range(1, values.ndim)))
         if self.schur.shape[1]:
             values, _ = self._conditions
             total += (values < 0).sum(axis=1)

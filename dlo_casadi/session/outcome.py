@@ -9,13 +9,13 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dlo_casadi.config import Config
-from dlo_casadi.equilibrium import PoseBranch
 from dlo_casadi.estimation.band import COVERED
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.pose import PoseBranch
 from dlo_casadi.thresholds import DIFFERENT
 from dlo_casadi.vision import Sight
 
@@ -238,7 +238,7 @@ class PoseInput:
     center : (float, float), optional [m]
         Middle of the photograph in the board frame.
     camera_center : (float, float, float), optional [m]
-        Where a calibrated camera stood, see `equilibrium.Pose`.
+        Where a calibrated camera stood, see `pose.Pose`.
     pixel : float, optional [m]
         Size of a pixel on the board.
     weight : (K,), optional
@@ -427,7 +427,7 @@ class Outcome:
                 continue
             std = shape.expected(self.fit.model.cable.length, self.measurement.std)
             score = ((shape.residual / std) ** 2).reshape((len(std), -1)).sum(axis=1)
-            inside.append(score <= chi2.ppf(COVERED, std.size // len(std)))
+            inside.append(score <= chdtri(std.size // len(std), 1 - COVERED))
         return float(np.concatenate(inside).mean()) if inside else None
 
     def held_out(self, stage: Stage) -> HeldOut:

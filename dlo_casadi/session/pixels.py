@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.chords import chord_places
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.sensors import Observed, ObservedChange, OfPoints
+from dlo_casadi.pose import Pose
 from dlo_casadi.session.outcome import ViewInput
 from dlo_casadi.vision import Viewpoint, compare_pixels, nearest_in_order
 

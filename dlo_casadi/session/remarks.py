@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
-from dlo_casadi.equilibrium import PoseBranch
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.pose import PoseBranch
 from dlo_casadi.session.fitting import allowed_mesh_error
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
 from dlo_casadi.thresholds import EITHER, FIXTURES, MESH_SHARE, UNSEEN

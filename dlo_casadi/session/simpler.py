@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dlo_casadi.estimation.gauss_newton import CONVERGED
 from dlo_casadi.estimation.hyperparameters import refine
 from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.result import Fit
@@ -58,7 +59,7 @@ def _from_simpler(fit: Fit, stiffness: float, better: bool) -> Fit:
     if not better and point.objective >= fit.point.objective:
         return fit
     point, converged = problem.descend(point)
-    if point.objective >= fit.point.objective:
+    if point.objective > fit.point.objective - CONVERGED:
         return fit
     if fit.noise.source == "misfit":
         return Fit(problem, point, converged)

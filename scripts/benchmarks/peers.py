@@ -32,9 +32,10 @@ from scipy.optimize import brentq
 from benchmarks import speed
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.solve import solve_equilibrium
 
 FloatArray = NDArray[np.floating]
 CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
@@ -62,9 +63,9 @@ def run(poses: int = 4, sizes: tuple[int, ...] = SIZES) -> dict[str, Any]:
         rows.append(_row(f"C solver, {element}", 10, ends, curves, compiled(10, element)))
         rows.append(_row(f"IPOPT, {element}", 10, ends, curves, ipopt(10, element)))
     for name, missing, make in (
-        ("pyelastica", _missing_elastica(), elastica),
-        ("mujoco", _missing_mujoco(), mujoco),
-        ("mujoco, soft pin", _missing_mujoco(), lambda n: mujoco(n, soft=True)),
+        ("pyelastica", missing_elastica(), elastica),
+        ("mujoco", missing_mujoco(), mujoco),
+        ("mujoco, soft pin", missing_mujoco(), lambda n: mujoco(n, soft=True)),
     ):
         if missing:
             print(f"{name}: not measured, {missing}", flush=True)
@@ -177,14 +178,15 @@ def relax(advance: Callable[[int], FloatArray], step: float) -> tuple[FloatArray
     while still < 2:
         before, nodes = nodes, advance(many)
         steps += many
-        fastest = np.hypot(*(nodes - before).T).max() / (many * step)
+        fastest = np.linalg.norm(nodes - before, axis=1).max() / (many * step)
         if not np.isfinite(fastest) or steps * step > PATIENCE:
             raise RuntimeError(f"not at rest after {steps} steps of {step:.3g} s")
         still = still + 1 if fastest < REST_SPEED else 0
     return nodes, perf_counter() - begin, steps
 
 
-def _missing_elastica() -> str:
+def missing_elastica() -> str:
+    """What is missing for PyElastica, or nothing."""
     return "" if find_spec("elastica") else "PyElastica is not installed; try the extra `peers`"
 
 
@@ -245,7 +247,8 @@ def elastica(n: int) -> Method:
     return solve
 
 
-def _missing_mujoco() -> str:
+def missing_mujoco() -> str:
+    """What is missing for MuJoCo, or nothing."""
     if not find_spec("mujoco"):
         return "MuJoCo is not installed; try the extra `peers`"
     import mujoco as mj

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,31 +15,61 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.random_cables import SpaceProblem, space_problem
+from benchmarks.random_cables import SpaceProblem
 from benchmarks.speed import FLAGS, HERE, summary
 from dlo_casadi.codegen import CompiledSpaceSolver, generate
 from dlo_casadi.codegen.compiled import shape_record
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.poses import frame_poses
-from dlo_casadi.equilibrium import Pose
+from dlo_casadi.effects import Cable
+from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 
 FloatArray = NDArray[np.floating]
 # Elements of the mesh against which errors are measured: of fourth order, 1e-6 m and less.
 FINE = 96
+# The cable and the ends of the rendered session of markers in space; places [m], quaternions.
+CABLE = Cable(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
+START = (0.4, -0.2, 0.3), (-0.480585, -0.087156, -0.095296, 0.867387)
+ENDS = [
+    ((0.74719, -0.43401, 0.40592), (0.382257, 0.048187, -0.181262, 0.904821)),
+    ((0.70445, -0.24877, 0.28533), (-0.019251, -0.013436, 0.001364, 0.999723)),
+    ((0.68366, -0.1154, 0.18282), (0.007981, 0.170074, 0.022079, 0.985152)),
+    ((0.66228, -0.34145, 0.11238), (0.56894, 0.314861, -0.314834, 0.691411)),
+    ((0.57354, 0.16749, 0.39342), (-0.144429, -0.233479, 0.671014, 0.688744)),
+    ((0.61731, -0.65095, 0.23888), (-0.333233, 0.225503, -0.627699, 0.666407)),
+    ((0.85449, -0.10142, 0.41625), (-0.47761, -0.028848, 0.466896, 0.743683)),
+    ((0.54607, 0.11478, 0.19418), (-0.494563, 0.239912, 0.622616, 0.556956)),
+    ((0.79658, -0.35028, 0.08085), (0.357292, 0.470428, -0.161182, 0.790607)),
+    ((0.65576, -0.07941, 0.52353), (0.473641, -0.379694, 0.009338, 0.794613)),
+    ((0.70951, -0.51979, 0.37982), (0.323647, -0.404163, -0.116912, 0.847489)),
+    ((0.72862, -0.28813, -0.00225), (-0.22966, 0.426855, -0.139879, 0.863415)),
+    ((0.56559, 0.05501, 0.42854), (-0.11798, -0.166167, 0.3749, 0.904389)),
+    ((0.65141, -0.47903, 0.11108), (0.205104, 0.106403, -0.376811, 0.897009)),
+]
+GUESSES = 8  # most first guesses of a pose
 
 
-def problem(n: int, element: str) -> SpaceProblem:
-    """The same cable and poses on any mesh, curved at rest."""
-    drawn = space_problem(np.random.default_rng(0), 14, FINE, "quadratic")
-    model = drawn.model.with_mesh(n, element)
-    coefficients = np.linalg.lstsq(drawn.model.rest_basis, drawn.rest, rcond=None)[0]
-    return SpaceProblem(model, model.rest_basis @ coefficients, drawn.poses)
+def problem(n: int, element: str, bent: float = 1.0) -> SpaceProblem:
+    """The cable on any mesh; `bent` times its rest curvature."""
+    fine = CableModel(CABLE, FINE, "quadratic", "clamped", "clamped", (0.0, 0.0, -9.81))
+    middle = fine.chain.cells.mean(axis=1) / CABLE.length
+    bump = bent * np.exp(-(((middle - 0.5) / 0.4) ** 2)) / CABLE.length
+    curved = np.concatenate([0.0 * bump, bump, 0.5 * bump])
+    coefficients = np.linalg.lstsq(fine.rest_basis, curved, rcond=None)[0]
+    model = fine.with_mesh(n, element)
+    rest = model.rest_basis @ coefficients
+    start, first = START
+    poses = tuple(
+        Pose(start, end, start_orientation=first, end_orientation=last) for end, last in ENDS
+    )
+    return SpaceProblem(model, rest, poses)
 
 
-@lru_cache(maxsize=1)
-def reference() -> tuple[FloatArray, ...]:
+@lru_cache(maxsize=2)
+def reference(bent: float = 1.0) -> tuple[FloatArray, ...]:
     """Points of all poses on the fine mesh."""
-    fine = problem(FINE, "quadratic")
+    fine = problem(FINE, "quadratic", bent)
     solver = CompiledSpaceSolver(fine.model, fine.model.nominal, fine.rest)
     return tuple(solver.solve(pose).points for pose in fine.poses)
 
@@ -56,43 +86,118 @@ def moved(pose: Pose, rng: np.random.Generator) -> Pose:
     )
 
 
+class Timed:
+    """The compiled solver of a problem, with a bare Newton method beside it and a clock."""
+
+    def __init__(self, own: SpaceProblem) -> None:
+        self.own = own
+        source = generate(own.model, own.model.nominal, own.rest)
+        texts = dict(source.files)
+        parts = [
+            texts["dlo_solver.c"],
+            *((HERE / name).read_text() for name in ("timing.c", "bare_newton_space.c")),
+        ]
+        texts["dlo_solver.c"] = "#define _POSIX_C_SOURCE 199309L\n" + "".join(parts)
+        begin = perf_counter()
+        with tempfile.TemporaryDirectory(prefix="dlo_space_") as folder:
+            library = compile_library(replace(source, files=texts), Path(folder), FLAGS)
+            self._c = ctypes.CDLL(str(library))
+        self.compile_seconds = perf_counter() - begin
+        pointer, size, number = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+        for clock in (self._c.dlo_time, self._c.dlo_time_bare):
+            clock.argtypes = [pointer, number, pointer, size, pointer, pointer, pointer]
+        self._c.dlo_bare.argtypes = [pointer, number, pointer, pointer, pointer]
+        self._work = np.empty(source.workspace)
+
+    def solve(
+        self, pose: Pose, warm: NDArray[np.void] | None, repeats: int
+    ) -> tuple[FloatArray, NDArray[np.void]]:
+        """Seconds (repeats,) of solves, and the shape."""
+        return self._run(self._c.dlo_time, pose, 0, warm, repeats)
+
+    def bare(self, pose: Pose, which: int, warm: NDArray[np.void] | None) -> NDArray[np.void]:
+        """Shape to which the bare method leads; zeros if it leads nowhere."""
+        out = np.zeros(1, shape_record(self.own.model))
+        at = frame_poses([pose])
+        self._c.dlo_bare(
+            *(at.ctypes.data, which, None if warm is None else warm.ctypes.data),
+            *(out.ctypes.data, self._work.ctypes.data),
+        )
+        return out
+
+    def time_bare(
+        self, pose: Pose, which: int, warm: NDArray[np.void] | None, repeats: int
+    ) -> float:
+        """Its least seconds."""
+        return float(self._run(self._c.dlo_time_bare, pose, which, warm, repeats)[0].min())
+
+    def _run(
+        self,
+        clock: Callable[..., None],
+        pose: Pose,
+        which: int,
+        warm: NDArray[np.void] | None,
+        repeats: int,
+    ) -> tuple[FloatArray, NDArray[np.void]]:
+        taken, out = np.zeros(repeats), np.zeros(1, shape_record(self.own.model))
+        at = frame_poses([pose])
+        for _ in range(2):  # the first round fills the caches
+            clock(
+                *(at.ctypes.data, which, None if warm is None else warm.ctypes.data, repeats),
+                *(taken.ctypes.data, out.ctypes.data, self._work.ctypes.data),
+            )
+        return taken, out
+
+
+def _same(shape: NDArray[np.void], other: NDArray[np.void]) -> bool:
+    return bool(np.abs(shape["points"] - other["points"]).max() < 1e-4 * CABLE.length)
+
+
 def timed(n: int, element: str, repeats: int = 20) -> dict[str, Any]:
-    """Seconds of cold and warm solves, and the largest node error of each pose [m]."""
-    own = problem(n, element)
-    source = generate(own.model, own.model.nominal, own.rest)
-    texts = dict(source.files)
-    head = "#define _POSIX_C_SOURCE 199309L\n"
-    texts["dlo_solver.c"] = head + texts["dlo_solver.c"] + (HERE / "timing.c").read_text()
-    folder = Path(tempfile.mkdtemp(prefix="dlo_space_"))
-    begin = perf_counter()
-    c = ctypes.CDLL(str(compile_library(replace(source, files=texts), folder, FLAGS)))
-    compiled = perf_counter() - begin
-    pointer, size = ctypes.c_void_p, ctypes.c_size_t
-    c.dlo_time.argtypes = [pointer, ctypes.c_int, pointer, size, pointer, pointer, pointer]
-    work, rng = np.empty(source.workspace), np.random.default_rng(1)
-    shape = np.zeros((2, 1), shape_record(own.model))
+    """Seconds of cold and warm solves, and the largest node error of each pose [m].
+
+    `times_bare_newton` is the median of the quotients of the fastest times: of a warm start; of
+    that first guess from which the bare method needs the fewest steps to the same shape, over the
+    `poses` where one leads there; and of all first guesses, without which nobody knows which of
+    several equilibria is the lowest.
+    """
+    own = Timed(problem(n, element))
+    rng = np.random.default_rng(1)
     errors, seconds = [], {"cold": [], "warm": []}
+    quotients: dict[str, list[float]] = {"warm": [], "best_guess": [], "all_guesses": []}
     every = FINE // n if FINE % n == 0 else 0
-    for pose, fine in zip(own.poses, reference(), strict=True):
-        for kind, at, warm in (("cold", pose, None), ("warm", moved(pose, rng), shape[0])):
-            taken = np.zeros(repeats)
-            out = shape[0 if warm is None else 1]
-            for _ in range(2):  # the first round fills the caches
-                c.dlo_time(
-                    *(frame_poses([at]).ctypes.data, 0),
-                    *(None if warm is None else warm.ctypes.data, repeats),
-                    *(taken.ctypes.data, out.ctypes.data, work.ctypes.data),
-                )
-            seconds[kind].append(taken)
+    for pose, fine in zip(own.own.poses, reference(), strict=True):
+        cold, shape = own.solve(pose, None, repeats)
+        near = moved(pose, rng)
+        warm, close = own.solve(near, shape, repeats)
+        seconds["cold"].append(cold)
+        seconds["warm"].append(warm)
         if every:
-            gaps = np.linalg.norm(shape[0]["points"][0] - fine[::every], axis=1)
+            gaps = np.linalg.norm(shape["points"][0] - fine[::every], axis=1)
             errors.append(float(gaps.max()))
-    shutil.rmtree(folder)
-    found: dict[str, Any] = {"compile_seconds": compiled}
+        if _same(close, own.bare(near, 0, shape)):
+            quotients["warm"].append(warm.min() / own.time_bare(near, 0, shape, repeats))
+        bare = [own.time_bare(pose, k, None, repeats) for k in range(GUESSES)]
+        quotients["all_guesses"].append(cold.min() / sum(bare))
+        there = [k for k in range(GUESSES) if _same(shape, own.bare(pose, k, None))]
+        if there:
+            quotients["best_guess"].append(cold.min() / min(bare[k] for k in there))
+    found: dict[str, Any] = {"compile_seconds": own.compile_seconds}
     for kind, rows in seconds.items():
-        # The machine is shared: the fastest of each pose tells what the code costs.
         best = float(np.median([row.min() for row in rows]))
         found[kind] = {**summary(np.concatenate(rows)), "best": best}
+        found[kind]["p99_over_median"] = found[kind]["p99"] / found[kind]["median"]
+    found["times_bare_newton"] = {
+        name: {"median": float(np.median(row)), "poses": len(row)} if row else None
+        for name, row in quotients.items()
+    }
     if errors:
         found["error"] = {"median": float(np.median(errors)), "largest": max(errors)}
     return found
+
+
+def per_element(n: int, element: str) -> float:
+    """Median over the poses of the fastest cold solve, over n [s]."""
+    own, repeats = Timed(problem(n, element)), max(3, 100 // n)
+    fastest = [own.solve(pose, None, repeats)[0].min() for pose in own.own.poses]
+    return float(np.median(fastest)) / n

@@ -1,32 +1,42 @@
-// Plans a motion of a cable's held end through a scene of round obstacles, with OMPL.
+// Plans a motion of the gripper that holds a cable's end through a scene of obstacles, with OMPL.
 //
-// A state is the place of the held end; the shape of the cable there comes from the generated
-// solver. A state is valid if the whole cable keeps clear of the obstacles and bends no tighter
-// than allowed; a motion is valid if the cable can be led along it without snapping over, and
-// all its shapes are valid. Prints the shapes along the path, one line of x y pairs each.
+// A state is the gripper's place, in space its place and orientation, in SE(3); the shape of the
+// cable there comes from the generated solver. A state is valid if the whole cable keeps clear of
+// the obstacles, bends no tighter than allowed, pulls the gripper no harder and, in space, is
+// twisted no more. A motion is valid if the cable can be led along it without snapping over or
+// looping, and all its shapes are valid. Prints a line for each shape along the path: its nodes,
+// then bend radius [m], force on the gripper [N], twist [1/m] and distance from the obstacles [m];
+// and on the standard error how often each limit has turned a state or a motion down.
 //
-//   cable_planner <scene file> <branch: ccw or cw> <iterations> <seed>
+//   cable_planner <scene file> <branch: ccw or cw, in space lowest> <iterations> <seed>
 //
-// Scene file, one item a line [m]: start x y | goal x y | bend_radius r | clearance c |
-// box x0 y0 x1 y1 (of the held end) | circle x y r
+// Scene file, one item a line [m]; a place has as many numbers as the cable has dimensions:
+//   start PLACE | goal PLACE | low PLACE | high PLACE     of the gripper; start and goal in space
+//                                                         with its orientation qx qy qz qw
+//   held qx qy qz qw                                      of the cable's start, in space
+//   capsule PLACE PLACE radius | half_space PLACE NORMAL  obstacles; equal places are a sphere
+//   clearance c | bend_radius r | force f | twist t       limits [m, m, N, 1/m]
 
 #include <dlo_solver.h>
 
 #include <ompl/base/ProblemDefinition.h>
 #include <ompl/base/objectives/PathLengthOptimizationObjective.h>
 #include <ompl/base/spaces/RealVectorStateSpace.h>
+#include <ompl/base/spaces/SE3StateSpace.h>
 #include <ompl/base/terminationconditions/IterationTerminationCondition.h>
 #include <ompl/geometric/PathGeometric.h>
 #include <ompl/geometric/planners/rrt/RRTstar.h>
 #include <ompl/util/Console.h>
 #include <ompl/util/RandomNumbers.h>
 
-#include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <fstream>
 #include <iostream>
+#include <limits>
+#include <map>
 #include <memory>
 #include <string>
 #include <vector>
@@ -34,15 +44,33 @@
 namespace ob = ompl::base;
 namespace og = ompl::geometric;
 
-struct Circle {
-    double x, y, r;
-};
+constexpr unsigned D = DLO_DIMENSION;
+using Place = std::array<double, D>;
+using Turn = std::array<double, 4>;
 
 struct Scene {
-    double start[2] = {0.0, 0.0}, goal[2] = {0.0, 0.0}, low[2] = {-1.0, -1.0}, high[2] = {1.0, 1.0};
-    double bend_radius = 0.0, clearance = 0.0;
-    std::vector<Circle> circles;
+    Place start{}, goal{}, low{}, high{};
+    Turn start_turn{0.0, 0.0, 0.0, 1.0}, goal_turn{0.0, 0.0, 0.0, 1.0}, held{0.0, 0.0, 0.0, 1.0};
+    double clearance = 0.0, bend_radius = 0.0;
+    double force = std::numeric_limits<double>::infinity(), twist = force;
+    std::vector<dlo_obstacle> obstacles;
 };
+
+template <typename Numbers>
+static void read(std::ifstream &file, Numbers &numbers)
+{
+    for (double &number : numbers)
+        file >> number;
+}
+
+static void read_turn(std::ifstream &file, Turn &turn)
+{
+    read(file, turn);
+    const double size = std::sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2] +
+                                  turn[3] * turn[3]);
+    for (double &number : turn)
+        number /= size; // written with a few digits
+}
 
 static Scene read_scene(const char *name)
 {
@@ -50,24 +78,85 @@ static Scene read_scene(const char *name)
     std::ifstream file(name);
     std::string word;
     while (file >> word) {
-        if (word == "start")
-            file >> scene.start[0] >> scene.start[1];
-        else if (word == "goal")
-            file >> scene.goal[0] >> scene.goal[1];
-        else if (word == "bend_radius")
-            file >> scene.bend_radius;
-        else if (word == "clearance")
+        dlo_obstacle obstacle{};
+        if (word == "start" || word == "goal") {
+            read(file, word == "start" ? scene.start : scene.goal);
+            if (D == 3)
+                read_turn(file, word == "start" ? scene.start_turn : scene.goal_turn);
+        } else if (word == "held") {
+            read_turn(file, scene.held);
+        } else if (word == "low" || word == "high") {
+            read(file, word == "low" ? scene.low : scene.high);
+        } else if (word == "capsule" || word == "half_space") {
+            obstacle.kind = word == "capsule" ? DLO_CAPSULE : DLO_HALF_SPACE;
+            read(file, obstacle.a);
+            read(file, obstacle.b);
+            if (word == "capsule")
+                file >> obstacle.radius;
+            scene.obstacles.push_back(obstacle);
+        } else if (word == "clearance") {
             file >> scene.clearance;
-        else if (word == "box")
-            file >> scene.low[0] >> scene.low[1] >> scene.high[0] >> scene.high[1];
-        else if (word == "circle") {
-            Circle c{};
-            file >> c.x >> c.y >> c.r;
-            scene.circles.push_back(c);
+        } else if (word == "bend_radius") {
+            file >> scene.bend_radius;
+        } else if (word == "force") {
+            file >> scene.force;
+        } else if (word == "twist") {
+            file >> scene.twist;
+        } else {
+            std::cerr << name << ": unknown item " << word << "\n";
+            std::exit(2);
         }
     }
     return scene;
 }
+
+// What differs between the plane and space: the gripper's states, and poses.
+#if DLO_DIMENSION == 3
+using Space = ob::SE3StateSpace;
+static std::shared_ptr<Space> make_space() { return std::make_shared<Space>(); }
+
+static void put(ob::State *state, const Place &place, const Turn &turn)
+{
+    auto *at = state->as<Space::StateType>();
+    at->setXYZ(place[0], place[1], place[2]);
+    at->rotation().x = turn[0];
+    at->rotation().y = turn[1];
+    at->rotation().z = turn[2];
+    at->rotation().w = turn[3];
+}
+
+static dlo_pose pose_of(const Scene &scene, const ob::State *state)
+{
+    const auto *at = state->as<Space::StateType>();
+    const auto &turn = at->rotation();
+    return {{0.0, 0.0, 0.0},
+            {at->getX(), at->getY(), at->getZ()},
+            {scene.held[0], scene.held[1], scene.held[2], scene.held[3]},
+            {turn.x, turn.y, turn.z, turn.w},
+            0.0};
+}
+
+static dlo_branch branch_of(const std::string &) { return DLO_LOWEST; }
+static double twist_of(const dlo_shape &shape) { return std::fabs(shape.max_twist); }
+#else
+using Space = ob::RealVectorStateSpace;
+static std::shared_ptr<Space> make_space() { return std::make_shared<Space>(D); }
+
+static void put(ob::State *state, const Place &place, const Turn &)
+{
+    for (unsigned k = 0; k < D; ++k)
+        state->as<Space::StateType>()->values[k] = place[k];
+}
+
+static dlo_pose pose_of(const Scene &, const ob::State *state)
+{
+    const double *at = state->as<Space::StateType>()->values;
+    return {{0.0, 0.0}, {at[0], at[1]}, 0.0, 0.0};
+}
+
+static dlo_branch branch_of(const std::string &word) { return word == "cw" ? DLO_CW : DLO_CCW; }
+static double twist_of(const dlo_shape &) { return 0.0; }
+#endif
 
 // The cable in the scene: one workspace, so one object for each thread.
 class Cable {
@@ -77,81 +166,106 @@ public:
     {
     }
 
-    static dlo_pose pose(double x, double y)
+    // Whether the gripper may be in a state, alone.
+    bool place(const ob::State *state)
     {
-        dlo_pose out = {{0.0, 0.0}, {x, y}, 0.0, 0.0};
-        return out;
+        dlo_shape shape;
+        return judge(solve(state, shape) ? limit(shape) : "no equilibrium", "state");
     }
 
-    bool solve(double x, double y, dlo_shape &shape)
+    // Shapes along a motion; empty if it is not possible.
+    std::vector<dlo_shape> lead(const ob::SpaceInformation &space, const ob::State *from,
+                                const ob::State *to)
     {
-        const dlo_pose at = pose(x, y);
-        ++solves;
-        return dlo_solve(&at, branch_, nullptr, &shape, work_.data(), work_.size()) == DLO_OK;
-    }
-
-    bool clear(const dlo_shape &shape) const
-    {
-        if (shape.min_bend_radius < scene_.bend_radius)
-            return false;
-        for (const Circle &c : scene_.circles)
-            for (int i = 0; i < DLO_N; ++i)
-                if (distance(c, shape.points[i], shape.points[i + 1]) < c.r + scene_.clearance)
-                    return false;
-        return true;
-    }
-
-    // Shapes along a straight motion of the end; empty if it is not possible.
-    std::vector<dlo_shape> lead(const double from[2], const double to[2])
-    {
-        const double way = std::hypot(to[0] - from[0], to[1] - from[1]);
-        const std::size_t count = 2 + static_cast<std::size_t>(way / 0.01);
+        // A step of 1 cm; OMPL's distance in SE(3) adds that and an angle [rad].
+        const auto count = 2 + static_cast<std::size_t>(space.distance(from, to) / 0.01);
         std::vector<dlo_pose> poses(count);
         std::vector<dlo_shape> shapes(count);
         std::vector<dlo_status> statuses(count);
         std::size_t jump = 0;
+        ob::State *at = space.allocState();
         for (std::size_t i = 0; i < count; ++i) {
             const double u = static_cast<double>(i) / static_cast<double>(count - 1);
-            poses[i] = pose(from[0] + u * (to[0] - from[0]), from[1] + u * (to[1] - from[1]));
+            space.getStateSpace()->interpolate(from, to, u, at);
+            poses[i] = pose_of(scene_, at);
         }
+        space.freeState(at);
         solves += count;
         const dlo_status status =
             dlo_path(poses.data(), count, branch_, nullptr, shapes.data(), statuses.data(), &jump,
                      work_.data(), work_.size());
-        dlo_shape own;
-        if (status != DLO_OK || jump < count || !solve(to[0], to[1], own))
-            return {};
-        // The shape that the motion leads to must be the one that the state stands for.
-        for (int i = 0; i <= DLO_N; ++i)
-            if (std::hypot(own.points[i][0] - shapes.back().points[i][0],
-                           own.points[i][1] - shapes.back().points[i][1]) > 1e-6)
-                return {};
-        for (const dlo_shape &shape : shapes)
-            if (!clear(shape))
-                return {};
-        return shapes;
+        const char *why = status != DLO_OK ? "no equilibrium" : (jump < count ? "snap" : nullptr);
+        for (std::size_t i = 0; !why && i < count; ++i)
+            why = limit(shapes[i]);
+        if (!why && !leads_to(to, shapes.back()))
+            why = "another shape";
+        return judge(why, "motion") ? shapes : std::vector<dlo_shape>();
+    }
+
+    double distance(const dlo_shape &shape) const
+    {
+        dlo_gap gap;
+        if (scene_.obstacles.empty())
+            return std::numeric_limits<double>::infinity();
+        dlo_clearance(&shape, scene_.obstacles.data(), scene_.obstacles.size(), nullptr, &gap);
+        return gap.distance;
+    }
+
+    static double force(const dlo_shape &shape)
+    {
+        double square = 0.0;
+        for (double part : shape.lam_end)
+            square += part * part;
+        return std::sqrt(square);
     }
 
     std::size_t solves = 0;
+    std::map<std::string, std::size_t> refused;
 
 private:
-    static double distance(const Circle &c, const double a[2], const double b[2])
+    bool solve(const ob::State *state, dlo_shape &shape)
     {
-        const double x = b[0] - a[0], y = b[1] - a[1];
-        const double u = ((c.x - a[0]) * x + (c.y - a[1]) * y) / (x * x + y * y);
-        const double at = std::clamp(u, 0.0, 1.0);
-        return std::hypot(a[0] + at * x - c.x, a[1] + at * y - c.y);
+        const dlo_pose at = pose_of(scene_, state);
+        ++solves;
+        return dlo_solve(&at, branch_, nullptr, &shape, work_.data(), work_.size()) == DLO_OK;
+    }
+
+    // The limit that a shape does not keep, or none.
+    const char *limit(const dlo_shape &shape) const
+    {
+        if (shape.min_bend_radius < scene_.bend_radius)
+            return "bend radius";
+        if (force(shape) > scene_.force)
+            return "force";
+        if (twist_of(shape) > scene_.twist)
+            return "twist";
+        return distance(shape) < scene_.clearance ? "clearance" : nullptr;
+    }
+
+    // The shape that a motion leads to must be the one that the state stands for.
+    bool leads_to(const ob::State *state, const dlo_shape &shape)
+    {
+        dlo_shape own;
+        if (!solve(state, own))
+            return false;
+        for (int i = 0; i <= DLO_N; ++i)
+            for (unsigned k = 0; k < D; ++k)
+                if (std::fabs(own.points[i][k] - shape.points[i][k]) > 1e-6)
+                    return false;
+        return true;
+    }
+
+    bool judge(const char *why, const char *what)
+    {
+        if (why)
+            ++refused[std::string(why) + " of a " + what];
+        return !why;
     }
 
     Scene scene_;
     dlo_branch branch_;
     std::vector<double> work_;
 };
-
-static const double *place(const ob::State *state)
-{
-    return state->as<ob::RealVectorStateSpace::StateType>()->values;
-}
 
 class Leading : public ob::MotionValidator {
 public:
@@ -162,7 +276,7 @@ public:
 
     bool checkMotion(const ob::State *from, const ob::State *to) const override
     {
-        return !cable_.lead(place(from), place(to)).empty();
+        return !cable_.lead(*si_, from, to).empty();
     }
 
     // The share up to which the motion is possible is not needed by the planner used here.
@@ -182,63 +296,62 @@ private:
 int main(int argc, char **argv)
 {
     if (argc != 5) {
-        std::cerr << "usage: cable_planner <scene file> <ccw or cw> <iterations> <seed>\n";
+        std::cerr << "usage: cable_planner <scene file> <ccw, cw or lowest> <iterations> <seed>\n";
         return 2;
     }
     ompl::msg::setLogLevel(ompl::msg::LOG_WARN);
     ompl::RNG::setSeed(static_cast<unsigned>(std::atoi(argv[4])));
     const Scene scene = read_scene(argv[1]);
-    Cable cable(scene, std::string(argv[2]) == "cw" ? DLO_CW : DLO_CCW);
+    Cable cable(scene, branch_of(argv[2]));
 
-    auto space = std::make_shared<ob::RealVectorStateSpace>(2);
-    ob::RealVectorBounds bounds(2);
-    for (unsigned k = 0; k < 2; ++k) {
+    auto space = make_space();
+    ob::RealVectorBounds bounds(D);
+    for (unsigned k = 0; k < D; ++k) {
         bounds.setLow(k, scene.low[k]);
         bounds.setHigh(k, scene.high[k]);
     }
     space->setBounds(bounds);
     auto information = std::make_shared<ob::SpaceInformation>(space);
-    information->setStateValidityChecker([&cable](const ob::State *state) {
-        dlo_shape shape;
-        return cable.solve(place(state)[0], place(state)[1], shape) && cable.clear(shape);
-    });
+    information->setStateValidityChecker(
+        [&cable](const ob::State *state) { return cable.place(state); });
     information->setMotionValidator(std::make_shared<Leading>(information, cable));
     information->setup();
 
-    ob::ScopedState<ob::RealVectorStateSpace> start(space), goal(space);
-    for (unsigned k = 0; k < 2; ++k) {
-        start[k] = scene.start[k];
-        goal[k] = scene.goal[k];
-    }
+    ob::ScopedState<Space> start(space), goal(space);
+    put(start.get(), scene.start, scene.start_turn);
+    put(goal.get(), scene.goal, scene.goal_turn);
     auto problem = std::make_shared<ob::ProblemDefinition>(information);
     problem->setStartAndGoalStates(start, goal, 1e-3);
     problem->setOptimizationObjective(
         std::make_shared<ob::PathLengthOptimizationObjective>(information));
     auto planner = std::make_shared<og::RRTstar>(information);
-    planner->setRange(0.15);
+    planner->setRange(D == 3 ? 0.4 : 0.15);
     planner->setGoalBias(0.1);
     planner->setProblemDefinition(problem);
     planner->setup();
     ob::IterationTerminationCondition iterations(static_cast<unsigned>(std::atoi(argv[3])));
     const ob::PlannerStatus status = planner->solve(iterations);
     std::cerr << "solver calls: " << cable.solves << "\n";
+    for (const auto &[why, count] : cable.refused)
+        std::cerr << "turned down for " << why << ": " << count << "\n";
     if (status != ob::PlannerStatus::EXACT_SOLUTION) {
         std::cerr << "no path: " << status.asString() << "\n";
         return 1;
     }
     const auto *path = problem->getSolutionPath()->as<og::PathGeometric>();
-    std::cerr << "path of the held end: " << path->length() << " m\n";
-    for (std::size_t k = 1; k < path->getStateCount(); ++k) {
-        const auto shapes = cable.lead(place(path->getState(static_cast<unsigned>(k - 1))),
-                                       place(path->getState(static_cast<unsigned>(k))));
+    std::cerr << "path of the gripper: " << path->length() << (D == 3 ? " m + rad\n" : " m\n");
+    for (unsigned k = 1; k < path->getStateCount(); ++k) {
+        const auto shapes = cable.lead(*information, path->getState(k - 1), path->getState(k));
         if (shapes.empty()) {
             std::cerr << "the path is not valid\n";
             return 1;
         }
         for (const dlo_shape &shape : shapes) {
-            for (int i = 0; i <= DLO_N; ++i)
-                std::printf("%.6f %.6f ", shape.points[i][0], shape.points[i][1]);
-            std::printf("%.6f\n", shape.min_bend_radius);
+            for (const auto &point : shape.points)
+                for (double number : point)
+                    std::printf("%.6f ", number);
+            std::printf("%.6f %.6f %.6f %.6f\n", shape.min_bend_radius, Cable::force(shape),
+                        twist_of(shape), cable.distance(shape));
         }
     }
     return 0;

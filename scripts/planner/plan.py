@@ -1,9 +1,10 @@
-"""Plan a motion of the cable's held end with OMPL in C++ and draw it.
+"""Plan a motion of the gripper that holds a cable's end with OMPL in C++, and draw it.
 
-    python scripts/planner/plan.py --output DIR [--parameters results/<run>/parameters.yaml]
+    python scripts/planner/plan.py --output DIR [--space] [--parameters PARAMETERS.yaml]
 
-Generates the solver, builds cable_planner against it, plans, checks the path again from Python
-and writes shapes.txt and plan.png. Without parameters a made-up cable of 0.9 m is used.
+Generates the solver, builds cable_planner against it, plans, measures the clearance again and
+writes shapes.txt and plan.png. Without parameters a made-up cable of 0.9 m is used, pinned in the
+plane or, with --space, clamped in space, where the gripper moves in SE(3).
 """
 
 import argparse
@@ -17,29 +18,59 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
-from dlo_casadi.codegen import generate
+from dlo_casadi.codegen import Capsule, HalfSpace, generate
 from dlo_casadi.effects import Cable
 from dlo_casadi.errors import DloError
 from dlo_casadi.model import CableModel
 
 HERE = Path(__file__).parent
+FloatArray = NDArray[np.floating]
+Scene = dict[str, list[list[float]]]
+# Of what a scene limits: column behind the points of a shape, and whether that is a lower bound.
+LIMITS = {
+    "bend_radius": (0, True),
+    "force": (1, False),
+    "twist": (2, False),
+    "clearance": (3, True),
+}
+UNITS = {"bend_radius": "m", "force": "N", "twist": "1/m", "clearance": "m"}
 
 
-def example() -> tuple[CableModel, NDArray[np.floating], NDArray[np.floating]]:
-    """A cable of 0.9 m, pinned at both ends, straight at rest."""
-    cable = Cable(length=0.9, mass=0.12, diameter=0.01, bending_stiffness=0.08, name="example")
-    model = CableModel(cable, n=24, element="arc", n_rest=0)
-    return model, model.nominal, np.zeros(model.chain.n_cells)
+def example(*, in_space: bool = False) -> tuple[CableModel, FloatArray, FloatArray]:
+    """A cable of 0.9 m, straight at rest: pinned at both ends, in space clamped."""
+    if in_space:
+        cable = Cable(0.9, 0.12, 0.01, 0.08, name="example", torsional_stiffness=0.06)
+        model = CableModel(
+            cable, 16, "quadratic", "clamped", "clamped", (0.0, 0.0, -9.81), n_rest=0
+        )
+    else:
+        cable = Cable(0.9, 0.12, 0.01, 0.08, name="example")
+        model = CableModel(cable, n=24, element="arc", n_rest=0)
+    return model, model.nominal, np.zeros(model.chain.n_rests)
 
 
-def read_scene(path: Path) -> dict[str, list[list[float]]]:
+def scene_of(model: CableModel) -> Path:
+    """The scene that comes with the example."""
+    return HERE / ("scene_in_space.txt" if model.in_space else "scene.txt")
+
+
+def read_scene(path: Path) -> Scene:
     """Items of a scene file by kind."""
-    scene: dict[str, list[list[float]]] = {}
+    scene: Scene = {}
     for line in path.read_text().splitlines():
         word, *numbers = line.split()
         scene.setdefault(word, []).append([float(number) for number in numbers])
     return scene
+
+
+def obstacles_of(scene: Scene, dimension: int) -> list[Capsule | HalfSpace]:
+    """Capsules and half-spaces of a scene."""
+    d = dimension
+    capsules = [Capsule(tuple(o[:d]), tuple(o[d : 2 * d]), o[-1]) for o in scene.get("capsule", [])]
+    halves = [HalfSpace(tuple(o[:d]), tuple(o[d:])) for o in scene.get("half_space", [])]
+    return [*capsules, *halves]
 
 
 def build(solver: Path, folder: Path) -> Path:
@@ -54,61 +85,113 @@ def build(solver: Path, folder: Path) -> Path:
     return folder / "cable_planner"
 
 
-def clearance(shape: NDArray[np.floating], circles: list[list[float]]) -> float:
-    """Smallest distance of a polyline (k, 2) from the circles' edges [m]."""
+def clearance(points: FloatArray, radius: float, scene: Scene) -> float:
+    """Smallest distance of a cable's surface from obstacles [m]: of a spline through its nodes."""
+    spline = CubicSpline(np.linspace(0, 1, len(points)), points)
+    places = spline(np.linspace(0, 1, 20 * len(points)))
     least = np.inf
-    for x, y, r in circles:
-        a, d = shape[:-1], np.diff(shape, axis=0)
-        u = np.clip((([x, y] - a) * d).sum(1) / (d * d).sum(1), 0.0, 1.0)
-        least = min(least, float(np.hypot(*(a + u[:, None] * d - [x, y]).T).min()) - r)
+    for obstacle in obstacles_of(scene, points.shape[1]):
+        a, b = (np.array(end) for end in obstacle.ends)
+        if isinstance(obstacle, HalfSpace):
+            gaps = (places - a) @ b / np.linalg.norm(b)
+        else:
+            size = (b - a) @ (b - a)
+            share = np.clip((places - a) @ (b - a) / size, 0.0, 1.0) if size else np.zeros(1)
+            gaps = np.linalg.norm(places - a - share[:, None] * (b - a), axis=1) - obstacle.radius
+        least = min(least, float(gaps.min()) - radius)
     return least
 
 
-def draw(shapes: NDArray[np.floating], scene: dict[str, list[list[float]]], path: Path) -> None:
+def _tube(axes: plt.Axes, obstacle: Capsule) -> None:
+    """A capsule in space."""
+    a, b = np.array(obstacle.a), np.array(obstacle.b)
+    along = b - a
+    size = np.linalg.norm(along)
+    ahead = along / size if size else np.array([0.0, 0.0, 1.0])
+    side = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    side /= np.linalg.norm(side)
+    other = np.cross(ahead, side)
+    tilt, about = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 16), np.linspace(0, 2 * np.pi, 24))
+    shell = (
+        np.sin(tilt)[..., None] * ahead
+        + (np.cos(tilt) * np.cos(about))[..., None] * side
+        + (np.cos(tilt) * np.sin(about))[..., None] * other
+    )
+    middle = np.where((tilt < 0)[..., None], a, b)
+    axes.plot_surface(
+        *np.moveaxis(middle + obstacle.radius * shell, -1, 0), color="0.75", alpha=0.5
+    )
+
+
+def draw(shapes: FloatArray, scene: Scene, path: Path) -> None:
     """The cable along its way, from light to dark."""
-    figure, axes = plt.subplots(figsize=(6.4, 6.4), layout="constrained")
-    for x, y, r in scene["circle"]:
-        axes.add_patch(plt.Circle((x, y), r, color="0.75"))
+    d = shapes.shape[-1]
+    figure = plt.figure(figsize=(6.4, 6.4), layout="constrained")
+    axes = figure.add_subplot(projection="3d" if d == 3 else None)
+    for obstacle in obstacles_of(scene, d):
+        if isinstance(obstacle, Capsule) and d == 3:
+            _tube(axes, obstacle)
+        elif isinstance(obstacle, Capsule):
+            line = np.array(obstacle.ends).T
+            axes.add_patch(plt.Circle(obstacle.a, obstacle.radius, color="0.75"))
+            axes.add_patch(plt.Circle(obstacle.b, obstacle.radius, color="0.75"))
+            axes.plot(*line, color="0.75")
     shown = np.linspace(0, len(shapes) - 1, 18).round().astype(int)
     for k, i in enumerate(shown):
         axes.plot(*shapes[i].T, color=plt.get_cmap("viridis")(1 - k / (len(shown) - 1)), lw=1.5)
-    axes.plot(*shapes[:, -1].T, "k--", lw=1.0, label="way of the held end")
-    axes.plot(*scene["start"][0], "ko", mfc="w", label="start")
-    axes.plot(*scene["goal"][0], "k*", ms=12, label="goal")
+    axes.plot(*shapes[:, -1].T, "k--", lw=1.0, label="way of the gripper")
+    axes.plot(*([x] for x in scene["start"][0][:d]), "ko", mfc="w", label="start")
+    axes.plot(*([x] for x in scene["goal"][0][:d]), "k*", ms=12, label="goal")
     axes.set_aspect("equal")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
+    for name in "xyz"[:d]:
+        getattr(axes, f"set_{name}label")(f"{name} [m]")
     axes.legend()
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
 
-def plan(output: Path, parameters: Path | None, scene_file: Path, iterations: int) -> str:
+def tightest(rows: FloatArray, scene: Scene) -> str:
+    """How near the path comes to each limit of the scene."""
+    found = []
+    for name, (column, lower) in LIMITS.items():
+        if name in scene:
+            worst = rows[:, column].min() if lower else rows[:, column].max()
+            found.append(f"{name} {worst:.4f} {UNITS[name]} (limit {scene[name][0][0]:g})")
+    return ", ".join(found)
+
+
+def plan(
+    output: Path, parameters: Path | None, *, in_space: bool, scene_file: Path | None, tries: int
+) -> str:
     """Generate, build, plan, check, draw; what the planner said."""
     if parameters is None:
-        model, p, rest = example()
+        model, p, rest = example(in_space=in_space)
     else:
         from dlo_casadi.report.parameters_file import load_parameters
 
         model, p, rest, _ = load_parameters(parameters)
+    scene_file = scene_file or scene_of(model)
     generate(model, p, rest).write(output / "solver")
     program = build(output / "solver", output / "build")
-    run = subprocess.run(
-        [str(program), str(scene_file), "ccw", str(iterations), "1"], capture_output=True, text=True
-    )
+    branch = "lowest" if model.in_space else "ccw"
+    command = [str(program), str(scene_file), branch, str(tries), "1"]
+    run = subprocess.run(command, capture_output=True, text=True)
     if run.returncode:
         raise DloError(f"the planner found no path: {run.stderr}")
     (output / "shapes.txt").write_text(run.stdout)
     rows = np.loadtxt(output / "shapes.txt")
-    shapes, scene = rows[:, :-1].reshape(len(rows), -1, 2), read_scene(scene_file)
-    least = min(clearance(shape, scene["circle"]) for shape in shapes)
-    radius = float(rows[:, -1].min())
-    if least < scene["clearance"][0][0] - 1e-5 or radius < scene["bend_radius"][0][0] - 1e-5:
-        raise DloError(f"the path keeps {least:.4f} m clear and bends to {radius:.4f} m")
+    points, numbers = rows[:, : -len(LIMITS)], rows[:, -len(LIMITS) :]
+    shapes = points.reshape(len(rows), model.n + 1, -1)
+    scene = read_scene(scene_file)
+    radius = model.cable.diameter / 2
+    least = min(clearance(shape, radius, scene) for shape in shapes)
+    # The spline is not the solver's cubic: they differ by less than a millimetre.
+    if least < scene["clearance"][0][0] - 1e-3:
+        raise DloError(f"the path keeps only {least:.4f} m clear")
     draw(shapes, scene, output / "plan.png")
     return (
-        f"{run.stderr.strip()}\n{len(shapes)} shapes, clearance {least:.4f} m, smallest bend "
-        f"radius {radius:.4f} m\n{output / 'plan.png'}"
+        f"{run.stderr.strip()}\n{len(shapes)} shapes, nearest to its limits: "
+        f"{tightest(numbers, scene)}\n{output / 'plan.png'}"
     )
 
 
@@ -116,15 +199,23 @@ def main() -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--space", action="store_true", help="the example in space")
     parser.add_argument("--parameters", type=Path)
-    parser.add_argument("--scene", type=Path, default=HERE / "scene.txt")
+    parser.add_argument("--scene", type=Path, help="otherwise that of the example")
     parser.add_argument("--iterations", type=int, default=2000, help="of RRT*")
     chosen = parser.parse_args()
     try:
-        print(plan(chosen.output, chosen.parameters, chosen.scene, chosen.iterations))
+        said = plan(
+            chosen.output,
+            chosen.parameters,
+            in_space=chosen.space,
+            scene_file=chosen.scene,
+            tries=chosen.iterations,
+        )
     except DloError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    print(said)
     return 0
 
 

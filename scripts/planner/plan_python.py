@@ -1,22 +1,23 @@
-"""Plan the same motion from Python, with the PyPI package ompl and CompiledSolver.
+"""Plan the same motion from Python, with the PyPI package ompl and the compiled solver.
 
     pip install ompl
-    python scripts/planner/plan_python.py --output DIR
+    python scripts/planner/plan_python.py --output DIR [--space]
 
 Compiles the solver, plans with RRT*, writes plan_python.png.
 """
 
 import argparse
 import sys
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from plan import HERE, clearance, draw, example, read_scene
+from plan import Scene, draw, example, obstacles_of, read_scene, scene_of
 
-from dlo_casadi.codegen import CompiledSolver
-from dlo_casadi.codegen.shapes import Shape
+from dlo_casadi.codegen import CompiledSolver, CompiledSpaceSolver
+from dlo_casadi.pose import Pose
 
 try:
     from ompl import base as ob
@@ -26,35 +27,104 @@ except ModuleNotFoundError:
     sys.exit("error: planning from Python needs OMPL's package.\n  Try: pip install ompl")
 
 
+class InPlane:
+    """The gripper's place in the plane; the cable is pinned and turns counter-clockwise."""
+
+    def __init__(self) -> None:
+        self.space, self.solver = ob.RealVectorStateSpace(2), CompiledSolver(*example())
+
+    def put(self, state: Any, numbers: list[float]) -> None:
+        """Set a state."""
+        state[0], state[1] = numbers
+
+    def at(self, state: Any) -> list[float]:
+        """What the solver is asked for."""
+        return list(state[0:2])
+
+    def solve(self, at: list[float]) -> Any:
+        """Shape of the cable, whatever its status."""
+        return self.solver.solve(at, branch="ccw", throw=False)
+
+    def path(self, way: list[list[float]]) -> Any:
+        """Shapes along a way."""
+        return self.solver.path(way, branch="ccw")
+
+
+class InSpace:
+    """The gripper's place and orientation, in SE(3); the cable is clamped."""
+
+    def __init__(self, held: list[float]) -> None:
+        self.space, self.solver = ob.SE3StateSpace(), CompiledSpaceSolver(*example(in_space=True))
+        self.held = tuple(held)
+
+    def put(self, state: Any, numbers: list[float]) -> None:
+        """Set a state."""
+        state.setXYZ(*numbers[:3])
+        turn, size = state.rotation(), np.linalg.norm(numbers[3:])
+        turn.x, turn.y, turn.z, turn.w = (number / size for number in numbers[3:])
+
+    def at(self, state: Any) -> Pose:
+        """What the solver is asked for."""
+        turn, place = state.rotation(), (state.getX(), state.getY(), state.getZ())
+        last = (turn.x, turn.y, turn.z, turn.w)
+        return Pose((0.0, 0.0, 0.0), place, start_orientation=self.held, end_orientation=last)
+
+    def solve(self, at: Pose) -> Any:
+        """Shape of the cable, whatever its status."""
+        return self.solver.solve(at, throw=False)
+
+    def path(self, way: list[Pose]) -> Any:
+        """Shapes along a way."""
+        return self.solver.path(way)
+
+
 class Leader:
-    """The cable in the scene: which places and motions of its held end are allowed."""
+    """The cable in the scene: which states and motions of the gripper are allowed."""
 
-    def __init__(self, solver: CompiledSolver, scene: dict[str, list[list[float]]]) -> None:
-        self.solver, self.scene = solver, scene
-        self.radius, self.gap = scene["bend_radius"][0][0], scene["clearance"][0][0]
+    def __init__(self, gripper: InPlane | InSpace, scene: Scene) -> None:
+        self.gripper, self.refused = gripper, Counter[str]()
+        self.obstacles = obstacles_of(scene, gripper.solver.model.node.dimension)
+        self.scene = {name: numbers[0][0] for name, numbers in scene.items()}
 
-    def clear(self, shape: Shape) -> bool:
-        """Whether a shape keeps clear and bends no tighter than allowed."""
-        return (
-            shape.status == "ok"
-            and shape.min_bend_radius >= self.radius
-            and clearance(shape.points, self.scene["circle"]) >= self.gap
-        )
+    def limit(self, shape: Any) -> str | None:
+        """The limit that a shape does not keep."""
+        scene = self.scene
+        if shape.status != "ok":
+            return "no equilibrium"
+        if shape.min_bend_radius < scene.get("bend_radius", 0.0):
+            return "bend radius"
+        if np.linalg.norm(shape.lam) > scene.get("force", np.inf):
+            return "force"
+        if abs(getattr(shape, "max_twist", 0.0)) > scene.get("twist", np.inf):
+            return "twist"
+        gap = self.gripper.solver.clearance(shape, self.obstacles)
+        return "clearance" if gap.distance < scene.get("clearance", 0.0) else None
 
-    def place(self, end: NDArray[np.floating]) -> bool:
-        """Whether the held end may be there."""
-        return self.clear(self.solver.solve(end, branch="ccw", throw=False))
+    def place(self, state: Any) -> bool:
+        """Whether the gripper may be in a state."""
+        return self._judge(self.limit(self.gripper.solve(self.gripper.at(state))), "state")
 
-    def lead(self, start: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[Shape, ...]:
-        """Shapes along a straight motion; none if it is not possible."""
-        count = 2 + int(np.hypot(*(end - start)) / 0.01)
-        path = self.solver.path(np.linspace(start, end, count), branch="ccw")
-        own = self.solver.solve(end, branch="ccw", throw=False)
-        if path.first_jump is not None or not all(self.clear(shape) for shape in path.shapes):
-            return ()
-        # The shape that the motion leads to must be the one that the place stands for.
-        same = np.abs(own.points - path.shapes[-1].points).max() < 1e-6
-        return path.shapes if same else ()
+    def lead(self, start: Any, end: Any) -> tuple[Any, ...]:
+        """Shapes along a motion; none if it is not possible."""
+        gripper, space = self.gripper, self.gripper.space
+        count, state, way = 2 + int(space.distance(start, end) / 0.01), space.allocState(), []
+        for u in np.linspace(0.0, 1.0, count):
+            space.interpolate(start, end, u, state)
+            way.append(gripper.at(state))
+        path = gripper.path(way)
+        why = "snap" if path.first_jump is not None else None
+        why = why or next(filter(None, map(self.limit, path.shapes)), None)
+        if not why:
+            # The shape that the motion leads to must be the one that the state stands for.
+            own = gripper.solve(way[-1])
+            far = np.abs(own.points - path.shapes[-1].points).max() > 1e-6
+            why = "another shape" if far else None
+        return path.shapes if self._judge(why, "motion") else ()
+
+    def _judge(self, why: str | None, what: str) -> bool:
+        if why:
+            self.refused[f"{why} of a {what}"] += 1
+        return not why
 
 
 class Motions(ob.MotionValidator):
@@ -65,57 +135,60 @@ class Motions(ob.MotionValidator):
         self.leader = leader
 
     def checkMotion(self, start: ob.State, end: ob.State) -> bool:
-        """Whether the cable can be led from one place to the other."""
-        return bool(self.leader.lead(np.array(start[0:2]), np.array(end[0:2])))
+        """Whether the cable can be led from one state to the other."""
+        return bool(self.leader.lead(start, end))
 
 
 def main() -> int:
     """Plan and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--scene", type=Path, default=HERE / "scene.txt")
+    parser.add_argument("--space", action="store_true", help="the example in space")
+    parser.add_argument("--scene", type=Path, help="otherwise that of the example")
     parser.add_argument("--seconds", type=float, default=10.0)
     chosen = parser.parse_args()
     chosen.output.mkdir(parents=True, exist_ok=True)
-    scene = read_scene(chosen.scene)
-    leader = Leader(CompiledSolver(*example()), scene)
+    scene = read_scene(chosen.scene or scene_of(example(in_space=chosen.space)[0]))
+    gripper = InSpace(scene["held"][0]) if chosen.space else InPlane()
+    leader = Leader(gripper, scene)
     ou.RNG.setSeed(1)
 
-    space = ob.RealVectorStateSpace(2)
-    bounds = ob.RealVectorBounds(2)
-    for k in range(2):
-        bounds.setLow(k, scene["box"][0][k])
-        bounds.setHigh(k, scene["box"][0][k + 2])
-    space.setBounds(bounds)
-    information = ob.SpaceInformation(space)
-    information.setStateValidityChecker(lambda state: leader.place(np.array(state[0:2])))
+    bounds = ob.RealVectorBounds(len(scene["low"][0]))
+    for k, (low, high) in enumerate(zip(scene["low"][0], scene["high"][0], strict=True)):
+        bounds.setLow(k, low)
+        bounds.setHigh(k, high)
+    gripper.space.setBounds(bounds)
+    information = ob.SpaceInformation(gripper.space)
+    information.setStateValidityChecker(leader.place)
     motions = Motions(information, leader)
     information.setMotionValidator(motions)
     information.setup()
     problem = ob.ProblemDefinition(information)
-    start, goal = space.allocState(), space.allocState()
-    for k in range(2):
-        start[k], goal[k] = scene["start"][0][k], scene["goal"][0][k]
+    start, goal = gripper.space.allocState(), gripper.space.allocState()
+    gripper.put(start, scene["start"][0])
+    gripper.put(goal, scene["goal"][0])
     problem.setStartAndGoalStates(start, goal, 1e-3)
     planner = og.RRTstar(information)
-    planner.setRange(0.15)
+    planner.setRange(0.4 if chosen.space else 0.15)
     planner.setProblemDefinition(problem)
     planner.setup()
     solved = planner.solve(chosen.seconds)
+    for why, count in sorted(leader.refused.items()):
+        print(f"turned down for {why}: {count}")
     if not problem.hasExactSolution():
         print(f"no path: {solved}", file=sys.stderr)
         return 1
     path = problem.getSolutionPath()
-    places = [np.array(state[0:2]) for state in path.getStates()]
     shapes = []
-    for a, b in pairwise(places):
+    for a, b in pairwise(path.getStates()):
         led = leader.lead(a, b)
         if not led:
             print("the path is not valid", file=sys.stderr)
             return 1
         shapes += [shape.points for shape in led]
     draw(np.array(shapes), scene, chosen.output / "plan_python.png")
-    print(f"path of the held end: {path.length():.3f} m\n{chosen.output / 'plan_python.png'}")
+    length = f"{path.length():.3f} m{' + rad' if chosen.space else ''}"
+    print(f"path of the gripper: {length}\n{chosen.output / 'plan_python.png'}")
     return 0
 
 

@@ -1,5 +1,6 @@
 """The planner example: OMPL in C++ calls the generated solver for every state and motion."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -18,17 +19,30 @@ def missing():
 
 
 @pytest.mark.skipif(bool(missing()), reason=f"not installed: {missing()}")
-def test_a_path_is_planned_checked_and_drawn(tmp_path):
-    command = [sys.executable, str(PLANNER / "plan.py"), "--output", str(tmp_path)]
-    run = subprocess.run([*command, "--iterations", "600"], capture_output=True, text=True)
+@pytest.mark.parametrize(
+    ("where", "iterations", "limits"),
+    [
+        ((), "300", ("bend_radius", "clearance")),
+        (("--space",), "100", ("bend_radius", "force", "twist", "clearance")),
+    ],
+    ids=["plane", "space"],
+)
+def test_a_path_is_planned_checked_and_drawn(tmp_path, where, iterations, limits):
+    command = [sys.executable, str(PLANNER / "plan.py"), "--output", str(tmp_path), *where]
+    run = subprocess.run([*command, "--iterations", iterations], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    assert "smallest bend radius" in run.stdout
+    assert "turned down for clearance of a motion" in run.stdout
+    for name in limits:
+        nearest, limit = re.search(rf"{name} (\S+) \S+ \(limit (\S+)\)", run.stdout).groups()
+        assert (float(nearest) >= float(limit)) == (name in ("bend_radius", "clearance"))
     assert (tmp_path / "plan.png").stat().st_size > 10_000
 
 
-def test_the_same_from_python(tmp_path):
+@pytest.mark.parametrize("where", [(), ("--space",)], ids=["plane", "space"])
+def test_the_same_from_python(tmp_path, where):
     pytest.importorskip("ompl", reason="the PyPI package ompl is not installed")
-    command = [sys.executable, str(PLANNER / "plan_python.py"), "--output", str(tmp_path)]
+    script = str(PLANNER / "plan_python.py")
+    command = [sys.executable, script, "--output", str(tmp_path), *where]
     run = subprocess.run([*command, "--seconds", "4"], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert (tmp_path / "plan_python.png").stat().st_size > 10_000

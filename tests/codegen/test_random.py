@@ -19,9 +19,10 @@ from benchmarks.random_cables import (
     random_problem,
     space_problem,
 )
+from benchmarks.space_ipopt import Ipopt
 
 from dlo_casadi.codegen import STATUSES
-from dlo_casadi.equilibrium import solve_equilibrium
+from dlo_casadi.solve import solve_equilibrium
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
@@ -95,7 +96,8 @@ def test_24_random_starts_find_nothing_lower(start, end):
 def test_random_clamped_cables_in_space_have_stable_equilibria():
     """scripts/benchmark.py --only space_random solves a hundred thousand."""
     rng = np.random.default_rng(0)
-    solver = AnyCable(space_problem(rng, 1, 10), flags=("-O1",))
+    any_cable = space_problem(rng, 1, 10)
+    solver, ipopt = AnyCable(any_cable, flags=("-O1",)), Ipopt(any_cable.model)
     failed, words = 0, []
     for _ in range(10):
         problem = space_problem(rng, 50, 10)
@@ -105,8 +107,8 @@ def test_random_clamped_cables_in_space_have_stable_equilibria():
             right, error = check_in_space(problem, shapes[i], i)
             assert right
             assert error < 1e-9
-        there = np.flatnonzero(statuses == 0)[:3]
-        words += [compare_in_space(problem, shapes[i], i) for i in there]
+        there = np.flatnonzero(statuses == 0)[:2]
+        words += [compare_in_space(problem, shapes[i], i, ipopt) for i in there]
     assert failed <= 2
     assert words.count("higher") <= 1
-    assert words.count("same") + words.count("lower") >= 25
+    assert words.count("same") + words.count("lower") >= 18

@@ -14,12 +14,12 @@ from dlo_casadi.diagnosis.causes import start_from
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.pull import Pull
 from dlo_casadi.effects import EFFECTS, Cable
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.session.declared import nuisances
 
 CABLE = Cable(0.8, 0.2, 0.01, 0.1)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis.next_pose import _separation, next_reading
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed
+from dlo_casadi.pose import Pose
 from dlo_casadi.rod.node import Heading
 
 LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4

@@ -9,7 +9,6 @@ import pytest
 
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.algorithm1 import (
     Algorithm1Status,
@@ -26,6 +25,8 @@ from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.measurements import read_points
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
+from dlo_casadi.solve import solve_equilibrium
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
 GRAVITY = (0.0, -9.81)  # m/s^2

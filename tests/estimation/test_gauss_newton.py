@@ -19,7 +19,6 @@ from dlo_casadi.effects import (
     RestCurvatureDrift,
     StiffnessGradient,
 )
-from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.curve import NodeCurve
@@ -31,6 +30,8 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
+from dlo_casadi.solve import solve_equilibrium
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 STD = 3e-4  # m

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import (
     NoiseModel,
@@ -15,6 +14,7 @@ from dlo_casadi.estimation.noise import (
 )
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Centerline, Observed, ObservedChange
+from dlo_casadi.pose import Pose
 
 CURVATURE, LENGTH = 4.0, 0.9  # 1/m, m: turns by 3.6 rad
 RADIUS = 1 / CURVATURE

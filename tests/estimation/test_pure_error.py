@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
 from dlo_casadi.estimation.repeats import different_poses, repeatability, with_repeats
+from dlo_casadi.pose import Pose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import measured_poses, read_inputs

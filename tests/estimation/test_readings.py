@@ -8,7 +8,6 @@ import pytest
 from dlo_casadi.assembly import Directions, Given
 from dlo_casadi.effects import Cable, SensorBias, Setup, StartSpring
 from dlo_casadi.ends import REACTIONS, reaction_rows
-from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
@@ -17,6 +16,8 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
+from dlo_casadi.solve import solve_equilibrium
 
 CABLE = Cable(0.8, 0.2, 0.012, 0.04)
 IN_SPACE = replace(CABLE, torsional_stiffness=0.02)

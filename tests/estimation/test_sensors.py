@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Centerline, Markers, Observed, ObservedChange
+from dlo_casadi.pose import Pose
 
 LENGTH, RADIUS, RISE = 0.9, 0.1, 0.6  # m, m, advance along the axis per arc length
 

@@ -16,15 +16,16 @@ from tiny_sessions import write_session
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium import Pose, solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel
 from dlo_casadi.parallel import open_executor
+from dlo_casadi.pose import Pose
 from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_file import parameters_text
 from dlo_casadi.session import run_session
 from dlo_casadi.shape_table import Grid, Plan, PoseList, shape_table, solve
+from dlo_casadi.solve import solve_equilibrium
 
 CABLE = Cable(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
 REST = np.zeros(10)

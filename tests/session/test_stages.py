@@ -7,12 +7,12 @@ import pytest
 
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium import Pose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses, predicted_shapes
 from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler
 from dlo_casadi.session.simpler import not_worse

@@ -1,0 +1,104 @@
+"""End conditions of one pose as declared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.rod.node import Frame, quaternion_product
+
+FloatArray = NDArray[np.floating]
+Branch = Literal["ccw", "cw"]
+# In a session a pose may also continue the one before it, see `solve.continued`.
+PoseBranch = Branch | Literal["previous"]
+
+# Sign of the turning from start to end on a branch.
+SIGNS: dict[Branch, int] = {"ccw": 1, "cw": -1}
+
+
+@dataclass(frozen=True)
+class Pose:
+    """End conditions of one pose as declared.
+
+    Parameters
+    ----------
+    start, end : (dimension,) [m]
+        `end` is None for a free end.
+    start_heading, end_heading : float [rad] or None
+        Directions of clamped ends in a plane, continuous along the cable.
+    start_orientation, end_orientation : (4,) or None
+        Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable.
+    turns : float
+        In space, full turns of twist at the end about its x axis beside the roll nearest to none.
+    branch : "ccw", "cw" or "previous", optional
+        Which way the cable turns from start to end: the sign of `Equilibrium.turn`; or as in the
+        pose before it, from which whoever predicts a series of poses follows it.
+    name : str
+    camera_center : (float, float, float), optional [m]
+        Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
+    """
+
+    start: tuple[float, ...]
+    end: tuple[float, ...] | None = None
+    start_heading: float | None = None
+    end_heading: float | None = None
+    start_orientation: tuple[float, ...] | None = None
+    end_orientation: tuple[float, ...] | None = None
+    turns: float = 0.0
+    branch: PoseBranch | None = None
+    name: str = "pose"
+    camera_center: tuple[float, float, float] | None = None
+
+    @property
+    def ends(self) -> FloatArray:
+        """Start, end [m], start frame, end frame: see `EndConditions.vector`."""
+        end = self.end if self.end is not None else (0.0,) * len(self.start)
+        return np.concatenate([self.start, end, *self.frames])
+
+    @property
+    def frames(self) -> tuple[FloatArray, FloatArray]:
+        """Frames (coordinates,) of both ends as nodes carry them: in a plane headings [rad]."""
+        if len(self.start) == 2:
+            return np.array([self.start_heading or 0.0]), np.array([self.end_heading or 0.0])
+        first, last = self.start_orientation, self.end_orientation
+        return _unit(first or Frame.identity), _unit(last or Frame.identity)
+
+    def moved(self, start: FloatArray, end: FloatArray, frames: Sequence[FloatArray]) -> Pose:
+        """The same pose elsewhere; what is free stays free."""
+        headings = [float(frame[0]) if len(frame) == 1 else None for frame in frames]
+        orientations = [tuple(frame) if len(frame) == 4 else None for frame in frames]
+        return replace(
+            self,
+            start=tuple(start),
+            end=None if self.end is None else tuple(end),
+            start_heading=headings[0],
+            end_heading=headings[1],
+            start_orientation=orientations[0],
+            end_orientation=orientations[1],
+        )
+
+    def rolled(self, angle: float) -> Pose:
+        """The pose with its end clamp, in space, turned about its x axis [rad]."""
+        if self.end_orientation is None:
+            return self
+        roll = (np.sin(angle / 2), 0.0, 0.0, np.cos(angle / 2))
+        turned = quaternion_product(self.end_orientation, roll)
+        return replace(self, end_orientation=tuple(float(x) for x in turned))
+
+    @property
+    def vector(self) -> FloatArray:
+        """The model's argument `pose`: the ends, then what `effects.Sight` says of the camera.
+
+        Its centre (x, y, z) enters as (x, y, 1) / z: zeros for none, which sees from infinity.
+        """
+        x, y, z = self.camera_center or (0.0, 0.0, np.inf)
+        return np.concatenate([self.ends, np.array([x, y, 1.0]) / z])
+
+
+def _unit(quaternion: tuple[float, ...]) -> FloatArray:
+    q = np.array(quaternion, dtype=float)
+    return q / max(float(np.linalg.norm(q)), 1e-300)
