@@ -105,6 +105,14 @@ class Directions:
     deviation: FloatArray
     tangent: BandMatrix | None = None
 
+    def and_step(self, step: Vector) -> Directions:
+        """These directions and, last, a step of the shapes alone (one column)."""
+        p, rest, deviation = (
+            np.pad(part, [(0, 0), (0, 0), (0, 1)]) for part in (self.p, self.rest, self.deviation)
+        )
+        x = np.concatenate([self.x, step.x], axis=-1)
+        return Directions(x, np.concatenate([self.lam, step.y], axis=-1), p, rest, deviation)
+
 
 class _Mapped:
     """A CasADi function of a slot (or node), mapped over a pose and called pose by pose.

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.assembly import Shapes
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.fit import (
     FIRST_LOOK,
@@ -34,7 +35,7 @@ FloatArray = NDArray[np.floating]
 
 # Decades of stiffness about that of the fit that is astray, and about the prior's. In five sessions
 # in which an effect is missing such fits were off by factors of 0.35 to 2.3, priors by 0.6 to 1.9.
-DECADES_NEAR = (0.0, -0.5, 0.5)
+DECADES_NEAR = (-0.5, 0.5)
 # Places of an effect that are tried first, and starts that are followed.
 PLACES_TRIED, FOLLOWED = 5, 2
 # Iterations with the effect's size free, its place and the stiffnesses held; with the stiffnesses,
@@ -50,8 +51,43 @@ class Start:
     guess: Guess
 
 
+@dataclass(frozen=True)
+class Origin:
+    """Where starts begin: parameters, and shapes along the measured lines.
+
+    Parameters
+    ----------
+    values : dict
+        By the names of the base's parameters.
+    x : (m, n_nodes, coordinates)
+    feet : list of (K_j,) [m]
+    indices : tuple of int
+        Places of the m poses in the session.
+    """
+
+    values: dict[str, float]
+    x: FloatArray
+    feet: list[FloatArray]
+    indices: tuple[int, ...]
+
+
+def origins_of(base: Fit) -> tuple[Origin, ...]:
+    """What a fit that is astray has found, and what was declared."""
+    names, problem = base.model.names, _searched_problem(base, base.model)
+    declared = np.where(problem.unknowns.free, base.model.nominal, base.p)
+    found = []
+    for p in (base.p, declared):
+        values = dict(zip(names, map(float, p), strict=True))
+        shapes, feet = measured_shapes(problem, values.get(END_ROLL, 0.0))
+        found.append(Origin(values, shapes.x, feet, tuple(problem.indices)))
+    return tuple(found)
+
+
 def start_afresh(
-    base: Fit, candidate: Candidate | None, smaller: tuple[Candidate, Start] | None = None
+    base: Fit,
+    origins: Sequence[Origin],
+    candidate: Candidate | None,
+    smaller: tuple[Candidate, Start] | None = None,
 ) -> Start | None:
     """The best of some starts from the measured shapes.
 
@@ -59,28 +95,29 @@ def start_afresh(
     ----------
     base : Fit
         Of a model that lacks something.
+    origins : sequence of Origin
+        Of that fit.
     candidate : Candidate, optional
         What is added to its model; by default nothing.
     smaller : (Candidate, Start), optional
-        A candidate that this one contains, and where that has led.
+        A candidate that this one contains, and where that has led: the start, then.
     """
-    model = base.model if candidate is None else candidate.add_to(base.model)
-    scans: tuple[dict[str, float], ...] = ({},) if candidate is None else candidate.scans
-    first = _First(base, base.model if candidate is None else candidate.add_linear_to(base.model))
-    tried = [scans[k] for k in range(0, len(scans), -(-len(scans) // PLACES_TRIED))]
-    looks = [(guess, scan) for scan in tried for guess in first.looks(scan, DECADES_NEAR[:1])]
-    if not looks:
-        return None
-    _, place = min(looks, key=lambda look: look[0].objective)
-    looks += [(guess, place) for guess in first.looks(place, DECADES_NEAR[1:])]
+    model = linear = base.model if candidate is None else candidate.add_to(base.model)
+    scans: tuple[dict[str, float], ...] = ({},)
+    if candidate is not None:
+        scans, linear = candidate.scans, candidate.add_linear_to(base.model)
+    first = _First(base, model if linear == model else linear, origins)
     if candidate is not None and smaller is not None:
-        looks += [(guess, place) for guess in first.beyond(candidate, *smaller)]
-    looks.sort(key=lambda look: look[0].objective)
-    problem, best = _searched_problem(base, model), None
-    problem.share_metric(first.problem)
-    for look, scan in looks[:FOLLOWED]:
+        looks = [(guess, scans[0]) for guess in first.beyond(candidate, *smaller)]
+    else:
+        looks = first.looks(scans[:: -(-len(scans) // PLACES_TRIED)])
+    problem, best = first.problem, None
+    if linear != model:
+        problem = _searched_problem(base, model)
+        problem.share_metric(first.problem)
+    for look, scan in sorted(looks, key=lambda look: look[0].objective)[:FOLLOWED]:
         guess: Guess | None = look
-        if candidate is not None and not candidate.nuisance:
+        if candidate is not None and linear != model:
             guess = first.continued(look, problem, candidate)
         placed = np.array([name in scan for name in problem.unknowns.names])
         for still, steps in ((placed, STEPS[1]), (np.zeros_like(placed), STEPS[2])):
@@ -93,33 +130,51 @@ def start_afresh(
 class _First:
     """First looks at a model, in parameters in which what it has more is linear."""
 
-    def __init__(self, base: Fit, model: CableModel) -> None:
+    def __init__(self, base: Fit, model: CableModel, origins: Sequence[Origin]) -> None:
         self.problem, self.model = _searched_problem(base, model), model
-        # What the fit that is astray has found, and what was declared.
-        astray, free = base.values_in(model), self.problem.unknowns.free
-        self.origins = [astray, np.where(free, model.nominal, astray)]
-        names = model.names
-        rolls = [
-            float(p[names.index(END_ROLL)]) if END_ROLL in names else 0.0 for p in self.origins
-        ]
-        self.measured = [measured_shapes(self.problem, roll) for roll in rolls]
+        self.begun: list[tuple[FloatArray, Shapes, list[FloatArray]]] = []
+        for origin in origins:
+            p = base.values_in(model)
+            for name, value in origin.values.items():
+                p[model.names.index(name)] = value
+            if tuple(self.problem.indices) == origin.indices:
+                shapes, feet = self.problem.sweep.start_shapes(origin.x), origin.feet
+            else:  # a state makes shapes depend on those of poses that were held out
+                shapes, feet = measured_shapes(self.problem, origin.values.get(END_ROLL, 0.0))
+            self.begun.append((p, shapes, feet))
         priors = base.model.priors
         released = {name for name in priors if name not in model.priors}
         self.kept = set(base.model.names) - released - {END_ROLL}
 
-    def looks(self, scan: Mapping[str, float], decades: Sequence[float]) -> list[Guess]:
-        """Guesses after a few steps at a place and at stiffnesses, which stay."""
+    def looks(self, scans: Sequence[dict[str, float]]) -> list[tuple[Guess, dict[str, float]]]:
+        """Guesses after a few steps at places and at stiffnesses, which stay."""
+        found = [
+            (guess, scan, k)
+            for scan in scans
+            for k in range(len(self.begun))
+            if (guess := self._look(scan, k)) is not None
+        ]
+        if not found:
+            return []
+        _, scan, k = min(found, key=lambda look: look[0].objective)
+        others = [self._look(scan, k, decade) for decade in DECADES_NEAR]
+        return [
+            *((guess, scan) for guess, scan, _ in found),
+            *((guess, scan) for guess in others if guess is not None),
+        ]
+
+    def _look(self, scan: Mapping[str, float], k: int, decade: float = 0.0) -> Guess | None:
+        p, shapes, feet = self.begun[k]
+        p, stiff = p.copy(), self.model.stiffness_indices
+        # Torsion goes with bending: their ratio is known better than what a misfit leaves of it.
+        p[stiff] = 10**decade * p[0] / self.model.nominal[0] * self.model.nominal[stiff]
+        for name, value in scan.items():
+            p[self.model.names.index(name)] = value
+        theta = self.problem.unknowns.pack(p, np.zeros(self.model.n_coefficients))
+        if not self.problem.has_metric:
+            self.problem.refresh(theta, shapes, feet)
         held = np.array([name in self.kept or name in scan for name in self.problem.unknowns.names])
-        out = []
-        for decade in decades:
-            for values, (shapes, feet) in zip(self.origins, self.measured, strict=True):
-                theta = self._theta(values, scan, decade)
-                if not self.problem.has_metric:
-                    self.problem.refresh(theta, shapes, feet)
-                guess = all_at_once(self.problem, Guess(theta, shapes, feet), held, STEPS[0])
-                if guess is not None:
-                    out.append(guess)
-        return out
+        return all_at_once(self.problem, Guess(theta, shapes, feet), held, STEPS[0])
 
     def beyond(self, candidate: Candidate, smaller: Candidate, start: Start) -> list[Guess]:
         """A guess from where a candidate has led that this one contains."""
@@ -132,17 +187,10 @@ class _First:
         p = np.array([values[name] for name in self.model.names])
         shapes = with_border_of(start.guess.shapes, other.model, self.model)
         begun = Guess(self.problem.unknowns.pack(p, rest), shapes, start.guess.feet)
+        self.problem.share_metric(start.problem)
         held = np.array([name in self.kept for name in self.problem.unknowns.names])
         guess = all_at_once(self.problem, begun, held, STEPS[0])
         return [] if guess is None else [guess]
-
-    def _theta(self, origin: FloatArray, scan: Mapping[str, float], decade: float) -> FloatArray:
-        p, stiff = origin.copy(), self.model.stiffness_indices
-        # Torsion goes with bending: their ratio is known better than what a misfit leaves of it.
-        p[stiff] = 10**decade * origin[0] / self.model.nominal[0] * self.model.nominal[stiff]
-        for name, value in scan.items():
-            p[self.model.names.index(name)] = value
-        return self.problem.unknowns.pack(p, np.zeros(self.model.n_coefficients))
 
     def continued(self, guess: Guess, problem: BatchProblem, candidate: Candidate) -> Guess:
         """A guess in the candidate's own parameters."""

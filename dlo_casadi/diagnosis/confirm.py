@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from dlo_casadi.diagnosis.afresh import Start, fit_afresh, start_afresh
+from dlo_casadi.diagnosis.afresh import Start, fit_afresh, origins_of, start_afresh
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.screening import Screened, survival
@@ -74,16 +74,19 @@ def screened_afresh(
     The score is what a candidate gains there, at the noise of a search; without one that starts
     from the measured shapes, too.
     """
-    cable, without = base.model.cable, start_afresh(base, None)
-    found = map_in_order(executor, partial(start_afresh, base), listed)
-    begun = [(item, start) for item, start in zip(listed, found, strict=True) if start is not None]
+    cable, origins = base.model.cable, origins_of(base)
+    without = start_afresh(base, origins, None)
+    containing = [x for x in listed if any(x.contains(other, cable) for other in listed)]
+    simple = [x for x in listed if x not in containing]
+    found = map_in_order(executor, partial(start_afresh, base, origins), simple)
+    begun = list(zip(simple, found, strict=True))
+    for candidate in containing:
+        inside = [(x, start) for x, start in begun if start and candidate.contains(x, cable)]
+        smaller = min(inside, key=lambda pair: pair[1].guess.objective, default=None)
+        begun.append((candidate, start_afresh(base, origins, candidate, smaller)))
     out = []
     for candidate, start in begun:
-        inside = [pair for pair in begun if candidate.contains(pair[0], cable)]
-        if inside:
-            smaller = min(inside, key=lambda pair: pair[1].guess.objective)
-            start = start_afresh(base, candidate, smaller) or start
-        if without is not None:
+        if start is not None and without is not None:
             score = max(2 * (without.guess.objective - start.guess.objective), 0.0)
             p_value = survival(score, len(candidate.frees), np.inf)
             out.append((Screened(candidate, score, p_value, {}), start))

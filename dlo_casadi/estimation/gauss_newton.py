@@ -289,30 +289,27 @@ class BatchProblem:
         return self.linearize_along(point, along)
 
     def linearize_along(
-        self, point: Point, along: Directions, correction: Directions | None = None
+        self, point: Point, along: Directions, correction: Vector | None = None
     ) -> Linearization:
         """Residuals and derivatives for given derivatives of the shapes and parameters.
 
         Parameters
         ----------
-        correction : Directions, optional
-            One column: how the shapes are about to move; the residuals are those afterwards, to
+        correction : Vector, optional
+            How the shapes are about to move, one column; the residuals are those afterwards, to
             first order.
         """
         p, rest = self.unknowns.p(point.theta), self.unknowns.rest(point.theta)
-        seen = self.sweep.observe(point.shapes, p, rest, along)
-        ahead = None
-        if correction is not None:
-            ahead = self.sweep.observe(point.shapes, p, rest, correction)
+        ways = along if correction is None else along.and_step(correction)
+        seen = self.sweep.observe(point.shapes, p, rest, ways)
         out = Linearization([], [], [], [], [], along)
         size, length = self.unknowns.size, self.unknowns.model.cable.length
         for j, s in zip(self.used, point.feet, strict=True):
             (now, change), item = seen.pose(j, length), self.measured[j]
             white = self.whitening(j)
-            d = item.residual(now, s)
-            if ahead is not None:
-                d = d + item.residual_along(now, s, ahead.pose(j, length)[1])[:, 0]
-            directions = item.residual_along(now, s, change)
+            d, directions = item.residual(now, s), item.residual_along(now, s, change)
+            if correction is not None:
+                d, directions = d + directions[:, -1], directions[:, :-1]
             whitened = white @ directions
             out.residuals.append(white @ d)
             out.by_theta.append(whitened[:, :size])

@@ -257,7 +257,7 @@ def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step
     if not np.all(np.isfinite(correction.x)):
         return None
     point = problem.evaluate(theta, shapes, guess.feet)
-    ahead = problem.linearize_along(point, along, _only(along, correction))
+    ahead = problem.linearize_along(point, along, correction)
     gap = theta - problem.mean
     hessian, gradient = problem.precision.copy(), problem.precision @ gap
     objective = float(gap @ gradient) / 2
@@ -296,9 +296,3 @@ def equilibria_near(problem: BatchProblem, guess: Guess) -> Point | None:
         return None
     point = problem.evaluate(guess.theta, shapes, guess.feet)
     return point if np.isfinite(point.objective) else None
-
-
-def _only(along: Directions, step: Vector) -> Directions:
-    """A step of the shapes as one direction, all else still."""
-    p, rest, deviation = (0 * part[..., :1] for part in (along.p, along.rest, along.deviation))
-    return Directions(step.x, step.y, p, rest, deviation)

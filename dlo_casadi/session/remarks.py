@@ -146,7 +146,9 @@ def doubts_of(
 
     Its fit has not converged; or poses are predicted, from their ends alone, worse than UNSEEN
     times what noise, fixtures, parameters and the cable's scatter let expect. Where a cable may
-    fall to either side, a pose on the other one is what its scatter lets expect.
+    fall to either side, a pose on the other one is what its scatter lets expect; where no `branch`
+    names the equilibrium in which a fit pose was measured, it tells of the model what it tells
+    there.
 
     Parameters
     ----------
@@ -161,7 +163,7 @@ def doubts_of(
         )
     for role, said in (("fit", "fit poses"), ("held_out", "held-out poses")):
         errors = {
-            pose.name: _errors(stage.shapes[pose.name], fit.model.cable.length, noise)
+            pose.name: _errors(stage.shapes[pose.name], fit.model.cable.length, noise, role)
             for pose in poses
             if pose.role == role and pose.name in stage.shapes and len(pose.points)
         }
@@ -188,14 +190,18 @@ def doubts_of(
     return tuple(lines)
 
 
-def _errors(shape: PoseShape, length: float, noise: float) -> FloatArray:
+def _errors(shape: PoseShape, length: float, noise: float, role: str) -> FloatArray:
     """Squares (2, K) [m^2] of a pose's distances from its prediction: measured, expected."""
     if shape.spread is None:
         return np.zeros((2, 0))
     if shape.measured_branch is not None and shape.tipping is not None and shape.tipping < EITHER:
         return np.zeros((2, 0))
     across = shape.expected(length, noise).reshape((len(shape.s), -1))
-    return np.stack([(shape.gap**2).sum(axis=1), (across**2).sum(axis=1) + noise**2])
+    expected = (across**2).sum(axis=1) + noise**2
+    there = shape.measured_branch
+    if role == "fit" and there is not None and there.branch is None:
+        return np.stack([np.full_like(expected, there.rmse**2), expected])
+    return np.stack([(shape.gap**2).sum(axis=1), expected])
 
 
 def fit_warnings(fit: Fit, error: float) -> list[str]:
