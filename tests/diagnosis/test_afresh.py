@@ -1,0 +1,81 @@
+"""Where the declared model is astray, an effect is found from the measured shapes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.diagnosis.afresh import fit_afresh, origins_of, start_afresh
+from dlo_casadi.diagnosis.candidates import candidates, setup_of
+from dlo_casadi.diagnosis.confirm import screened_afresh
+from dlo_casadi.effects import BendingAnisotropy, Cable
+from dlo_casadi.estimation.fit import fit_model, fitted_closely
+from dlo_casadi.estimation.gauss_newton import Tolerances
+from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.executors import InProcess
+from dlo_casadi.model import CableModel
+from dlo_casadi.pose import Pose
+
+TRUE = Cable(1.0, 0.08, 0.007, bending_stiffness=0.018, torsional_stiffness=0.007)
+DECLARED = replace(TRUE, bending_stiffness=0.011, torsional_stiffness=0.007)
+HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
+NOISE = 5e-4
+RATIO, ANGLE = 1.9, 0.3
+TRIED = ("bending_anisotropy", "stiffness_gradient", "point_force", "tether")
+
+
+@pytest.fixture(scope="module")
+def base():
+    """The round cable that is declared, fitted to poses of one that is flat."""
+    flat = CableModel(TRUE, 8, "quadratic", n_rest=2, effects=(BendingAnisotropy(),), **HELD)
+    p = flat.nominal.copy()
+    p[flat.names.index("bending_anisotropy.ratio")] = RATIO
+    p[flat.names.index("bending_anisotropy.angle")] = ANGLE
+    rest = flat.rest_basis @ np.array([1.0, 0.6, 0.3, -0.4])
+    rng = np.random.default_rng(4)
+    s = np.linspace(0.02, 0.98, 15) * TRUE.length
+    measured = []
+    for k in range(6):
+        turned = Rotation.from_rotvec(rng.uniform(-0.7, 0.7, 3))
+        way = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3))
+        end = tuple(way.apply([rng.uniform(0.6, 0.85), 0.0, 0.0]))
+        pose = Pose((0.0, 0.0, 0.0), end, end_orientation=tuple(turned.as_quat()))
+        (shape,) = predict_poses(flat, p, rest, [pose])
+        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 3))
+        measured.append(MeasuredPose.of_points(pose, points))
+    round_ = CableModel(DECLARED, 8, "quadratic", n_rest=2, **HELD)
+    return fit_model(round_, measured, Tolerances(), NOISE)
+
+
+def test_a_model_that_misses_the_shapes_is_fitted_to_its_misfit(base):
+    assert base.noise.source == "misfit"
+    assert base.noise.before.std == NOISE
+    assert fitted_closely(base) is base  # nothing that is in it can explain what is left
+
+
+def test_the_effect_comes_nearest_and_is_fitted_to_the_noise(base):
+    listed = [x for x in candidates(base.model, setup_of(base.model, n_poses=6)) if x.name in TRIED]
+    begun = screened_afresh(base, listed, InProcess())
+
+    assert {item.candidate.name for item, _ in begun} == set(TRIED)
+    (first, start), (_, second), *_ = begun
+    assert first.candidate.name == "bending_anisotropy"
+    assert first.p_value < 1e-9
+    assert start.guess.objective < 0.2 * second.guess.objective
+    # A tether begins where the dead force that it may be has ended.
+    objective = {item.candidate.name: start.guess.objective for item, start in begun}
+    assert objective["tether"] < 1.5 * objective["point_force"]
+
+    fit = fitted_closely(fit_afresh(base, start))
+    assert fit.noise.std == NOISE
+    assert fit.value("bending_anisotropy.ratio") == pytest.approx(RATIO, rel=0.03)
+    assert fit.value("bending_anisotropy.angle") == pytest.approx(ANGLE, abs=0.03)
+    assert fit.value("bending_stiffness") == pytest.approx(TRUE.bending_stiffness, rel=0.03)
+    assert fit.chi2_per_dof < 1.3
+
+
+def test_without_an_effect_the_misfit_stays(base):
+    start = start_afresh(base, origins_of(base), None)
+    assert fitted_closely(fit_afresh(base, start)).noise.source == "misfit"
