@@ -92,8 +92,8 @@ def _place(fit: Fit, weight: Candidate) -> float:
     """Arc length [m] at which a weight makes the stiffness most uncertain."""
     _, position = weight.frees
     screen, variances = Screen(fit, [weight]), []
-    for scan in weight.scans:
-        hessian, _, names = screen.normal(scan)
+    for scan in range(len(weight.scans)):
+        hessian, _, names = screen.normal([weight], scan)
         kept = [k for k, name in enumerate(names) if name != position]
         covariance = np.linalg.pinv(hessian[np.ix_(kept, kept)], hermitian=True)
         own = kept.index(names.index(BENDING_STIFFNESS))

@@ -73,33 +73,54 @@ def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
     return model
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Linearized:
-    """The extended model at the fit; moving its candidates along the cable is cheap.
-
-    A local effect that is not there yet changes no shape wherever it is moved: only the
-    derivatives by its own parameters have to be taken again.
-    """
+    """A fit's model with candidates at their nominal values, linearised at the fit."""
 
     problem: BatchProblem
     point: Point
     lin: Linearization
 
-    def move(self, names: tuple[str, ...], p: FloatArray) -> None:
-        """Take the derivatives by the named parameters again, at p."""
-        problem, point = self.problem, self.point
-        unknowns = problem.unknowns
-        rest = unknowns.rest(point.theta)
-        columns = [unknowns.names.index(name) for name in names]
-        slopes = unknowns.slopes(point.theta)[:, columns]
+
+@dataclass(frozen=True)
+class _Moving:
+    """Candidates that are scanned along the cable together, alone in the fit's model.
+
+    A local effect that is not there yet changes no shape wherever it is moved: only the
+    derivatives by its own parameters have to be taken again, without the other candidates.
+    """
+
+    problem: BatchProblem
+    shapes: Shapes
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, fit: Fit, candidates: Sequence[Candidate]) -> _Moving:
+        """Candidates beside a fit."""
+        model = extended(fit, candidates)
+        values, rest_free = fit.values_in(model), fit.problem.unknowns.rest_free
+        problem = fit.problem.of(Unknowns(model, fit.free_in(model), values, rest_free))
+        problem.share_metric(fit.problem)
+        names = tuple(name for candidate in candidates for name in candidate.screened)
+        return cls(problem, carried_shapes(problem, fit), names)
+
+    def by_names(self, fit: Fit, p: FloatArray) -> list[FloatArray]:
+        """Whitened derivatives (R_j, names) of each pose's residuals, at p."""
+        problem, unknowns = self.problem, self.problem.unknowns
+        theta = unknowns.pack(p, fit.coefficients)
+        rest = unknowns.rest(theta)
+        columns = [unknowns.names.index(name) for name in self.names]
+        slopes = unknowns.slopes(theta)[:, columns]
         still = np.zeros((len(rest), len(columns)))
-        shapes = with_springs(problem.sweep, point.shapes, p, rest)
+        shapes = with_springs(problem.sweep, self.shapes, p, rest)
         along = problem.sweep.directions(shapes, p, rest, slopes, still)
         seen = problem.sweep.observe(shapes, p, rest, along)
-        for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
-            now, change = seen.pose(j, self.problem.unknowns.model.cable.length)
+        out: list[FloatArray] = []
+        for j, s in zip(problem.used, fit.point.feet, strict=True):
+            now, change = seen.pose(j, unknowns.model.cable.length)
             moved = problem.measured[j].residual_along(now, s, change)
-            self.lin.by_theta[k][:, columns] = problem.whitening(j) @ moved[:, : len(columns)]
+            out.append(problem.whitening(j) @ moved[:, : len(columns)])
+        return out
 
 
 def with_springs(sweep: Sweep, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Shapes:
@@ -117,13 +138,6 @@ class Screen:
         # Nuisances that are candidates enter twice: with their prior, and free.
         self.free = fit.free_in(self.model)
         self.p = fit.values_in(self.model)
-        # What scans change the derivatives of, within each pose.
-        self.moving = tuple(
-            name
-            for c in self.listed
-            if len(c.scans) > 1 and not isinstance(c.effect, StateEffect)
-            for name in c.screened
-        )
         self.carried = {
             name
             for c in self.listed
@@ -134,9 +148,13 @@ class Screen:
         self.sweep: Sweep | None = None
         self.shapes: Shapes | None = None
         self.still: _Linearized | None = None
+        self.moving: dict[tuple[str, ...], _Moving] = {}
 
-    def normal(self, scan: dict[str, float]) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
-        """Normal equations of the extended model with the scanned parameters set."""
+    def normal(
+        self, active: Sequence[Candidate], k: int
+    ) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+        """Normal equations of the extended model with the active candidates at their scan k."""
+        scan = {name: value for c in active for name, value in c.scans[k].items()}
         p = self.p.copy()
         for name, value in scan.items():
             p[self.model.names.index(name)] = value
@@ -144,10 +162,23 @@ class Screen:
         if self.still is None or self.fit.model.has_state or not self.carried.isdisjoint(scan):
             self.still = self._linearized(p)
         else:
-            self.still.move(self.moving, p)
+            self._move([c for c in active if len(c.scans) > 1], p)
         still = self.still
         normal = still.problem.normal_equations(still.point, still.lin)
         return normal.hessian, normal.gradient, still.problem.unknowns.names
+
+    def _move(self, candidates: Sequence[Candidate], p: FloatArray) -> None:
+        """Take the derivatives by the candidates' parameters again, at p."""
+        assert self.still is not None
+        key = tuple(candidate.name for candidate in candidates)
+        if key not in self.moving:
+            self.moving[key] = _Moving.of(self.fit, candidates)
+        moving = self.moving[key]
+        own = p[[self.model.names.index(name) for name in moving.problem.unknowns.model.names]]
+        columns = [self.still.problem.unknowns.names.index(name) for name in moving.names]
+        found = moving.by_names(self.fit, own)
+        for by_theta, moved in zip(self.still.lin.by_theta, found, strict=True):
+            by_theta[:, columns] = moved
 
     def _linearized(self, p: FloatArray) -> _Linearized:
         problem = self.fit.problem
@@ -177,8 +208,7 @@ class Screen:
             active = [c for c in self.listed if k < len(c.scans)]
             if not active:
                 continue
-            scan = {name: value for c in active for name, value in c.scans[k].items()}
-            hessian, gradient, names = self.normal(scan)
+            hessian, gradient, names = self.normal(active, k)
             for candidate in active:
                 tried = self._score(candidate, k, hessian, gradient, names, noise_dof)
                 known = best.get(candidate.name)

@@ -138,7 +138,8 @@ class NodeCurve:
         """Arc lengths (K,) [m] of the nearest places on the whole curve."""
         grid = np.linspace(0.0, self.length, self.n * per_element + 1)
         line = self.at(grid)
-        square = ((points[:, None, :] - line[None]) ** 2).sum(-1)
+        # Square distances but for those of the points from the origin.
+        square = (line**2).sum(axis=1) - 2 * points @ line.T
         return self.feet(points, grid[square.argmin(axis=1)])
 
     def normals(self, s: FloatArray) -> FloatArray:
