@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from dlo_casadi.ends import EndConditions
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel, SlotNumbers
+from dlo_casadi.lagrangian import SlotNumbers
+from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 

@@ -22,12 +22,13 @@ from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.kernels import kernels_of
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.poses import frame_poses
+from dlo_casadi.composition import EndKind, StartKind
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import JOINT_BOUND
 from dlo_casadi.guesses import guesses
 from dlo_casadi.initial import limited
 from dlo_casadi.ipopt import by_ipopt
-from dlo_casadi.model import CableModel, EndKind, StartKind
+from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 
 FloatArray = NDArray[np.floating]
