@@ -76,7 +76,6 @@ class SlotNumbers:
     shares: ca.SX
 
 
-@dataclass(frozen=True)
 class Lagrangian(Composition):
     """The expressions of a model, in symbols of its own."""
 

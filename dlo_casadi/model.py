@@ -6,7 +6,6 @@ node adds is one CasADi function each, mapped over the cable, see `assembly`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -20,7 +19,6 @@ from dlo_casadi.rod.element import Slot
 from dlo_casadi.rod.in_frame import SlotDerivatives, SlotInFrame
 
 
-@dataclass(frozen=True)
 class CableModel(Lagrangian):
     """An elastic cable between two fixtures, in a plane or in space.
 

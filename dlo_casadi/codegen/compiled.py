@@ -440,7 +440,7 @@ class CompiledSolver(_Compiled[Shape]):
 class CompiledSpaceSolver(_Compiled[SpaceShape]):
     """Equilibria in space by compiled C.
 
-    Parameters, flags and errors are those of `CompiledSolver`; poses are `equilibrium.Pose`, whose
+    Parameters, flags and errors are those of `CompiledSolver`; poses are `pose.Pose`, whose
     branch is not used.
 
     Examples
