@@ -21,7 +21,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from importlib.util import find_spec
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -133,9 +133,9 @@ def compiled(n: int, element: str, repeats: int = 200) -> Method:
     def solve(end: FloatArray) -> tuple[FloatArray, float, dict[str, float]]:
         seconds = []
         for _ in range(repeats):
-            begin = perf_counter()
+            begin = process_time()
             shape = solver.solve(end, branch="ccw")
-            seconds.append(perf_counter() - begin)
+            seconds.append(process_time() - begin)
         return shape.points, float(np.median(seconds)), {}
 
     return solve
@@ -150,9 +150,9 @@ def ipopt(n: int, element: str, repeats: int = 5) -> Method:
     def solve(end: FloatArray) -> tuple[FloatArray, float, dict[str, float]]:
         seconds = []
         for _ in range(repeats):
-            begin = perf_counter()
+            begin = process_time()
             found = solve_equilibrium(model, model.nominal, rest, _pose(end))
-            seconds.append(perf_counter() - begin)
+            seconds.append(process_time() - begin)
         return found.points, float(np.median(seconds)), {}
 
     return solve
@@ -173,7 +173,7 @@ def polygon(n: int, end: FloatArray) -> FloatArray:
 def relax(advance: Callable[[int], FloatArray], step: float) -> tuple[FloatArray, float, int]:
     """Nodes at rest, seconds and steps; `advance(m)` makes m steps and returns the nodes."""
     many = max(1, round(INTERVAL / step))
-    begin, steps, still = perf_counter(), 0, 0
+    begin, steps, still = process_time(), 0, 0
     nodes = advance(0)
     while still < 2:
         before, nodes = nodes, advance(many)
@@ -182,7 +182,7 @@ def relax(advance: Callable[[int], FloatArray], step: float) -> tuple[FloatArray
         if not np.isfinite(fastest) or steps * step > PATIENCE:
             raise RuntimeError(f"not at rest after {steps} steps of {step:.3g} s")
         still = still + 1 if fastest < REST_SPEED else 0
-    return nodes, perf_counter() - begin, steps
+    return nodes, process_time() - begin, steps
 
 
 def missing_elastica() -> str:
