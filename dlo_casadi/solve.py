@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
+from dlo_casadi.composition import COARSE_MESH
 from dlo_casadi.descent import descend
 from dlo_casadi.equilibrium import JOINT_BOUND, NEARBY, Equilibrium, Status, equilibria_of
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.guesses import first_nodes
 from dlo_casadi.ipopt import by_ipopt
-from dlo_casadi.model import COARSE_MESH, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.pose import SIGNS, Pose
 
 FloatArray = NDArray[np.floating]

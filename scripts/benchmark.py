@@ -156,7 +156,7 @@ def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
         counts = {"ok": 0, "wrong": 0, "same": 0, "lower": 0, "higher": 0, "ipopt_failed": 0}
         ipopt = space_ipopt.Ipopt(random_cables.space_problem(rng, 1, 12, element).model)
         worst, total = 0.0, 0.0
-        for _ in range(cables):
+        for cable in range(cables):
             problem = random_cables.space_problem(rng, poses, 12, element)
             shapes, statuses, seconds = solver.solve(problem)
             total += seconds
@@ -165,7 +165,8 @@ def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
                 right, error = random_cables.check_in_space(problem, shapes[i], i)
                 counts["wrong"] += not right
                 worst = max(worst, error)
-            for i in np.flatnonzero(statuses == 0)[: compared // cables]:
+            share = compared * (cable + 1) // cables - compared * cable // cables
+            for i in np.flatnonzero(statuses == 0)[:share]:
                 counts[random_cables.compare_in_space(problem, shapes[i], i, ipopt)] += 1
         out[element] = {
             "problems": cables * poses,

@@ -27,8 +27,8 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from simulated import random_session
 
-from dlo_casadi.assembly import Shapes
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.durable import write_file
@@ -37,7 +37,6 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.rest_scatter import SMOOTHNESS, RestScatter, modes_in
-from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.declared import declared_model
@@ -91,44 +90,21 @@ def simulate(config, generator):
     declared = declared_model(config)
     model = declared.model.with_mesh(40)
     cable = config.cable
-    tolerances = config.experiment.tolerances
-    p = model.nominal.copy()
     weight = cable.mass / cable.length * 9.81
-    p[0] = weight * cable.length**3 * np.exp(generator.uniform(np.log(0.03), np.log(0.6)))
-    for k, q in enumerate(model.parameters):
-        if np.isfinite(q.prior_std) and not q.log:
-            p[k] += q.prior_std * generator.standard_normal()
-    places = model.chain.cells.mean(axis=1) / cable.length
-    rest = sum(
-        generator.normal(0, 0.3) * np.cos(np.pi * k * places) * 2 * np.pi / cable.length
-        for k in range(4)
-    )
-    poses = [conditions(pose) for pose in config.experiment.poses]
-    predictions = predict_poses(model, p, rest, poses)
-    if any(item is None or not item.equilibrium.stable for item in predictions):
-        return None
-    deviation = np.zeros((len(poses), 6))
-    deviation[:, :2] = tolerances.end * generator.standard_normal((len(poses), 2))
-    shapes = Shapes(
-        np.array([item.equilibrium.x for item in predictions]),
-        np.array([item.equilibrium.multipliers for item in predictions]),
-        deviation,
-    )
-    sweep = Sweep(model, poses)
-    shapes, converged = sweep.solve(shapes, p, rest)
-    if not converged.all():
+    stiffness = weight * cable.length**3 * np.exp(generator.uniform(np.log(0.03), np.log(0.6)))
+    found = random_session(config, model, stiffness, generator, 0.3)
+    if found is None:
         return None
     std, share = generator.uniform(1e-4, 4e-4), generator.uniform(0.0, 0.6)
     noise = NoiseModel(std, share, generator.uniform(0.02, 0.04), "gaussian")
     measured = []
-    for pose, seen, own in zip(
-        config.experiment.poses, sweep.seen(shapes, p, rest), poses, strict=True
-    ):
+    for pose, seen in zip(config.experiment.poses, found, strict=True):
         s = np.sort(generator.uniform(0.01, 0.99, 200)) * cable.length
         factor = np.linalg.cholesky(noise.covariance(s, np.ones(len(s))))
         points = seen.curve.at(s) + factor @ generator.standard_normal((len(s), 2))
+        own = conditions(pose)
         measured.append(MeasuredPose.of_points(own, points, held_out=pose.role == "held_out"))
-    return measured, p[0]
+    return measured, stiffness
 
 
 def main() -> None:

@@ -30,8 +30,8 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from simulated import random_session
 
-from dlo_casadi.assembly import Shapes
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.durable import write_file
@@ -39,9 +39,7 @@ from dlo_casadi.effects import EFFECTS
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_intervals
-from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fine_enough, fit_declared
@@ -83,43 +81,19 @@ def simulate(config: Config, generator, hidden: dict[str, dict[str, float]], fac
         True mass over that which the model starts from.
     """
     model = declared_model(config).model.with_mesh(40)
-    cable, tolerances = model.cable, config.experiment.tolerances
+    cable = model.cable
     model = replace(model, cable=replace(cable, mass=factor * cable.mass))
     for name in hidden:
         if name not in [effect.name for effect in model.effects]:
             model = model.with_effect(EFFECTS[name]())
-    p = model.nominal.copy()
-    p[0] = cable.mass * 9.81 * cable.length**2 * generator.uniform(0.1, 0.4)
-    for k, q in enumerate(model.parameters):
-        if np.isfinite(q.prior_std) and not q.log:
-            p[k] += q.prior_std * generator.standard_normal()
-    for name, values in hidden.items():
-        for key, value in values.items():
-            p[model.names.index(f"{name}.{key}")] = value
-    places = model.chain.cells.mean(axis=1) / cable.length
-    rest = sum(
-        generator.normal(0, 0.2) * np.cos(np.pi * k * places) * 2 * np.pi / cable.length
-        for k in range(4)
-    )
-    poses = [conditions(pose) for pose in config.experiment.poses]
-    predictions = predict_poses(model, p, rest, poses)
-    if any(item is None or not item.equilibrium.stable for item in predictions):
-        return None
-    deviation = np.zeros((len(poses), 6))
-    deviation[:, :2] = tolerances.end * generator.standard_normal((len(poses), 2))
-    shapes = Shapes(
-        np.array([item.equilibrium.x for item in predictions]),
-        np.array([item.equilibrium.multipliers for item in predictions]),
-        deviation,
-    )
-    sweep = Sweep(model, poses)
-    shapes, converged = sweep.solve(shapes, p, rest)
-    if not converged.all():
+    stiffness = cable.mass * 9.81 * cable.length**2 * generator.uniform(0.1, 0.4)
+    values = {f"{name}.{key}": x for name, own in hidden.items() for key, x in own.items()}
+    found = random_session(config, model, stiffness, generator, 0.2, values)
+    if found is None:
         return None
     measured = []
-    for pose, seen, own in zip(
-        config.experiment.poses, sweep.seen(shapes, p, rest), poses, strict=True
-    ):
+    for pose, seen in zip(config.experiment.poses, found, strict=True):
+        own = conditions(pose)
         s = np.linspace(0.01, 0.99, 60) * cable.length
         points = seen.curve.at(s) + STD * generator.standard_normal((len(s), 2))
         item = MeasuredPose.of_points(own, points, held_out=pose.role == "held_out")
@@ -131,7 +105,7 @@ def simulate(config: Config, generator, hidden: dict[str, dict[str, float]], fac
         }
         item = MeasuredPose.of_points(own, points, held_out=pose.role == "held_out")
         measured.append(item.with_readings(read))
-    return measured, float(p[0])
+    return measured, stiffness
 
 
 def drawn(config: Config, generator, hidden=None, factor: float = 1.0):

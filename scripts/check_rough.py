@@ -18,6 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
+from beside_truth import stiffness_cell
 
 from dlo_casadi.config import load_config
 from dlo_casadi.session import run_session
@@ -55,9 +56,9 @@ def row(outcome: Outcome, truth: dict[str, Any]) -> tuple[list[str], bool]:
     """One line of the table, and whether all of it is as it should be."""
     stage, exact = outcome.stages[-1], truth["bending_stiffness"]
     stiffness = stage.parameters["bending_stiffness"]
+    bending, inside = stiffness_cell(outcome, "bending_stiffness", exact)
     low, high = stiffness.interval_95 or (None, None)
     known = low is not None and high is not None
-    inside = known and low <= exact <= high
     narrow = known and (high - low) / 2 < NARROW * stiffness.value
     floor = np.hypot(truth["repeat_rms_all_m"] / np.sqrt(2), np.sqrt(2) * truth["marker_noise"])
     held_out = stage.rmse_held_out
@@ -67,12 +68,11 @@ def row(outcome: Outcome, truth: dict[str, Any]) -> tuple[list[str], bool]:
     simple = outcome.stage("stiffness_only")
     worse = simple is not None and (stage.rmse_fit or np.inf) > (simple.rmse_fit or np.inf)
     passed = outcome.verdict == verdict and right and inside and narrow and error and not worse
-    interval = f"{low:.4g} to {high:.4g}" if known else "unbounded"
     spread = outcome.repeatability.expected_spread
     cells = [
         str(outcome.verdict),
         named,
-        f"{stiffness.value:.4g} ({interval}; {exact:g})",
+        bending,
         f"{1e3 * (held_out or np.nan):.2f} (<= {1e3 * ALLOWED * floor:.2f})",
         f"{1e3 * spread:.1f} ({1e3 * truth['repeat_rms_all_m']:.1f})",
         f"{outcome.measurement.std * 1e3:.2f} ({1e3 * truth['marker_noise']:.2f})",

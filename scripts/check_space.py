@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
+from beside_truth import stiffness_cell
 
 from dlo_casadi.config import load_config
 from dlo_casadi.session import run_session
@@ -37,15 +38,6 @@ HIDDEN: dict[str, tuple[str, Any]] = {
 }
 # Parameters are right within so many standard deviations and that share.
 STDS, SHARE = 3.0, 0.25
-
-
-def stiffness(outcome: Outcome, name: str, exact: float) -> tuple[str, bool]:
-    """A stiffness with its interval, and whether the truth lies inside."""
-    found = outcome.stages[-1].parameters[name]
-    low, high = found.interval_95 or (None, None)
-    inside = low is not None and high is not None and low <= exact <= high
-    told = "unbounded" if low is None or high is None else f"{low:.4g} to {high:.4g}"
-    return f"{found.value:.4g} ({told}; {exact:g})", inside
 
 
 def effects(outcome: Outcome, truth: dict[str, Any]) -> tuple[str, bool]:
@@ -79,8 +71,8 @@ def main() -> int:
         spent = time.process_time() - began
         truth = yaml.safe_load((truths / name / "truth.yaml").read_text(encoding="utf-8"))
         named, right = effects(outcome, truth)
-        bending, known = stiffness(outcome, "bending_stiffness", truth["bending_stiffness"])
-        torsion, told = stiffness(outcome, "torsional_stiffness", truth["torsional_stiffness"])
+        bending, known = stiffness_cell(outcome, "bending_stiffness", truth["bending_stiffness"])
+        torsion, told = stiffness_cell(outcome, "torsional_stiffness", truth["torsional_stiffness"])
         verdict = "effect_found" if truth["effects"] else "complete"
         passed = outcome.verdict == verdict and right and known and told
         good, stage = good and passed, outcome.stages[-1]

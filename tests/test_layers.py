@@ -12,7 +12,16 @@ PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 CHAIN = ["errors", "thresholds", "parameters", "rod", "rest", "ends", "effects", "assembly"]
-CHAIN += ["model", "whole_pose", "descent", "initial", "initial_frames", "pose"]
+CHAIN += [
+    "composition",
+    "lagrangian",
+    "model",
+    "whole_pose",
+    "descent",
+    "initial",
+    "initial_frames",
+    "pose",
+]
 CHAIN += ["guesses", "equilibrium", "ipopt", "solve"]
 MECHANICS = set(CHAIN)
 PARALLEL = {"executors", "parallel"}
@@ -25,20 +34,23 @@ MAY_IMPORT: dict[str, set[str]] = {
     "durable": {"errors"},
     "measurements": {"errors", "config", "durable"},
     "vision": {"errors", "durable"},
-    "estimation": MECHANICS | {"config", "measurements"} | PARALLEL,
-    "diagnosis": MECHANICS | {"config", "measurements", "estimation"} | PARALLEL,
-    "codegen": MECHANICS | {"config", "durable"},
+    "estimation": MECHANICS,
+    "diagnosis": MECHANICS | {"estimation"} | PARALLEL,
+    "codegen": MECHANICS | {"durable"},
     "workers": {"vision"},
     "executors": {"durable", "errors", "workers"},
     "parallel": {"errors", "executors", "workers"},
 }
 # A session: what is declared and measured -> stages and findings -> one outcome.
-MAY_IMPORT["session"] = set(MAY_IMPORT)
-MAY_IMPORT["report"] = set(MAY_IMPORT)
+READ = {"config", "measurements", "vision", "workers"}
+MAY_IMPORT["session"] = MECHANICS | READ | {"estimation", "diagnosis"} | PARALLEL
+# A report reads results and solves nothing.
+STATED = set(CHAIN[: CHAIN.index("whole_pose")])
+MAY_IMPORT["report"] = STATED | READ | {"durable", "estimation", "diagnosis", "session"}
 MAY_IMPORT["shape_table"] = MECHANICS | {"codegen", "durable", "parallel"}
-MAY_IMPORT["fleet"] = set(MAY_IMPORT)
+MAY_IMPORT["fleet"] = {"errors", "config", "durable", "workers", "session", "report"} | PARALLEL
 MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}
-MAY_IMPORT["api"] = set(MAY_IMPORT)
+MAY_IMPORT["api"] = {"errors", "config", "pose", "prediction", "session", "report"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 

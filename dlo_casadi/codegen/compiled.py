@@ -67,7 +67,13 @@ def slope_record(model: CableModel) -> np.dtype[Any]:
     n, k = model.n, model.chain.n_nodes
     if not model.in_space:
         return np.dtype(
-            [("points", float, (n + 1, 2, 4)), ("headings", float, (k, 4)), ("lam", float, (2, 4))]
+            [
+                ("points", float, (n + 1, 2, 4)),
+                ("headings", float, (k, 4)),
+                ("lam", float, (2, 4)),
+                ("moments", float, (2, 4)),
+                ("min_bend_radius", float, 4),
+            ]
         )
     return np.dtype(
         [
@@ -428,13 +434,13 @@ class CompiledSolver(_Compiled[Shape]):
         """
         pose = one_pose(end, start, headings)
         found = self._derived(shape, pose)
-        return Slope(found["points"], found["headings"], found["lam"])
+        return Slope(**{name: found[name] for name in self._slope.names or ()})
 
 
 class CompiledSpaceSolver(_Compiled[SpaceShape]):
     """Equilibria in space by compiled C.
 
-    Parameters, flags and errors are those of `CompiledSolver`; poses are `equilibrium.Pose`, whose
+    Parameters, flags and errors are those of `CompiledSolver`; poses are `pose.Pose`, whose
     branch is not used.
 
     Examples

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from dlo_casadi.ends import EndConditions
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel, SlotNumbers
+from dlo_casadi.lagrangian import SlotNumbers
+from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -105,6 +106,11 @@ class Kernels:
         )
         return sum(counts)
 
+    @property
+    def code_size(self) -> int:
+        """Bytes of their machine code, about."""
+        return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.slots))
+
     def loops(self, call: str, table_at: int = 0) -> list[str]:
         """Statements that call all kernels, `table_at` after the start of the solver's table.
 
@@ -128,6 +134,14 @@ class Kernels:
             functions.append(_ends_text(self.ends))
             loops.append("    total += at_ends(q, table);")
         return with_helpers(functions), "\n".join(loops)
+
+
+def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
+    """Bytes of a compiled solver, about: of its own code and kernels, and its table.
+
+    Of 13 solvers in the plane and in space, with gcc 12 -O2 on x86-64, it is within 8 %.
+    """
+    return 25_000 + sum(kernels.code_size for kernels in meshes) + 8 * len(numbers)
 
 
 def with_helpers(functions: Sequence[str]) -> str:

@@ -116,12 +116,15 @@ class ShapePath(Generic[S_co]):
 class Slope:
     """Derivatives by (end x, end y, start heading, end heading), last index.
 
-    `points` (n + 1, 2, 4), `headings` (n_nodes, 4), `lam` (2, 4).
+    `points` (n + 1, 2, 4), `headings` (n_nodes, 4), `lam` (2, 4), `moments` (2, 4),
+    `min_bend_radius` (4,).
     """
 
     points: FloatArray
     headings: FloatArray
     lam: FloatArray
+    moments: FloatArray
+    min_bend_radius: FloatArray
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from dlo_casadi.codegen.kernels import (
     Kernels,
     c_number,
     kernels_of,
+    size_of_code,
     statements,
     table_to_c,
     with_helpers,
@@ -123,6 +124,16 @@ def numbers_of(
     return [*rows, *_extra(model, p, rest)]
 
 
+def _most_steps(model: CableModel) -> int:
+    """Newton steps of a cold solve after a warm start in vain; the template checks the number.
+
+    Each first guess is descended from on the coarse mesh, from its minimum on the fine mesh, and
+    should all that be in vain, on the fine mesh from the start; a descent takes 80 steps.
+    """
+    guesses = 3 if model.end == "free" else 8
+    return (1 + 3 * guesses) * 80
+
+
 def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> dict[str, str]:
     """What the marks of the templates stand for."""
     meshes, count = meshes_of(model, p, rest, inline), coarse_elements(model)
@@ -143,15 +154,18 @@ def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> 
         call = f"{name}_{{k}}(w->x + 4 * j, w->lam, {{row}}, table, w->slot + SLOT * j)"
         loops[name] = "\n".join(kernels.loops(call, at))
         at += len(kernels.table)
+    numbers = numbers_of(model, p, rest, meshes)
     return {
         "LENGTH": c_number(float(model.held(p, 0, 0)[1])),
         "WORKSPACE": str(_NUMBERS * (model.n + 1) + 4 * _COARSE_SHAPES * (count + 1)),
         "COARSE": str(count),
         "REACHES": str(int(not model.extensible)),
-        "TABLE": table_to_c(numbers_of(model, p, rest, meshes)),
+        "TABLE": table_to_c(numbers),
         "EXTRA": str(at),
         # Elimination and solution: about 500 operations a node.
         "OPERATIONS": str(meshes["kernel"].operations + 500 * (model.n + 1)),
+        "STEPS": str(_most_steps(model)),
+        "CODE": str(size_of_code(meshes.values(), numbers)),
         "KERNELS": with_helpers(functions),
         "LOOPS": loops["kernel"],
         "COARSE_LOOPS": re.sub("^", "    ", loops.get("coarse_kernel", ""), flags=re.MULTILINE),

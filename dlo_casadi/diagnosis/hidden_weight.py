@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
+from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.effects import Load
@@ -20,7 +21,6 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import BENDING_STIFFNESS
 from dlo_casadi.thresholds import NORMAL_95
 
 # Weights that are tried in turn, over the cable's own: until one does not fit.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Shapes
+from dlo_casadi.composition import END_ROLL, STIFFNESSES
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
 from dlo_casadi.estimation.hyperparameters import (
@@ -24,7 +25,7 @@ from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import END_ROLL, STIFFNESSES, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.solve import continued, solve_equilibrium
 from dlo_casadi.thresholds import DIFFERENT
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.composition import BENDING_STIFFNESS, STIFFNESSES
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.gauss_newton import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import BENDING_STIFFNESS, STIFFNESSES
 from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, SYSTEMATIC_SHARE
 
 FloatArray = NDArray[np.floating]

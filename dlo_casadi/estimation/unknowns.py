@@ -8,7 +8,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.model import STIFFNESS_RATIO_STD, STIFFNESSES, CableModel
+from dlo_casadi.composition import STIFFNESS_RATIO_STD, STIFFNESSES
+from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dlo_casadi.composition import STIFFNESSES
 from dlo_casadi.config import (
     MESH,
     REST_COEFFICIENTS,
@@ -35,7 +36,7 @@ from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.band import Uncertainty
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import STIFFNESSES, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.parameters import Parameter
 from dlo_casadi.report.json_report import finite
 from dlo_casadi.rod.chain import ELEMENTS

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.config import Config
 from dlo_casadi.config import Pose as DeclaredPose
 from dlo_casadi.ends import reaction_rows
@@ -16,7 +17,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import BENDING_STIFFNESS, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.session.declared import declared_model, straight
 from dlo_casadi.session.hanging import pulled_elsewhere
 from dlo_casadi.session.headings import wrong_headings

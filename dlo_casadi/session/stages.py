@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.composition import END_ROLL
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.algorithm1 import Algorithm1Result
@@ -23,7 +24,7 @@ from dlo_casadi.estimation.prediction import (
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
-from dlo_casadi.model import END_ROLL, CableModel
+from dlo_casadi.model import CableModel
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.session.outcome import (
     MASS,

@@ -21,7 +21,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from importlib.util import find_spec
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -133,9 +133,9 @@ def compiled(n: int, element: str, repeats: int = 200) -> Method:
     def solve(end: FloatArray) -> tuple[FloatArray, float, dict[str, float]]:
         seconds = []
         for _ in range(repeats):
-            begin = perf_counter()
+            begin = process_time()
             shape = solver.solve(end, branch="ccw")
-            seconds.append(perf_counter() - begin)
+            seconds.append(process_time() - begin)
         return shape.points, float(np.median(seconds)), {}
 
     return solve
@@ -150,9 +150,9 @@ def ipopt(n: int, element: str, repeats: int = 5) -> Method:
     def solve(end: FloatArray) -> tuple[FloatArray, float, dict[str, float]]:
         seconds = []
         for _ in range(repeats):
-            begin = perf_counter()
+            begin = process_time()
             found = solve_equilibrium(model, model.nominal, rest, _pose(end))
-            seconds.append(perf_counter() - begin)
+            seconds.append(process_time() - begin)
         return found.points, float(np.median(seconds)), {}
 
     return solve
@@ -173,7 +173,7 @@ def polygon(n: int, end: FloatArray) -> FloatArray:
 def relax(advance: Callable[[int], FloatArray], step: float) -> tuple[FloatArray, float, int]:
     """Nodes at rest, seconds and steps; `advance(m)` makes m steps and returns the nodes."""
     many = max(1, round(INTERVAL / step))
-    begin, steps, still = perf_counter(), 0, 0
+    begin, steps, still = process_time(), 0, 0
     nodes = advance(0)
     while still < 2:
         before, nodes = nodes, advance(many)
@@ -182,12 +182,47 @@ def relax(advance: Callable[[int], FloatArray], step: float) -> tuple[FloatArray
         if not np.isfinite(fastest) or steps * step > PATIENCE:
             raise RuntimeError(f"not at rest after {steps} steps of {step:.3g} s")
         still = still + 1 if fastest < REST_SPEED else 0
-    return nodes, perf_counter() - begin, steps
+    return nodes, process_time() - begin, steps
 
 
 def missing_elastica() -> str:
     """What is missing for PyElastica, or nothing."""
     return "" if find_spec("elastica") else "PyElastica is not installed; try the extra `peers`"
+
+
+def relax_rod(
+    rod: Any,
+    held: dict[str, tuple[int, ...]],
+    damping: float,
+    step: float,
+    gravity: tuple[float, float, float],
+) -> tuple[FloatArray, float, int]:
+    """Nodes (n + 1, 3) of PyElastica's rod at rest, what is `held` fixed; seconds and steps."""
+    import elastica as ea
+
+    class Simulator(
+        ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping
+    ):  # its features are mixed in by inheritance
+        pass
+
+    simulator = Simulator()
+    simulator.append(rod)
+    simulator.constrain(rod).using(ea.FixedConstraint, **held)
+    simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=np.array(gravity))
+    simulator.dampen(rod).using(
+        ea.AnalyticalLinearDamper, uniform_damping_constant=damping, time_step=step
+    )
+    simulator.finalize()
+    stepper, time = ea.PositionVerlet(), 0.0
+
+    def advance(many: int) -> FloatArray:
+        nonlocal time
+        for _ in range(many):
+            time = stepper.step(simulator, time, step)
+        return np.array(rod.position_collection.T)
+
+    advance(1)  # compiles
+    return relax(advance, step)
 
 
 def elastica(n: int) -> Method:
@@ -198,11 +233,6 @@ def elastica(n: int) -> Method:
     # The shear mode of an element on its own small rotary inertia limits explicit steps.
     shear = MODULUS / 3
     step = COURANT * 2 / np.sqrt(shear * AREA / (density * SECOND_MOMENT))
-
-    class Simulator(
-        ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping
-    ):  # its features are mixed in by inheritance
-        pass
 
     def solve(end: FloatArray) -> tuple[FloatArray, float, dict[str, float]]:
         phi = polygon(n, end)
@@ -221,28 +251,11 @@ def elastica(n: int) -> Method:
             position=nodes,
             directors=directors,
         )
-        simulator = Simulator()
-        simulator.append(rod)
-        simulator.constrain(rod).using(ea.FixedConstraint, constrained_position_idx=(0, -1))
-        simulator.add_forcing_to(rod).using(
-            ea.GravityForces, acc_gravity=np.array([0.0, GRAVITY, 0.0])
-        )
-        simulator.dampen(rod).using(
-            ea.AnalyticalLinearDamper, uniform_damping_constant=UNIFORM_DAMPING, time_step=step
-        )
-        simulator.finalize()
-        stepper, time = ea.PositionVerlet(), 0.0
-
-        def advance(many: int) -> FloatArray:
-            nonlocal time
-            for _ in range(many):
-                time = stepper.step(simulator, time, step)
-            return rod.position_collection[:2].T.copy()
-
-        advance(1)  # compiles
-        found, seconds, steps = relax(advance, step)
+        held = {"constrained_position_idx": (0, -1)}
+        found, seconds, steps = relax_rod(rod, held, UNIFORM_DAMPING, step, (0.0, GRAVITY, 0.0))
         stretch = float(np.abs(rod.dilatation - 1).max())
-        return found, seconds, {"steps": steps, "simulated_s": steps * step, "stretch": stretch}
+        told = {"steps": steps, "simulated_s": steps * step, "stretch": stretch}
+        return found[:, :2], seconds, told
 
     return solve
 

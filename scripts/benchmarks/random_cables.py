@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import weakref
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
 
@@ -22,12 +23,13 @@ from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.kernels import kernels_of
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.poses import frame_poses
+from dlo_casadi.composition import EndKind, StartKind
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import JOINT_BOUND
 from dlo_casadi.guesses import guesses
 from dlo_casadi.initial import limited
 from dlo_casadi.ipopt import by_ipopt
-from dlo_casadi.model import CableModel, EndKind, StartKind
+from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 
 FloatArray = NDArray[np.floating]
@@ -64,6 +66,11 @@ class Problem:
     headings: FloatArray
 
     @property
+    def p(self) -> FloatArray:
+        """The cable's parameters."""
+        return self.model.nominal
+
+    @property
     def table(self) -> FloatArray:
         """All poses as the C solver takes them."""
         poses = np.zeros((len(self.ends), 6))
@@ -86,6 +93,7 @@ class SpaceProblem:
     """One random cable in space between two clamps."""
 
     model: CableModel
+    p: FloatArray
     rest: FloatArray
     poses: tuple[Pose, ...]
 
@@ -93,6 +101,13 @@ class SpaceProblem:
     def table(self) -> FloatArray:
         """All poses as the C solver takes them."""
         return frame_poses(self.poses)
+
+
+@lru_cache
+def _unit_cable(n: int, element: str) -> CableModel:
+    """A cable of 1 m in space: cables that differ in their stiffness share its functions."""
+    cable = Cable(1.0, 0.1, 0.01, 1.0, torsional_stiffness=1.0)
+    return CableModel(cable, n, element, "clamped", "clamped", (0.0, 0.0, -9.81))  # type: ignore[arg-type]
 
 
 def space_problem(
@@ -104,11 +119,10 @@ def space_problem(
     chords of any direction to gravity from 0.5 to 0.9 L, both ends turned by up to 60 degrees
     against the chord, the end rolled by up to 180 degrees and twisted by up to two turns more.
     """
-    mass = 0.1
-    stiffness = 9.81 * mass * np.exp(rng.uniform(np.log(0.003), np.log(30.0)))
-    cable = Cable(1.0, mass, 0.01, stiffness, torsional_stiffness=stiffness / rng.uniform(0.7, 3.0))
-    gravity = (0.0, 0.0, -9.81)
-    model = CableModel(cable, n, element, "clamped", "clamped", gravity)
+    model = _unit_cable(n, element)
+    weight = 9.81 * model.cable.mass
+    stiffness = weight * np.exp(rng.uniform(np.log(0.003), np.log(30.0)))
+    p = np.array([stiffness, stiffness / rng.uniform(0.7, 3.0), 0.0])
     rest = model.rest_basis @ rng.normal(size=model.n_coefficients)
     bends = np.linalg.norm(model.chain.curvatures(rest), axis=0) / n
     rest *= rng.uniform(0.0, np.pi) / bends.sum()
@@ -127,7 +141,7 @@ def space_problem(
                 turns=float(rng.integers(-2, 3)),
             )
         )
-    return SpaceProblem(model, rest, tuple(found))
+    return SpaceProblem(model, p, rest, tuple(found))
 
 
 def _tilted(rng: np.random.Generator) -> Rotation:
@@ -144,7 +158,7 @@ def _is_minimum(
     The error is in m or rad; stability is that of all eigenvalues of the whole matrix.
     """
     model = problem.model
-    given = Given.of(model.nominal, problem.rest, problem.poses[i].vector[None])
+    given = Given.of(problem.p, problem.rest, problem.poses[i].vector[None])
     shapes = Shapes.declared(frames[None], lam[None])
     _, slope, matrix = model.assembly.balance(shapes, given)
     scale = float(matrix.scale[0])
@@ -169,16 +183,15 @@ def compare_in_space(problem: SpaceProblem, shape: NDArray[np.void], i: int, ipo
 
     IPOPT also ends at saddles, also of the unknowns inside elements: those do not count.
     """
-    model = problem.model
     minima = [
         found.energy
-        for found in ipopt.solve(model.nominal, problem.rest, problem.poses[i])
+        for found in ipopt.solve(problem.p, problem.rest, problem.poses[i])
         if _is_minimum(problem, i, found.frames, found.multipliers)[0]
     ]
     if not minima:
         return "ipopt_failed"
-    cable = model.cable
-    slack = 1e-6 * (cable.bending_stiffness / cable.length + 9.81 * cable.mass * cable.length)
+    cable = problem.model.cable
+    slack = 1e-6 * (problem.p[0] / cable.length + 9.81 * cable.mass * cable.length)
     if abs(shape["energy"] - min(minima)) <= slack:
         return "same"
     return "lower" if shape["energy"] < min(minima) else "higher"
@@ -249,7 +262,7 @@ class AnyCable:
 
     def __init__(self, problem: Problem | SpaceProblem, flags: tuple[str, ...] = ("-O2",)) -> None:
         model = problem.model
-        source = generate(model, model.nominal, problem.rest, inline=False)
+        source = generate(model, problem.p, problem.rest, inline=False)
         texts = dict(source.files)
         texts["dlo_solver.c"] += _WITH_TABLE
         self._source = replace(source, files=texts)
@@ -265,12 +278,10 @@ class AnyCable:
 
     def table(self, problem: Problem | SpaceProblem) -> FloatArray:
         """Numbers of a cable, laid out as the compiled code expects."""
-        model, rest = problem.model, problem.rest
-        if model.in_space:
-            meshes = space.meshes_of(model, model.nominal, rest, inline=False)
-            return np.array(space.numbers_of(model, model.nominal, rest, meshes))
-        kernels = kernels_of(model, model.nominal, rest, inline=False)
-        return np.array(plane.numbers_of(model, model.nominal, rest, kernels))
+        given = problem.model, problem.p, problem.rest
+        if problem.model.in_space:
+            return np.array(space.numbers_of(*given, space.meshes_of(*given, inline=False)))
+        return np.array(plane.numbers_of(*given, kernels_of(*given, inline=False)))
 
     def solve(
         self,

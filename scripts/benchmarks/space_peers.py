@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.peers import COURANT, missing_elastica, missing_mujoco, relax
+from benchmarks.peers import COURANT, missing_elastica, missing_mujoco, relax, relax_rod
 from benchmarks.space_ipopt import Ipopt
 from benchmarks.space_speed import CABLE, FINE, Timed, problem, reference
 from dlo_casadi.guesses import guessed_frames
@@ -34,9 +34,9 @@ FloatArray = NDArray[np.floating]
 RADIUS = CABLE.diameter / 2
 AREA, SECOND_MOMENT = np.pi * RADIUS**2, np.pi * RADIUS**4 / 4
 YOUNG = CABLE.bending_stiffness / SECOND_MOMENT
-TWIST = 0.011  # N m^2, of that cable
+TWIST = CABLE.torsional_stiffness  # [N m^2]
 SHEAR = TWIST / (2 * SECOND_MOMENT)
-GRAVITY = np.array([0.0, 0.0, -9.81])
+GRAVITY = (0.0, 0.0, -9.81)
 # Damping [1/s] of PyElastica, and of a joint in MuJoCo relative to its stiffness [s]: by hand.
 UNIFORM_DAMPING, JOINT_DAMPING = 20.0, 0.1
 
@@ -125,9 +125,6 @@ def elastica(n: int) -> Method:
     # The shear mode of an element on its own small rotary inertia limits explicit steps.
     step = COURANT * 2 / np.sqrt(SHEAR * AREA / (density * SECOND_MOMENT))
 
-    class Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping):
-        pass
-
     def solve(pose: Pose, fine: FloatArray) -> tuple[FloatArray, float]:
         start = start_at(pose, n, fine)
         # Their third director is along the rod.
@@ -140,27 +137,9 @@ def elastica(n: int) -> Method:
             position=start.nodes.T.copy(),
             directors=directors.copy(),
         )
-        simulator = Simulator()
-        simulator.append(rod)
-        simulator.constrain(rod).using(
-            ea.FixedConstraint, constrained_position_idx=(0, -1), constrained_director_idx=(0, -1)
-        )
-        simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=GRAVITY)
-        simulator.dampen(rod).using(
-            ea.AnalyticalLinearDamper, uniform_damping_constant=UNIFORM_DAMPING, time_step=step
-        )
-        simulator.finalize()
-        stepper, time = ea.PositionVerlet(), 0.0
-
-        def advance(many: int) -> FloatArray:
-            nonlocal time
-            for _ in range(many):
-                time = stepper.step(simulator, time, step)
-            return rod.position_collection.T.copy()
-
-        advance(1)  # compiles
-        found, seconds, _ = relax(advance, step)
-        return found, seconds
+        ends = (0, -1)
+        held = {"constrained_position_idx": ends, "constrained_director_idx": ends}
+        return relax_rod(rod, held, UNIFORM_DAMPING, step, GRAVITY)[:2]
 
     return solve
 

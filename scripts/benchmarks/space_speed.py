@@ -63,7 +63,7 @@ def problem(n: int, element: str, bent: float = 1.0) -> SpaceProblem:
     poses = tuple(
         Pose(start, end, start_orientation=first, end_orientation=last) for end, last in ENDS
     )
-    return SpaceProblem(model, rest, poses)
+    return SpaceProblem(model, model.nominal, rest, poses)
 
 
 @lru_cache(maxsize=2)

@@ -109,8 +109,10 @@ def test_clamps_that_give_way(element, end):
     slope, d = solver.sensitivity(shape, place, headings=CLAMPS), 1e-5
     for k in (0, 1) if end == "clamped" else (0,):
         moved = [np.array(CLAMPS, dtype=float) + d * side * np.eye(2)[k] for side in (1, -1)]
-        ahead, back = (solver.solve(place, headings=tuple(both)).points for both in moved)
-        assert slope.points[..., 2 + k] == pytest.approx((ahead - back) / (2 * d), abs=1e-6)
+        ahead, back = (solver.solve(place, headings=tuple(both)) for both in moved)
+        for name in ("points", "moments"):
+            change = (getattr(ahead, name) - getattr(back, name)) / (2 * d)
+            assert getattr(slope, name)[..., 2 + k] == pytest.approx(change, abs=1e-6)
 
 
 def test_clamps_in_space_that_give_way_are_refused():

@@ -185,10 +185,13 @@ def test_sensitivities_are_central_differences(element, start, end, effects):
         for sign in (1, -1):
             to = pose + sign * step * np.eye(4)[k]
             moved.append(solver.solve(to[:2], headings=to[2:], warm=shape))
-        for name in ("points", "headings", "lam"):
+        for name in ("points", "headings", "lam", "moments", "min_bend_radius"):
             expected = (getattr(moved[0], name) - getattr(moved[1], name)) / (2 * step)
             size = max(np.abs(getattr(slope, name)).max(), 1e-12)
             assert np.abs(getattr(slope, name)[..., k] - expected).max() < 1e-6 * size, (k, name)
+        rise = (moved[0].energy - moved[1].energy) / (2 * step)
+        if k >= 2:
+            assert rise == pytest.approx(-shape.moments[k - 2], abs=1e-6)
 
 
 @pytest.mark.parametrize("solver", ["links", "clamped"])

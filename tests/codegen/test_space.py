@@ -4,12 +4,18 @@ import ctypes
 import re
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+
+from benchmarks import memory
 
 from dlo_casadi.codegen import STATUSES, CompiledSpaceSolver, generate
 from dlo_casadi.codegen.library import compile_library
@@ -397,9 +403,20 @@ def test_compiles_without_a_warning_and_with_another_prefix(tmp_path, compiler, 
     assert "bend radius" in shown.stdout
 
 
+def test_sanitizers_and_threads_with_a_workspace_each_are_silent(tmp_path):
+    """scripts/benchmark.py --only memory runs more, under valgrind, too."""
+    generate(*problem("arc", 6)).write(tmp_path)
+    shutil.copy(memory.HERE / "memory.c", tmp_path)
+    flags = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    assert memory.build_and_run(tmp_path, flags, [], 5, threads=8).startswith("silent")
+
+
 def test_links_nothing_but_libm(tmp_path):
     generate(*problem(n=8, effects=(AxialStretch(),))).write(tmp_path)
-    subprocess.run(["cc", "-O1", "-c", "dlo_solver.c"], cwd=tmp_path, check=True)
+    subprocess.run(["cc", "-O2", "-c", "dlo_solver.c"], cwd=tmp_path, check=True)
+    size = subprocess.run(["size", "dlo_solver.o"], cwd=tmp_path, capture_output=True, text=True)
+    told = re.search(r"CODE_SIZE (\d+)", (tmp_path / "dlo_solver.h").read_text())
+    assert int(size.stdout.splitlines()[1].split()[0]) == pytest.approx(int(told[1]), rel=0.15)
     names = subprocess.run(["nm", "dlo_solver.o"], cwd=tmp_path, capture_output=True, text=True)
     needed = set(re.findall(r" U (\w+)", names.stdout))
     allowed = {"sin", "cos", "sincos", "sqrt", "atan2", "ceil", "memset", "memcpy", "memmove"}

@@ -1,0 +1,66 @@
+"""Random cables in the poses of a configuration, for the scripts that count what is found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.assembly import Shapes
+from dlo_casadi.config import Config
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.sensors import Observed
+from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.model import CableModel
+from dlo_casadi.session.measure import conditions
+
+# Waves of the rest curvature along the cable.
+WAVES = 4
+
+
+def random_session(
+    config: Config,
+    model: CableModel,
+    stiffness: float,
+    generator: np.random.Generator,
+    curvature: float,
+    hidden: Mapping[str, float] | None = None,
+) -> list[Observed] | None:
+    """What sensors see of each pose; None where one has no stable equilibrium.
+
+    What a model has within tolerances, its rest curvature and the ends of each pose are drawn.
+
+    Parameters
+    ----------
+    stiffness : float [N m^2]
+    curvature : float [turns]
+        Standard deviation of each wave of the rest curvature, over the length.
+    hidden : mapping, optional
+        Values of other parameters by their qualified names.
+    """
+    p = model.nominal.copy()
+    p[0] = stiffness
+    for k, q in enumerate(model.parameters):
+        if np.isfinite(q.prior_std) and not q.log:
+            p[k] += q.prior_std * generator.standard_normal()
+    for name, value in (hidden or {}).items():
+        p[model.names.index(name)] = value
+    length = model.cable.length
+    places = model.chain.cells.mean(axis=1) / length
+    waves: NDArray[np.floating] = np.cos(np.pi * np.arange(WAVES)[:, None] * places)
+    rest = generator.normal(0, curvature, WAVES) @ waves * 2 * np.pi / length
+    poses = [conditions(pose) for pose in config.experiment.poses]
+    found = [item for item in predict_poses(model, p, rest, poses) if item is not None]
+    if len(found) < len(poses) or not all(item.equilibrium.stable for item in found):
+        return None
+    deviation = np.zeros((len(poses), len(model.deviation_names)))
+    deviation[:, :2] = config.experiment.tolerances.end * generator.standard_normal((len(poses), 2))
+    shapes = Shapes(
+        np.array([item.equilibrium.x for item in found]),
+        np.array([item.equilibrium.multipliers for item in found]),
+        deviation,
+    )
+    sweep = Sweep(model, poses)
+    shapes, converged = sweep.solve(shapes, p, rest)
+    return sweep.seen(shapes, p, rest) if converged.all() else None
