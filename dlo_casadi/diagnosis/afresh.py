@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Shapes
+from dlo_casadi.composition import END_ROLL
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.fit import (
     FIRST_LOOK,
@@ -29,7 +30,7 @@ from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import END_ROLL, CableModel
+from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 

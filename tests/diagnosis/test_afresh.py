@@ -37,7 +37,7 @@ def base():
     rng = np.random.default_rng(4)
     s = np.linspace(0.02, 0.98, 15) * TRUE.length
     measured = []
-    for k in range(6):
+    for _ in range(6):
         turned = Rotation.from_rotvec(rng.uniform(-0.7, 0.7, 3))
         way = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3))
         end = tuple(way.apply([rng.uniform(0.6, 0.85), 0.0, 0.0]))
