@@ -441,7 +441,9 @@ def _effect_lines(effect: dict[str, Any]) -> list[str]:
     values = ", ".join(_quantity(name, row) for name, row in effect["parameters"].items())
     line = f"  {effect['name']}: {values}"
     if effect["p_value"] is not None:
-        line += f" (p = {effect['p_value']:.1g})"
+        # Below the smallest double it is zero.
+        p_value = effect["p_value"]
+        line += f" (p = {p_value:.1g})" if p_value > 0 else " (p < 1e-307)"
     lines = [line]
     rivals = effect["indistinguishable_from"]
     if rivals:

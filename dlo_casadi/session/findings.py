@@ -22,7 +22,7 @@ def _effect_row(item: AddedEffect, fit: Fit) -> dict[str, Any]:
         "name": item.candidate.name,
         "parameters": effect_parameters(fit, item.candidate.effect),
         "p_value": item.p_value,
-        "rmse_cross_validated_before": item.before.rmse,
+        "rmse_cross_validated_before": item.before.rmse if item.before.complete else None,
         "rmse_cross_validated_after": item.after.rmse,
         "indistinguishable_from": list(
             dict.fromkeys([*(rival.candidate.name for rival in item.rivals), *item.equivalents])
