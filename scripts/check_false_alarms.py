@@ -1,7 +1,7 @@
 """False alarms of the diagnosis on simulated sessions with nothing hidden.
 
     python scripts/check_false_alarms.py [--sets 300] [--seed 0] [--jobs N] [--output FILE]
-                                         [--scatter]
+                                         [--scatter | --space]
 
 Each set takes the cable and the poses of a bench session, a new smooth rest curvature and
 stiffness, fixtures, length and scale drawn from their tolerances, and noise that is partly
@@ -12,6 +12,9 @@ interval is counted, too.
 With --scatter the sets are heavy cables in a gripper with a free tip instead, seen at two to four
 markers with 1.5 to 2.5 mm of noise, and every hanging has a smooth random rest curvature of its
 own, of 0.1 to 0.3 1/m.
+
+With --space they are random cables between two grippers in space, 40 points a line with white
+noise; how often GJ lies in its interval is counted, too.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from simulated import random_session
 
 from dlo_casadi.config import load_config
@@ -107,20 +111,66 @@ def simulate(config, generator):
     return measured, stiffness
 
 
+def spatial(config, generator):
+    """A cable in space with nothing hidden: configuration, poses, EI, GJ."""
+    length, mass = generator.uniform(0.5, 1.0), generator.uniform(0.03, 0.12)
+    bending = mass * 9.81 * length**2 * np.exp(generator.uniform(np.log(0.03), np.log(0.3)))
+    torsion = bending * generator.uniform(0.5, 0.9)
+    prior = bending * np.exp(generator.uniform(-0.7, 0.7))
+    own = {"length": length, "mass": mass, "bending_stiffness": prior, "torsional_stiffness": None}
+    config = replace(config, cable=config.cable.model_copy(update=own))
+    model = declared_model(config).model.with_mesh(24)
+    p = model.nominal.copy()
+    for k, q in enumerate(model.parameters):
+        if np.isfinite(q.prior_std) and not q.log:
+            p[k] += q.prior_std * generator.standard_normal()
+    p[:2] = bending, torsion
+    places = model.chain.cells.mean(axis=1) / length
+    waves = np.cos(np.pi * np.arange(3)[:, None] * places)
+    bends = generator.normal(0.0, 0.1, (2, 3)) @ waves * 2 * np.pi / length
+    rest = np.concatenate([np.zeros(len(places)), *bends])
+    start = Rotation.from_rotvec(generator.uniform(-0.6, 0.6, 3))
+    s, std = np.linspace(0.02, 0.98, 40) * length, generator.uniform(2e-4, 1e-3)
+    measured = []
+    while len(measured) < 10:
+        way = start * Rotation.from_rotvec(generator.uniform(-0.5, 0.5, 3))
+        end = way.apply([generator.uniform(0.55, 0.85) * length, 0.0, 0.0])
+        turned = start * Rotation.from_rotvec(generator.uniform(-0.7, 0.7, 3))
+        held = Pose(
+            (0.0, 0.0, 0.0),
+            tuple(end),
+            start_orientation=tuple(start.as_quat()),
+            end_orientation=tuple(turned.as_quat()),
+            name=f"pose_{len(measured):02d}",
+        )
+        slip = turned * Rotation.from_rotvec(2e-3 * generator.standard_normal(3))
+        moved = tuple(end + 1e-4 * generator.standard_normal(3))
+        true = replace(held, end=moved, end_orientation=tuple(slip.as_quat()))
+        found = predict_poses(model, p, rest, [true])[0]
+        if found is None or not found.equilibrium.stable:
+            continue
+        points = found.curve.at(s) + std * generator.standard_normal((len(s), 3))
+        out = len(measured) % 5 == 4
+        measured.append(MeasuredPose.of_points(held, points, held_out=out))
+    return config, measured, bending, torsion
+
+
 def main() -> None:
     """Simulate, diagnose, count."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path)
-    parser.add_argument("--scatter", action="store_true", help="of cables that do not repeat")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--scatter", action="store_true", help="of cables that do not repeat")
+    kinds.add_argument("--space", action="store_true", help="of cables in space")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
     rows: dict[int, dict] = {}
     seconds = []
     with open_executor(args.jobs, args.scheduler) as executor:
-        work = partial(run_one, seed=args.seed, scatter=args.scatter)
+        work = partial(run_one, seed=args.seed, scatter=args.scatter, space=args.space)
         for done in map_as_completed(executor, work, range(args.sets)):
             row = rows[done.index] = done.value
             seconds.append([row["fit_seconds"], row["diagnosis_seconds"]])
@@ -129,11 +179,13 @@ def main() -> None:
             if len(rows) % 20 == 0 or len(rows) == args.sets:
                 alarms = sum(bool(row["added"]) for row in rows.values())
                 unexplained = sum(row["verdict"] == "unexplained" for row in rows.values())
-                inside = sum(row["inside"] for row in rows.values())
+                both = [np.mean([row[k] for row in rows.values()]) for k in ("inside", "torsion")]
                 fit, diagnosis = np.median(seconds, axis=0)
                 print(
                     f"{len(rows)} sets: {alarms} with a wrong effect, {unexplained} unexplained, "
-                    f"EI in its interval in {100 * inside / len(rows):.1f} %; "
+                    f"EI in its interval in {100 * both[0]:.1f} %"
+                    + (f", GJ in {100 * both[1]:.1f} %" if args.space else "")
+                    + "; "
                     f"median {fit:.1f} s for the fit, {diagnosis:.1f} s for the diagnosis",
                     flush=True,
                 )
@@ -141,16 +193,20 @@ def main() -> None:
                     write_file(args.output, json.dumps([rows[k] for k in sorted(rows)]))
 
 
-def run_one(index: int, seed: int, scatter: bool) -> dict:
+def run_one(index: int, seed: int, scatter: bool, space: bool) -> dict:
     """Simulate one set, whose random numbers depend on seed and index alone, and diagnose it."""
     name = HANGING if scatter else SESSIONS[index % len(SESSIONS)]
-    config = load_config(ROOT / "tests" / "data" / "bench" / name / "session.yaml")
+    path = ROOT / "tests" / "data" / "bench" / name / "session.yaml"
+    config = load_config(ROOT / "configs" / "markers_in_space.yaml" if space else path)
     plain = config.experiment.measurement.model_copy(update={"std": None})
     experiment = config.experiment.model_copy(update={"measurement": plain})
     config = replace(config, experiment=experiment)
     generator = generator_of(seed, index)
+    torsion = np.nan
     if scatter:
         config, measured, stiffness = hanging(config, generator)
+    elif space:
+        config, measured, stiffness, torsion = spatial(config, generator)
     else:
         found = None
         while found is None:
@@ -160,17 +216,25 @@ def run_one(index: int, seed: int, scatter: bool) -> dict:
     fit, _ = fit_declared(config, declared_model(config), measured)
     fitted = time.perf_counter()
     diagnosis = diagnose(fit)
-    interval = profile_intervals(diagnosis.after)["bending_stiffness"]
-    low, high = interval.low or 0.0, interval.high or np.inf
+    intervals = profile_intervals(diagnosis.after)
     return {
         "session": config.cable.name,
         "verdict": diagnosis.verdict,
         "added": [item.candidate.name for item in diagnosis.added],
         "n": fit.model.n,
-        "inside": bool(low <= stiffness <= high),
+        "inside": within(intervals["bending_stiffness"], stiffness),
+        "torsion": within(intervals.get("torsional_stiffness"), torsion),
         "fit_seconds": fitted - begin,
         "diagnosis_seconds": time.perf_counter() - fitted,
     }
+
+
+def within(interval, true) -> bool:
+    """Whether a stiffness lies in its interval; an end that does not exist is no limit."""
+    if interval is None:
+        return False
+    low = -np.inf if interval.low is None else interval.low
+    return bool(low <= true <= (np.inf if interval.high is None else interval.high))
 
 
 if __name__ == "__main__":

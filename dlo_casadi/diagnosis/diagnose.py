@@ -29,7 +29,8 @@ from dlo_casadi.diagnosis.structure import (
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model, fitted_closely
-from dlo_casadi.estimation.hyperparameters import errors_of, settle
+from dlo_casadi.estimation.hyperparameters import SETTLED_MODES, errors_of, settle
+from dlo_casadi.estimation.mesh import fine_enough
 from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
@@ -145,6 +146,7 @@ def diagnose(
     max_effects: int = 4,
     step: Callable[[str, int, int], None] = lambda name, done, total: None,
     executor: Executor | None = None,
+    finest: int | None = None,
 ) -> Diagnosis:
     """Search for effects that a fitted model lacks.
 
@@ -166,8 +168,12 @@ def diagnose(
     executor : Executor, optional
         Where candidates are refitted and places of an unknown load tried, half a second to some
         seconds each; in this process by default.
+    finest : int, optional
+        Elements up to which the mesh may be refined where what effects leave is not noise; by
+        default it stays.
     """
-    search = _Search(fit, center, exclude, significance, max_effects, step, executor or InProcess())
+    run_in = executor or InProcess()
+    search = _Search(fit, center, exclude, significance, max_effects, step, run_in, finest)
     # Where left-out poses are not even reached no effect can be followed: first what pulls.
     lost = search.astray and fit.noise.source != "misfit"
     pull = estimate_pull(fit, search.executor) if lost else None
@@ -242,6 +248,7 @@ class _Search:
     max_effects: int
     step: Callable[[str, int, int], None]
     executor: Executor
+    finest: int | None = None
 
     @cached_property
     def validation(self) -> CrossValidation:
@@ -378,6 +385,14 @@ class _Search:
         """What has been found, and whether it explains the data."""
         if not added and not fit.noise.known:
             fit = settle(fit)
+        found = self._judged(fit, added, ranked)
+        if not (found.unexplained and added and self.finest):
+            return found
+        # What effects leave may be the mesh's, which was fine enough for what they explain.
+        finer, _ = fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)
+        return found if finer is fit else self._judged(finer, added, ranked)
+
+    def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> _Found:
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
         limit = UNSEEN * fit.expected_error
         if added:

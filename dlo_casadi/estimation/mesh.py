@@ -1,4 +1,4 @@
-"""Discretisation error of a fit, from two meshes."""
+"""Discretisation error of a fit, from two meshes, and a mesh that is fine enough."""
 
 from __future__ import annotations
 
@@ -7,11 +7,18 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import on_other_mesh
+from dlo_casadi.estimation.fit import on_other_mesh, refine_mesh
+from dlo_casadi.estimation.hyperparameters import SMOOTH_MODES
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.thresholds import MESH_SHARE
 
 FloatArray = NDArray[np.floating]
+
+FINEST_MESH = 160
+# The search for missing effects, a hundred refits, runs on at most so many elements.
+SEARCH_MESH = 80
 
 
 def on_mesh(fit: Fit, n: int) -> tuple[Sweep, Shapes, FloatArray, bool]:
@@ -55,3 +62,43 @@ def discretization_error(fit: Fit) -> float:
         gap = true.curve.at(places) - seen.curve.at(places)
         worst = max(worst, float(np.sqrt((gap**2).sum(axis=1).mean())))
     return 4 / 3 * worst
+
+
+def fine_enough(
+    fit: Fit, n: int, modes: int = SMOOTH_MODES, finest: int = FINEST_MESH
+) -> tuple[Fit, float]:
+    """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
+
+    Where an effect is missing, the mesh need not be finer than what is missing.
+    """
+    while True:
+        if fit.noise.source == "misfit":
+            return fit, mesh_error(fit)
+        if n != fit.model.n:
+            fit = refine_mesh(fit, n, modes)
+        error = mesh_error(fit)
+        largest = finest if np.isfinite(error) else SEARCH_MESH
+        allowed = allowed_mesh_error(fit)
+        if error <= allowed or n >= largest:
+            return fit, error
+        n = min(_finer(n, error / allowed, fit.model.element), largest)
+
+
+def mesh_error(fit: Fit) -> float:
+    """Error of a fit's mesh [m]; infinite if its shapes cannot be followed to a finer one."""
+    try:
+        return discretization_error(fit)
+    except EstimationError:
+        return float("inf")
+
+
+def allowed_mesh_error(fit: Fit) -> float:
+    """Error of the mesh [m] that is far below the noise and whatever else is left."""
+    return MESH_SHARE * max(fit.noise.std, fit.residual_rms)
+
+
+def _finer(n: int, excess: float, element: str) -> int:
+    """Even number of elements that should make the error smaller by the factor `excess`."""
+    # Carefully: as if half of what lies above the second order were lost on a coarse mesh.
+    order = 1 + ELEMENTS[element].order / 2
+    return 2 * int(np.ceil(n * np.clip(excess ** (1 / order), 1.2, 2.0) / 2))

@@ -25,6 +25,9 @@ Source = Literal["declared", "repeats", "estimated", "misfit"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 # Slow sines per pose in which a missing effect would show.
 SLOW_MODES = 6
+# Directions below this share of the largest tell nothing of their own: the square root of rounding
+# in their products, 1e-8, and two digits.
+_DEPENDENT = 1e-6
 # Points beyond its own directions that a pose needs to tell of the noise, and degrees of freedom
 # that all poses need together for a size and a correlation.
 _SPARE_POINTS, _LEAST_DEGREES = 5, 6
@@ -168,15 +171,19 @@ class NoiseSample:
     shared: FloatArray
 
     def thinned(self, most: int) -> NoiseSample:
-        """Keep at most so many points, evenly picked."""
+        """Keep at most so many points, evenly picked, and of the own directions what they tell.
+
+        A pose's directions may leave the points of one of its photographs where they are.
+        """
         step = max(1, -(-len(self.places) // most))
         kept = np.arange(0, len(self.places), step)
         rows = (kept[:, None] * self.per_point + np.arange(self.per_point)).ravel()
+        basis, values, _ = np.linalg.svd(self.own[rows], full_matrices=False)
         return NoiseSample(
             self.residuals[rows],
             self.places[kept],
             self.weight[kept],
-            self.own[rows],
+            basis[:, values > _DEPENDENT * values.max(initial=0.0)],
             self.shared[rows],
         )
 

@@ -11,21 +11,16 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
-from dlo_casadi.estimation.hyperparameters import SMOOTH_MODES, first_reading_noise
-from dlo_casadi.estimation.mesh import discretization_error
+from dlo_casadi.estimation.hyperparameters import first_reading_noise
+from dlo_casadi.estimation.mesh import fine_enough, mesh_error
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
-from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.session.declared import REST_COEFFICIENTS, Declared
-from dlo_casadi.thresholds import MESH_SHARE
 
 # The search over decades of stiffness runs on this mesh; in space, where an element takes 17
 # times the operations, on half of it.
 FIRST_MESH, FIRST_MESH_IN_SPACE = 20, 10
-FINEST_MESH = 160
-# The search for missing effects, a hundred refits, runs on at most so many elements.
-SEARCH_MESH = 80
 # Markers that are nearer to each other than this share of the cable are at one place.
 SAME_PLACE = 0.02
 # Huber's constant: points beyond it count with their distance instead of its square.
@@ -76,44 +71,6 @@ def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) ->
     # Of twenty simulated cables of two to four markers a constant left structure in two, both with
     # two markers; a straight line did not.
     return max(min(count, 2), count - (model.start, model.end).count("clamped"))
-
-
-def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> tuple[Fit, float]:
-    """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
-
-    Where an effect is missing, the mesh need not be finer than what is missing.
-    """
-    while True:
-        if fit.noise.source == "misfit":
-            return fit, mesh_error(fit)
-        if n != fit.model.n:
-            fit = refine_mesh(fit, n, modes)
-        error = mesh_error(fit)
-        largest = FINEST_MESH if np.isfinite(error) else SEARCH_MESH
-        allowed = allowed_mesh_error(fit)
-        if error <= allowed or n >= largest:
-            return fit, error
-        n = min(_finer(n, error / allowed, fit.model.element), largest)
-
-
-def mesh_error(fit: Fit) -> float:
-    """Error of a fit's mesh [m]; infinite if its shapes cannot be followed to a finer one."""
-    try:
-        return discretization_error(fit)
-    except EstimationError:
-        return float("inf")
-
-
-def allowed_mesh_error(fit: Fit) -> float:
-    """Error of the mesh [m] that is far below the noise and whatever else is left."""
-    return MESH_SHARE * max(fit.noise.std, fit.residual_rms)
-
-
-def _finer(n: int, excess: float, element: str) -> int:
-    """Even number of elements that should make the error smaller by the factor `excess`."""
-    # Carefully: as if half of what lies above the second order were lost on a coarse mesh.
-    order = 1 + ELEMENTS[element].order / 2
-    return 2 * int(np.ceil(n * np.clip(excess ** (1 / order), 1.2, 2.0) / 2))
 
 
 def solved_by_ipopt(fit: Fit) -> Fit:

@@ -158,7 +158,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
 
     Pixels share their errors with their neighbours over the length of the average along the
     cable: of those nearer to each other one is taken. Where that average reaches over an end of
-    the line, into what holds the cable, none is.
+    the line, into what holds the cable, or to where another stretch hides an edge, none is.
 
     Parameters
     ----------
@@ -171,9 +171,13 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     every = max(1, int(np.ceil(sight.correlation / sight.spacing)))
     steps = np.linalg.norm(np.diff(sight.pixels, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    inside = np.minimum(along, along[-1] - along) > _REACH * sight.correlation / np.sqrt(np.pi)
     sure = sight.whole & (sight.std < _UNSURE * np.median(sight.std))
-    kept = np.flatnonzero(inside & sure & np.isfinite(view.places).all(axis=1))[::every]
+    sure &= np.isfinite(view.places).all(axis=1)
+    foreign = np.concatenate([[0.0], along[~sure], along[-1:]])
+    away = np.abs(along[:, None] - foreign).min(axis=1) > _REACH * sight.correlation / np.sqrt(
+        np.pi
+    )
+    kept = np.flatnonzero(away & sure)[::every]
     if len(kept) < 2:
         return None
     size, pixels, points = _size(view), sight.pixels[kept], view.places[kept]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
+from dlo_casadi.estimation.mesh import allowed_mesh_error
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.pose import PoseBranch
-from dlo_casadi.session.fitting import allowed_mesh_error
+from dlo_casadi.pose import SIGNS, PoseBranch
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
 from dlo_casadi.thresholds import EITHER, FIXTURES, MESH_SHARE, UNSEEN
 
@@ -146,9 +146,8 @@ def doubts_of(
 
     Its fit has not converged; or poses are predicted, from their ends alone, worse than UNSEEN
     times what noise, fixtures, parameters and the cable's scatter let expect. Where a cable may
-    fall to either side, a pose on the other one is what its scatter lets expect; where no `branch`
-    names the equilibrium in which a fit pose was measured, it tells of the model what it tells
-    there.
+    fall to either side, a pose on the other one is what its scatter lets expect. A pose whose
+    equilibrium has no name but the way that led there tells of the model what it tells there.
 
     Parameters
     ----------
@@ -163,7 +162,7 @@ def doubts_of(
         )
     for role, said in (("fit", "fit poses"), ("held_out", "held-out poses")):
         errors = {
-            pose.name: _errors(stage.shapes[pose.name], fit.model.cable.length, noise, role)
+            pose.name: _errors(stage.shapes[pose.name], fit.model.cable.length, noise)
             for pose in poses
             if pose.role == role and pose.name in stage.shapes and len(pose.points)
         }
@@ -190,7 +189,7 @@ def doubts_of(
     return tuple(lines)
 
 
-def _errors(shape: PoseShape, length: float, noise: float, role: str) -> FloatArray:
+def _errors(shape: PoseShape, length: float, noise: float) -> FloatArray:
     """Squares (2, K) [m^2] of a pose's distances from its prediction: measured, expected."""
     if shape.spread is None:
         return np.zeros((2, 0))
@@ -199,7 +198,7 @@ def _errors(shape: PoseShape, length: float, noise: float, role: str) -> FloatAr
     across = shape.expected(length, noise).reshape((len(shape.s), -1))
     expected = (across**2).sum(axis=1) + noise**2
     there = shape.measured_branch
-    if role == "fit" and there is not None and there.branch is None:
+    if there is not None and there.branch not in SIGNS:
         return np.stack([np.full_like(expected, there.rmse**2), expected])
     return np.stack([(shape.gap**2).sum(axis=1), expected])
 

@@ -16,6 +16,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SETTLED_MODES
+from dlo_casadi.estimation.mesh import SEARCH_MESH, fine_enough, mesh_error
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
@@ -34,10 +35,7 @@ from dlo_casadi.session.findings import (
 )
 from dlo_casadi.session.fitting import (
     FIRST_MESH_IN_SPACE,
-    SEARCH_MESH,
-    fine_enough,
     fit_declared,
-    mesh_error,
     reweighted,
     solved_by_ipopt,
 )
@@ -191,6 +189,7 @@ def close_the_loop(
         max_effects=options.max_effects,
         step=progress.step,
         executor=executor,
+        finest=None if outcome.config.model.n else SEARCH_MESH,
     )
     fit, stages = diagnosis.after, list(outcome.stages)
     if outcome.config.model.n:

@@ -1,5 +1,7 @@
 """Measured points against a curve, on a circle; the noise model against simulated noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -219,6 +221,16 @@ def test_white_noise_is_recovered():
     spacing = LENGTH / 80
     neighbours = found.covariance(np.array([0.0, spacing]), np.ones(2))[0, 1] / found.std**2
     assert neighbours < 0.1
+
+
+def test_directions_that_leave_a_photograph_alone_tell_nothing_of_its_noise():
+    samples = simulated(NoiseModel(3e-4))
+    twice = [replace(x, own=np.column_stack([x.own, 0 * x.own, x.own[:, :1]])) for x in samples]
+    still = [replace(x, own=0 * x.own) for x in simulated(NoiseModel(3e-4), seed=1)]
+    assert estimate_noise(twice, LENGTH).std == pytest.approx(
+        estimate_noise(samples, LENGTH).std, rel=1e-6
+    )
+    assert np.isfinite(estimate_noise([*samples, *still], LENGTH).std)
 
 
 @pytest.mark.parametrize("truth", NOISES[1:], ids=lambda noise: noise.kernel)
