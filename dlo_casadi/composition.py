@@ -212,7 +212,7 @@ class Composition:
 
     @property
     def n_multipliers(self) -> int:
-        """How many of them are multipliers: negative eigenvalues of the tangent at a minimum."""
+        """How many of the border are multipliers: negative eigenvalues of a minimum's tangent."""
         return self.n_conditions + self.node.dimension * self.n_springs
 
     @cached_property

@@ -287,7 +287,7 @@ def _held(cable: Parameters, given: Mapping[str, Any]) -> dict[str, Any]:
                 f"{unit}"
             )
         if held != "clamped" and value is not None:
-            raise DloError(f"the {side} of {model.cable.name!r} is {held}: a {key} has no meaning")
+            raise DloError(f"the {side} of {model.cable.name!r} is {held}: {key} has no meaning")
         if held != "clamped":
             continue
         value = shared.get(key) if value is None else value

@@ -261,7 +261,12 @@ def test_the_command_takes_what_the_function_takes(loom, capsys):
         ("pinned", {}, "the end of 'short_clean' is pinned: where is it?"),
         ("pinned", {"end": (0.3, float("nan"))}, "end: two finite numbers (x, y) in metres"),
         ("pinned", {"end": (0.3, 0.1, 0.0)}, "end: two finite numbers (x, y) in metres"),
-        ("pinned", {"end": (0.3, 0), "start_heading": 1.0}, "a start_heading has no meaning"),
+        ("loom", IN_SPACE | {"end_orientation": (1, 0, 0)}, "belongs here, not 3 numbers"),
+        (
+            "pinned",
+            {"end": (0.3, 0), "start_heading": 1.0},
+            "is pinned: start_heading has no meaning",
+        ),
         (
             "pinned",
             {"end": "ab"},

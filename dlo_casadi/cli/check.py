@@ -49,7 +49,9 @@ def main(argv: Sequence[str]) -> int:
 
     config = configuration(chosen.config)
     with Watch(Console(stderr=True), chosen.quiet) as watch:
-        config = calibrated(config, lambda name, k, m: watch.step(f"calibrate {name}", k, m))
+        config = calibrated(
+            config, lambda name, k, m: watch.step(f"calibrate {name}".strip(), k, m)
+        )
         inputs = read_inputs(config, lambda name, k, m: watch.step(f"read {name}", k, m))
         pictures = [] if chosen.show is None else _show(config, chosen.show, watch)
         watch.step("compare with what is declared", 0, 1)

@@ -65,6 +65,11 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print the counts as JSON")
     chosen = parser.parse_args(plain_numbers(argv))
 
+    if chosen.output.suffix.lower() != ".parquet":
+        raise DloError(
+            f"--output {chosen.output}: the table is a Parquet file.\n"
+            f"  Try: --output {chosen.output.with_suffix('.parquet')}"
+        )
     cable = load_parameters(chosen.parameters)
     model, p, rest, metadata = cable
     if model.in_space:

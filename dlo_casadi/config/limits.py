@@ -124,10 +124,11 @@ def implausible_gravity(gravity: tuple[float, ...]) -> list[Problem]:
 
 def implausible_quaternion(values: Sequence[float]) -> str:
     """What is wrong with an orientation (x, y, z, w); empty if its length is one."""
+    belongs = "a unit quaternion [qx, qy, qz, qw] belongs here"
+    if len(values) != 4:
+        return f"{belongs}, not {len(values)} numbers"
     size = math.hypot(*values)
-    if len(values) == 4 and abs(size - 1) <= _UNIT:
-        return ""
-    return f"a unit quaternion [qx, qy, qz, qw] belongs here, its length is {size:.4g}"
+    return "" if abs(size - 1) <= _UNIT else f"{belongs}, its length is {size:.4g}"
 
 
 def implausible_pixels(place: Place, values: Iterable[float]) -> list[Problem]:

@@ -10,6 +10,10 @@ from dlo_casadi.config import Camera, Config
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.session.measure import board_of
 
+# Relative standard deviation of the focal length from which on a session's own photographs tell
+# no camera. A judgement: three photographs from different sides leave less than a percent.
+_UNKNOWN = 0.1
+
 
 def needs_camera(config: Config) -> bool:
     """Whether photographs are to be measured that cannot be without a camera, and none is given.
@@ -39,6 +43,8 @@ def calibrated(config: Config, step: Callable[[str, int, int], None]) -> Config:
         return config
     try:
         found = calibrate_session(config, step)
+        if found.focal_uncertainty > _UNKNOWN:
+            raise MeasurementError("; ".join(found.advice))
     except MeasurementError as error:
         why = "in space" if config.experiment.in_space else "with a standoff from the board"
         raise MeasurementError(

@@ -84,7 +84,7 @@ def run_session(
     """
     progress = progress or Silent()
     clock = Clock()
-    config = calibrated(config, lambda name, k, m: progress.step(f"calibrate {name}", k, m))
+    config = calibrated(config, lambda name, k, m: progress.step(f"calibrate {name}".strip(), k, m))
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
     try:
         with one_thread():

@@ -62,6 +62,11 @@ class Calibration:
     problems: Mapping[str, str]
     advice: tuple[str, ...]
 
+    @property
+    def focal_uncertainty(self) -> float:
+        """Standard deviation of the focal lengths over themselves, the larger of both."""
+        return _relative(self.camera.matrix, self.matrix_std)
+
 
 def calibrate_camera(photographs: Mapping[str, NDArray[np.uint8]], board: Board) -> Calibration:
     """Find matrix and lens of the camera that took several photographs of the board.
@@ -168,30 +173,59 @@ def _solve(
     solid, flat = ([a.astype(np.float32) for a in arrays] for arrays in (places, pixels))
     count = 2 * sum(len(a) for a in pixels) / CORNERS_THAT_SHARE
     best: tuple[float, tuple] | None = None
+    fitted = 0
     for numbers, flags in _LENSES.items():
-        found = cv2.calibrateCameraExtended(solid, flat, size, None, None, flags=flags)
+        found = cv2.calibrateCamera(solid, flat, size, None, None, flags=flags)
         score = 2 * count * np.log(found[0]) + numbers * np.log(count)
         if best is None or score < best[0]:
-            best = (score, found)
+            best, fitted = (score, found), numbers
     assert best is not None
-    rms, matrix, lens, turns, shifts, std, *_ = best[1]
+    rms, matrix, lens, turns, shifts = best[1]
+    slopes = []
     errors: dict[str, dict[int, float]] = {}
     for (name, markers), corners, turn, shift in zip(
         seen.items(), places, turns, shifts, strict=True
     ):
-        at = cv2.projectPoints(corners, turn, shift, matrix, lens)[0].reshape(-1, 4, 2)
+        projected, slope = cv2.projectPoints(corners, turn, shift, matrix, lens)
+        slopes.append(slope[:, : 10 + fitted])
+        at = projected.reshape(-1, 4, 2)
         off = np.linalg.norm(at - np.array(list(markers.values())), axis=2)
         errors[name] = dict(zip(markers, np.sqrt(np.mean(off**2, axis=1)), strict=True))
     ahead = np.array([cv2.Rodrigues(turn)[0][2] for turn in turns])
     return _Solved(
         np.asarray(matrix, float),
         np.asarray(lens, float).ravel()[:5],
-        np.asarray(std, float).ravel()[:4],
+        _matrix_std(slopes, float(rms)),
         float(rms),
         errors,
         ahead,
         np.vstack(pixels),
     )
+
+
+def _matrix_std(slopes: list[Array], rms: float) -> Array:
+    """Standard deviations (4,) [px] of the matrix, whatever place and lens, were corners their own.
+
+    OpenCV's drop what photographs from one direction do not tell, and call it known.
+
+    Parameters
+    ----------
+    slopes : list of (2 K, 10 + k)
+        Derivatives of the corners of one photograph by its place (6), the matrix (4), the lens.
+    rms : scalar [px]
+        Of the distances of the corners.
+    """
+    rows = []
+    for slope in slopes:
+        basis = np.linalg.qr(slope[:, :6])[0]
+        rows.append(slope[:, 6:] - basis @ (basis.T @ slope[:, 6:]))
+    stacked = np.vstack(rows)
+    scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-12)
+    _, sizes, ways = np.linalg.svd(stacked / scale, full_matrices=False)
+    along = ways / np.maximum(sizes, 1e-12)[:, None]
+    unknowns = 6 * len(slopes) + stacked.shape[1]
+    noise = rms * np.sqrt(len(stacked) / 2 / max(len(stacked) - unknowns, 1))
+    return np.asarray(noise * np.linalg.norm(along, axis=0) / scale)[:4]
 
 
 def _common_size(photographs: Mapping[str, NDArray[np.uint8]]) -> tuple[int, int]:
@@ -210,10 +244,15 @@ def _common_size(photographs: Mapping[str, NDArray[np.uint8]]) -> tuple[int, int
     return int(width), int(height)
 
 
+def _relative(matrix: Array, std: Array) -> float:
+    """The larger standard deviation of both focal lengths, over them."""
+    return float(max(std[0] / matrix[0, 0], std[1] / matrix[1, 1]))
+
+
 def _advice(solved: _Solved, std: Array, size: tuple[int, int]) -> list[str]:
     """Sentences on how to do better."""
     advice = []
-    relative = float(max(std[0] / solved.matrix[0, 0], std[1] / solved.matrix[1, 1]))
+    relative = _relative(solved.matrix, std)
     if relative > _GOOD_FOCAL:
         advice.append(
             f"the focal length is known to {100 * relative:.1f} % only. Try: more photographs of "

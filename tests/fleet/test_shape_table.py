@@ -81,6 +81,12 @@ def test_rows_are_predictions_in_the_order_of_the_grid(parameters, tmp_path, cap
         assert force == pytest.approx(shape.equilibrium.lam, rel=1e-6, abs=1e-8)
 
 
+def test_the_command_writes_parquet_alone(tmp_path, capsys):
+    grid = ["--grid", "0", "0.3", "2", "0", "0.3", "2"]
+    assert main(["shape-table", "any.yaml", *grid, "--output", str(tmp_path / "t.csv")]) == 2
+    assert "t.parquet" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_a_list_of_poses_of_a_clamped_cable(kind, tmp_path):
     columns = {

@@ -48,6 +48,16 @@ def test_a_missing_camera_is_found_in_the_photographs(session, capsys):
     assert "matrix: [[10" in capsys.readouterr().out
 
 
+def test_photographs_from_one_direction_are_no_calibration():
+    """The focal length that they seem to give is off by a factor of three."""
+    config = load_config(Path(__file__).parents[2] / "configs/cable.yaml")
+    measurement = config.experiment.measurement.model_copy(update={"camera": None})
+    poses = config.experiment.poses[:4]
+    bare = config.experiment.model_copy(update={"measurement": measurement, "poses": poses})
+    with pytest.raises(MeasurementError, match=r"camera is missing.* focal length .*30 to 45"):
+        calibrated(replace(config, experiment=bare), lambda *_: None)
+
+
 def test_too_few_photographs(session):
     config = load_config(session)
     poses = config.experiment.poses

@@ -7,6 +7,8 @@ from scene import BOARD, CAMERA, PLACES, SHAPE, background
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision import calibrate_camera
+from dlo_casadi.vision.board import CORNERS_THAT_SHARE, detect_markers
+from dlo_casadi.vision.calibration import _LENSES
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +32,32 @@ def test_the_camera_is_found_from_three_photographs(pictures):
 
 def test_what_would_make_it_better_is_told(pictures):
     close = {"a": pictures["ahead"], "b": pictures["ahead"], "c": np.roll(pictures["ahead"], 4, 0)}
-    advice = " ".join(calibrate_camera(close, BOARD).advice)
+    found = calibrate_camera(close, BOARD)
+    advice = " ".join(found.advice)
+    assert found.focal_uncertainty > 0.02  # from three sides 0.0007
     assert "within" in advice
     assert "degrees" in advice
+
+
+def test_how_well_the_matrix_is_known_is_as_opencv_has_it(pictures):
+    """Its standard deviations are right where photographs are taken from different sides."""
+    known = [
+        np.vstack([np.column_stack([BOARD.corners(n), np.zeros(4)]) for n in seen])
+        for seen in (detect_markers(image, BOARD)[0] for image in pictures.values())
+    ]
+    seen = [
+        np.vstack(list(detect_markers(image, BOARD)[0].values())) for image in pictures.values()
+    ]
+    solid, flat = ([a.astype(np.float32) for a in arrays] for arrays in (known, seen))
+    found = calibrate_camera(pictures, BOARD)
+    stds = [
+        cv2.calibrateCameraExtended(solid, flat, SHAPE[::-1], None, None, flags=flags)[5][:4, 0]
+        for flags in _LENSES.values()
+    ]
+    misfit = [
+        np.abs(found.matrix_std / np.sqrt(CORNERS_THAT_SHARE) / std - 1).max() for std in stds
+    ]
+    assert min(misfit) < 1e-3
 
 
 def test_photographs_that_do_not_serve_are_named(pictures):
