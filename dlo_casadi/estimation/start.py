@@ -224,11 +224,11 @@ def all_at_once(
                 return None
             share *= PART
         else:
-            last, share = (replace(guess, objective=step.objective, feet=step.feet), step), 1.0
-        size = float(np.abs(last[1].shapes.x).max())
-        if share * size < SETTLED:
+            last = replace(guess, objective=step.objective, feet=step.feet), step
+            share = min(1.0, LONGEST / max(float(np.abs(step.shapes.x).max()), SETTLED))
+        if share * float(np.abs(last[1].shapes.x).max()) < SETTLED:
             break
-        guess = _moved(problem, *last, min(share, LONGEST / size))
+        guess = _moved(problem, *last, share)
     return None if last is None else last[0]
 
 
@@ -253,8 +253,6 @@ def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step
         assert along.tangent is not None
         correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
     except np.linalg.LinAlgError:
-        return None
-    if not np.all(np.isfinite(correction.x)):
         return None
     point = problem.evaluate(theta, shapes, guess.feet)
     ahead = problem.linearize_along(point, along, correction)
@@ -285,6 +283,8 @@ def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step
     for j, solved in zip(problem.used, inner, strict=True):
         deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
     change = correction + problem.shape_step(along, step, deviation)
+    if not (np.isfinite(objective) and np.all(np.isfinite(change.x))):
+        return None
     return _Step(objective, step, change, deviation, point.feet)
 
 

@@ -28,6 +28,9 @@ _PER_ELEMENT = 8
 _REACH = 3.0
 # Times the median: stretches that share an outline are known to 0.2 to 0.4 px, and off by as much.
 _UNSURE = 2.0
+# Sine of the angle between cable and line of sight. In ten rendered poses pixels are off the fitted
+# line's neighbourhood by 0.04 mm RMS below it, by 0.02 mm up to twice it and 0.014 mm above.
+_STEEP = 0.4
 _SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
 
 
@@ -158,7 +161,8 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
 
     Pixels share their errors with their neighbours over the length of the average along the
     cable: of those nearer to each other one is taken. Where that average reaches over an end of
-    the line, into what holds the cable, or to where another stretch hides an edge, none is.
+    the line, into what holds the cable, to where another stretch hides an edge, or to where the
+    cable runs along the line of sight, none is.
 
     Parameters
     ----------
@@ -172,7 +176,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     steps = np.linalg.norm(np.diff(sight.pixels, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     sure = sight.whole & (sight.std < _UNSURE * np.median(sight.std))
-    sure &= np.isfinite(view.places).all(axis=1)
+    sure &= _across(view) > _STEEP
     foreign = np.concatenate([[0.0], along[~sure], along[-1:]])
     away = np.abs(along[:, None] - foreign).min(axis=1) > _REACH * sight.correlation / np.sqrt(
         np.pi
@@ -192,6 +196,15 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     together = size * np.column_stack([by_turn, by_shift]) @ error
     weight = sight.std[kept] * size / std
     return Pixels(viewpoint, pixels, sight.diameter, points, weight, size, together, on_line)
+
+
+def _across(view: ViewInput) -> FloatArray:
+    """Sine (K,) of the angle between cable and line of sight; 0 where no place is known."""
+    places = view.sight.viewpoint.in_camera(view.places)
+    along = np.gradient(places, axis=0)
+    sizes = np.linalg.norm(along, axis=1) * np.linalg.norm(places, axis=1)
+    sine = np.linalg.norm(np.cross(along, places), axis=1) / np.maximum(sizes, 1e-300)
+    return np.asarray(np.nan_to_num(sine))
 
 
 def _size(view: ViewInput) -> float:
