@@ -52,12 +52,16 @@ class CrossValidation:
         Whether each fold could be predicted.
     of_points : float [m]
         Root mean square distance over all points; that of everything where it is not given.
+    expected : float [m]
+        Error of everything that noise, fixtures, the cable's scatter and what the other folds know
+        of the parameters let expect, to first order; of a single pose's stretches it is not told.
     """
 
     squares: FloatArray
     counts: FloatArray
     complete: bool
     of_points: float | None = None
+    expected: float = 0.0
 
     @property
     def error(self) -> float:
@@ -117,7 +121,7 @@ def cross_validate(
         return _stretches(fit)
     shapes = fit.point.shapes if shapes is None else shapes
     problem, lin = fit.problem, fit.linearization
-    thetas = []
+    thetas, covariances = [], []
     total = fit.normal
     for k, (block, cross, slope) in enumerate(_inner(fit)):
         a, e = lin.by_theta[k], lin.residuals[k]
@@ -127,7 +131,9 @@ def cross_validate(
             solved = np.linalg.solve(block, np.column_stack([cross, slope]))
             h_j = h_j - cross.T @ solved[:, :-1]
             g_j = g_j - cross.T @ solved[:, -1]
-        thetas.append(_without(fit, total.hessian - h_j, total.gradient - g_j))
+        theta, covariance = _without(fit, total.hessian - h_j, total.gradient - g_j)
+        thetas.append(theta)
+        covariances.append(covariance)
     errors: list[tuple[FloatArray, FloatArray] | None] = []
     predicted = _predicted(fit, shapes, thetas, executor or InProcess())
     for j, seen in zip(problem.used, predicted, strict=True):
@@ -136,7 +142,7 @@ def cross_validate(
             None if seen is None else (item.distances(seen.curve), item.misread(seen, fit.noise))
         )
         errors.append(found)
-    return _validation(errors)
+    return replace(_validation(errors), expected=fit.expected_with(covariances))
 
 
 def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> CrossValidation:
@@ -160,13 +166,13 @@ def _inner(fit: Fit) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
     return [empty] * len(fit.problem.used)
 
 
-def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Unknowns after one step with a part of the data left out."""
+def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unknowns after one step with a part of the data left out, and their covariance."""
     lower, upper = fit.problem.unknowns.bounds
     # A direction without any information (the place of a mass of zero) must not move.
     ridge = 1e-9 * np.diag(np.diag(fit.normal.hessian)) + NO_INFORMATION * np.eye(len(gradient))
-    step = -np.linalg.solve(hessian + ridge, gradient)
-    return np.clip(fit.point.theta + step, lower, upper)
+    covariance = np.linalg.inv(hessian + ridge)
+    return np.clip(fit.point.theta - covariance @ gradient, lower, upper), covariance
 
 
 def _predicted(

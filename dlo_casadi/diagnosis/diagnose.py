@@ -394,7 +394,7 @@ class _Search:
 
     def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> _Found:
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
-        limit = UNSEEN * fit.expected_error
+        limit = UNSEEN * max(fit.expected_error, validation.expected)
         if added:
             limit = max(limit, UNSEEN_LEFT * self.error)
         unpredicted = (bool(added) or self.several) and validation.error > limit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -214,14 +215,24 @@ class Fit:
         Of distances of points, and of readings as `NoiseModel.units` count them. Noise, scatter of
         the fixtures, uncertain parameters, and how the cable repeats.
         """
-        problem = self.problem
-        size, covariance = problem.unknowns.size, self.covariance * self.inflation**2
+        return self.expected_with([self.covariance] * len(self.problem.used))
+
+    def expected_with(self, covariances: Sequence[FloatArray]) -> float:
+        """RMS error [m] as `expected_error`, the unknowns known as well as is told of each pose.
+
+        Parameters
+        ----------
+        covariances : sequence of (size, size)
+            Of the unknowns, of each fitted pose.
+        """
+        problem, size = self.problem, self.problem.unknowns.size
         square, count = problem.n_residuals * self.noise.std**2, self._n_points
-        for k, j in enumerate(problem.used):
+        for k, (j, covariance) in enumerate(zip(problem.used, covariances, strict=True)):
             by = self.linearization.raw_directions[k][:, :size]
-            variance = ((by @ covariance) * by).sum(axis=1) + self._by_fixtures[k]
+            variance = self.inflation**2 * ((by @ covariance) * by).sum(axis=1)
+            variance += self._by_fixtures[k] + self._by_rest[k]
             units = self.noise.units(problem.measured[j].kinds)
-            square += float((units**2 * (variance + self._by_rest[k])).sum())
+            square += float((units**2 * variance).sum())
             count += int((~self._on_points[k]).sum())
         return float(np.sqrt(square / count))
 
