@@ -16,7 +16,7 @@ from dlo_casadi.errors import EstimationError, MeasurementError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.prediction import Prediction, predict_poses
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.declared import declared_model, straight
 from dlo_casadi.session.hanging import pulled_elsewhere
@@ -284,9 +284,10 @@ def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicio
     measured = [_posed(declared[item.name], item, item.points) for item in shown]
     model = straight(declared_model(config).model).with_mesh(_MESH)
     length = config.cable.length
-    own = np.inf
+    own, hanging = np.inf, {}
     for factor in _STIFFNESSES:
-        own = min(own, _distance(model, factor, measured))
+        hanging[factor] = _predicted(model, factor, measured)
+        own = min(own, _distance(hanging[factor], measured))
         if own < CONTRADICTS * length:
             return ()
     if not np.isfinite(own):
@@ -296,16 +297,22 @@ def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicio
         for pose, item in ((declared[item.name], item) for item in shown)
     ]
     x, y = model.gravity
-    others = {"y pointing up in the points, which now points down": (model, mirrored)}
-    for turned in ((-x, -y), (y, -x), (-y, x)):
-        said = f"gravity ({turned[0] + 0.0:g}, {turned[1] + 0.0:g}) m/s^2"
-        others[said] = (replace(model, gravity=turned), measured)
+    turned = {
+        f"gravity ({way[0] + 0.0:g}, {way[1] + 0.0:g}) m/s^2": replace(model, gravity=way)
+        for way in ((-x, -y), (y, -x), (-y, x))
+    }
     what, rms = "", np.inf
     for factor in _STIFFNESSES:
-        for said, (other, points) in others.items():
-            distance = _distance(other, factor, points)
-            if distance < rms:
-                what, rms = said, distance
+        distances = {
+            "y pointing up in the points, which now points down": _distance(
+                hanging[factor], mirrored
+            )
+        }
+        for said, other in turned.items():
+            distances[said] = _distance(_predicted(other, factor, measured), measured)
+        said = min(distances, key=lambda name: distances[name])
+        if distances[said] < rms:
+            what, rms = said, distances[said]
         if rms < _CLEAR * length:
             break
     if rms > MUCH_BETTER * own:
@@ -326,12 +333,17 @@ def _posed(pose: DeclaredPose, item: PoseInput, points: FloatArray) -> MeasuredP
     return MeasuredPose.of_points(conditions(pose), points, s=item.s)
 
 
-def _distance(model: CableModel, factor: float, measured: Sequence[MeasuredPose]) -> float:
-    """RMS distance [m] of the points from the shapes of a stiffness; infinite without a shape."""
+def _predicted(
+    model: CableModel, factor: float, measured: Sequence[MeasuredPose]
+) -> list[Prediction | None]:
+    """Shapes of a cable without rest curvature, so many times as stiff as declared."""
     p = model.nominal.copy()
     p[0] *= factor
-    rest = np.zeros(model.chain.n_rests)
-    predictions = predict_poses(model, p, rest, [item.pose for item in measured])
+    return predict_poses(model, p, np.zeros(model.chain.n_rests), [x.pose for x in measured])
+
+
+def _distance(predictions: Sequence[Prediction | None], measured: Sequence[MeasuredPose]) -> float:
+    """RMS distance [m] of the points from shapes; infinite without one."""
     gaps = [
         np.inf if prediction is None else item.distances(prediction.curve)
         for prediction, item in zip(predictions, measured, strict=True)
