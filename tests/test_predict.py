@@ -218,6 +218,11 @@ def test_the_reaction_in_space_is_the_slope_of_the_energy(loom):
     assert -predict(cable, **IN_SPACE).equilibrium.lam == pytest.approx(slope, rel=1e-4)
 
 
+def test_turns_that_slip_off_over_a_loop_are_an_error(loom):
+    with pytest.raises(EquilibriumError, match="does not hold 20 turns of twist there"):
+        predict(loom, **IN_SPACE, turns=20)
+
+
 def test_turns_twist_the_cable(loom):
     """White's theorem: a turn of the end is twist and writhe, and the cable has some of each."""
     twist = [predict(loom, **IN_SPACE, turns=turns).equilibrium.twist for turns in (-1, 0, 1)]
