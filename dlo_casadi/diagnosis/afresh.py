@@ -101,17 +101,17 @@ def start_afresh(
     candidate : Candidate, optional
         What is added to its model; by default nothing.
     smaller : (Candidate, Start), optional
-        A candidate that this one contains, and where that has led: the start, then.
+        A candidate that this one contains, and where that has led: the start, if it can be.
     """
     model = linear = base.model if candidate is None else candidate.add_to(base.model)
     scans: tuple[dict[str, float], ...] = ({},)
     if candidate is not None:
         scans, linear = candidate.scans, candidate.add_linear_to(base.model)
     first = _First(base, model if linear == model else linear, origins)
+    looks: list[tuple[Guess, dict[str, float]]] = []
     if candidate is not None and smaller is not None:
         looks = [(guess, scans[0]) for guess in first.beyond(candidate, *smaller)]
-    else:
-        looks = first.looks(scans[:: -(-len(scans) // PLACES_TRIED)])
+    looks = looks or first.looks(scans[:: -(-len(scans) // PLACES_TRIED)])
     problem, best = first.problem, None
     if linear != model:
         problem = _searched_problem(base, model)

@@ -71,8 +71,9 @@ def screened_afresh(
 ) -> list[tuple[Screened, Start]]:
     """Candidates of a base that is astray, started from the measured shapes, best first.
 
-    The score is what a candidate gains there, at the noise of a search; without one that starts
-    from the measured shapes, too.
+    The score is by how much twice the objective falls, at the noise of a search, below that of
+    the model without a candidate, which starts from the measured shapes, too; where it cannot,
+    nothing is listed.
     """
     cable, origins = base.model.cable, origins_of(base)
     without = start_afresh(base, origins, None)
@@ -93,8 +94,9 @@ def screened_afresh(
     return sorted(out, key=lambda pair: -pair[0].score)
 
 
-def confirm_afresh(base: Fit, screened: Screened, start: Start) -> Confirmed | None:
+def confirm_afresh(base: Fit, begun: tuple[Screened, Start]) -> Confirmed | None:
     """Fit with a candidate added, from where it was started; None if that is no equilibrium."""
+    screened, start = begun
     try:
         fit = fit_afresh(base, start)
         return None if fit is None else Confirmed.of(screened, base, fit)

@@ -363,7 +363,8 @@ class _Search:
         begun = screened_afresh(current, listed, self.executor)
         least = min((start.guess.objective for _, start in begun), default=0.0)
         near = [pair for pair in begun if pair[1].guess.objective <= NEAREST * least]
-        tried = [confirm_afresh(current, *pair) for pair in near[:REFITTED]]
+        refit = partial(confirm_afresh, current)
+        tried = list(map_in_order(self.executor, refit, near[:REFITTED]))
         return [item for item, _ in begun], tried
 
     def _causes(self, pull: Pull, screened: Sequence[Screened]) -> list[Confirmed | None]:

@@ -40,7 +40,7 @@ FAR_ROLLS = (2.0, -2.0)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
 # Iterations of all starts, and how many more the promising ones take in space, where frames take
 # longer: at the true stiffnesses, none of three sessions in which an effect is missing had settled
-# after 6, two had after 12 to 20, one had not.
+# after 6 whole steps, two had after 12 to 20, one had not.
 FIRST_LOOK, MORE = 6, 14
 # Starts that are descended from, and unknowns [scaled] within which two starts are one.
 DESCENTS, ALIKE = 3, 1e-2
@@ -52,13 +52,13 @@ POSES_OF_A_SEARCH = 40
 STEPS_OF_A_RIVAL = 10
 # Standard deviation of points in a search in space, over the length. Of three sessions in which an
 # effect is missing, one (space_flat) found its minimum at the noise, too; at 3 mm two did, and one
-# with a drift in neither. A judgement until the misfit itself sets it.
+# with a drift in neither. A judgement.
 SEARCH_STD = 0.004
 # RMS distance over length that a search in space leaves, from which on the model lacks something,
 # and the standard deviation over length by which such a fit weighs the points. In four sessions in
 # which an effect is missing the searches left 0.0025 to 0.0083, in three with nothing or little
-# missing 0.0008 to 0.0013. Weighed by 0.004 the fit of a taper loses its torsional stiffness
-# (0.0003 of 0.005 N m^2), by 0.01 it keeps it; a drift's is off either way.
+# missing 0.0008 to 0.0013. Either stiffness of such a fit may be far off (a taper's torsion 0.0005
+# of 0.005 N m^2): what is missing is looked for from the measured shapes.
 MISFIT, MISFIT_STD = 0.002, 0.01
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
@@ -194,8 +194,8 @@ def fit_model(
     problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta, decades)
-    searched_loosely, different = model.in_space, different_poses(measured, model.cable.length)
-    if not searched_loosely and different >= DIFFERENT and fit.beyond_noise:
+    different = different_poses(measured, model.cable.length)
+    if not model.in_space and different >= DIFFERENT and fit.beyond_noise:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every hanging had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
@@ -252,7 +252,7 @@ def _search(
     """
     loosely = problem.noise.doubted(SEARCH_STD * problem.unknowns.model.cable.length)
     if not problem.unknowns.model.in_space or loosely is problem.noise:
-        return _best(problem, theta, decades)
+        return _best(problem, theta, decades, rolls)
     rest = problem.rest_scatter
     loose = problem.changed(loosely, problem.roughness_std, problem.scatter, rest)
     found = _best(loose, theta, decades, rolls)
