@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.linalg import null_space
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.assembly import Given, Shapes
@@ -128,11 +129,18 @@ def test_a_helix_under_moments_alone():
     np.testing.assert_allclose(np.abs(found.moments[1]), np.abs(moment), atol=1e-6)
 
 
+def least_second_variation(m, matrix):
+    """Lowest eigenvalue under the end conditions, apart from the solver's elimination."""
+    whole, size = matrix.dense()[0], 3 * m.chain.n_nodes
+    allowed = null_space(whole[size:, :size])
+    return np.linalg.eigvalsh(allowed.T @ whole[:size, :size] @ allowed)[0]
+
+
 def test_the_twist_at_which_a_ring_leaves_its_plane():
     """Michell's ring: 2 pi sqrt(3) EI / GJ.
 
-    By the second variation under the end conditions, apart from the elimination. The plane of the
-    ring may turn about the tangent at the clamp, each section rolling back, which costs nothing.
+    The plane of the ring may turn about the tangent at the clamp, each section rolling back, which
+    costs nothing.
     """
     m = model(40, gravity=(0.0, 0.0, 0.0))
     s = m.chain.places
@@ -153,13 +161,38 @@ def test_the_twist_at_which_a_ring_leaves_its_plane():
             shapes = Shapes(moved, shapes.lam + step.y[..., 0], shapes.deviation)
         _, force, matrix = m.assembly.balance(shapes, given)
         assert np.abs(force.x).max() < 1e-9
-        whole, size = matrix.dense()[0], 3 * m.chain.n_nodes
-        allowed = null_space(whole[size:, :size])
-        return np.linalg.eigvalsh(allowed.T @ whole[:size, :size] @ allowed)[:2]
+        return least_second_variation(m, matrix)
 
     exact = 2 * np.pi * np.sqrt(3.0) * EI / GJ
-    assert lowest(0.999 * exact)[0] > 0
-    assert lowest(1.001 * exact)[0] < 0
+    assert lowest(0.999 * exact) > 0
+    assert lowest(1.001 * exact) < 0
+
+
+def test_the_twist_at_which_a_straight_cable_between_clamps_buckles():
+    """Greenhill's problem, clamped: without axial force M L / EI = 2 x, tan x = x.
+
+    A displacement w = y + i z across satisfies w'''' = i (M / EI) w''', w = w' = 0 at both ends.
+    Greenhill 1883; Timoshenko and Gere, Theory of Elastic Stability, 1961, chapter 2.
+    """
+    m = model(20, gravity=(0.0, 0.0, 0.0))
+
+    def lowest(twist):
+        rolls = np.outer(twist * m.chain.places / LENGTH, [1.0, 0.0, 0.0])
+        x = same_sign(Rotation.from_rotvec(rolls).as_quat())
+        place = Pose((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
+        given = Given.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
+        free = Shapes.declared(x[None], np.zeros((1, m.n_border)))
+        _, force, matrix = m.assembly.balance(free, given)
+        # Of the axial force, which the straight cable leaves open, least squares takes none.
+        rows = matrix.dense()[0][: force.x.size]
+        lam = np.linalg.lstsq(rows[:, force.x.size :], -force.x.ravel(), rcond=None)[0]
+        _, force, matrix = m.assembly.balance(Shapes.declared(x[None], lam[None]), given)
+        assert np.abs(force.x).max() < 1e-12
+        return least_second_variation(m, matrix)
+
+    exact = 2 * brentq(lambda x: np.sin(x) - x * np.cos(x), 4.0, 4.6) * EI / GJ
+    assert lowest(0.999 * exact) > 0
+    assert lowest(1.001 * exact) < 0
 
 
 def test_a_cantilever_bends_out_of_its_plane_as_within():
