@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.estimation.band import EDGE
 from dlo_casadi.estimation.moment import LEAST_POINTS, law_of, measured_moment_curve
+from dlo_casadi.report.arrows import forces_read
 from dlo_casadi.report.canvas import (
     BLACK,
     BLUE,
@@ -31,7 +32,7 @@ from dlo_casadi.report.canvas import (
     label_of,
     millimetres,
 )
-from dlo_casadi.report.figures_room import FORCE, draw_marks, frame_room
+from dlo_casadi.report.figures_room import FORCE, STYLES, draw_marks, frame_room
 from dlo_casadi.report.geometry import (
     band_outline,
     directions,
@@ -43,7 +44,7 @@ from dlo_casadi.report.geometry import (
 from dlo_casadi.report.overlay import write_overlays
 from dlo_casadi.report.room import Room, around, rooms, seen
 from dlo_casadi.report.scene import pull_marks, scene_of
-from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape, Stage
+from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 
 FloatArray = NDArray[np.floating]
 
@@ -97,10 +98,11 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
     factor = _magnification(outcome, outcome.config.cable.length)
     in_space = outcome.config.experiment.in_space
     standing = rooms(outcome.config, poses, [stage for stage, *_ in lines]) if in_space else []
-    center, span = _common_frame(outcome, poses)
+    draw_forces = lines and not in_space
+    arrows = forces_read(lines[-1][0], outcome.config.cable.length) if draw_forces else {}
+    center, span = _common_frame(outcome, poses, arrows)
     if standing:
         span = standing[0].window
-    metre = _length_of_newton(outcome)
     width = max(3.1 * columns, 7.5)
     height = 0.82 * width / columns * float(span[1] / span[0])
     if rows == 1 and height > _TALLEST:
@@ -112,8 +114,8 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
                 _draw_in_room(axes, outcome, pose, lines, factor, room)
                 continue
             _draw_pose(axes, pose, lines, factor, np.asarray)
-            if lines and pose.name in lines[-1][0].shapes:
-                _draw_forces(axes, lines[-1][0].shapes[pose.name], metre)
+            for kind, arrow in arrows.get(pose.name, ()):
+                axes.plot(*arrow.T, **STYLES[kind])
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
         for axes in grid.ravel()[len(poses) :]:
@@ -248,38 +250,16 @@ def _draw_pose(
             spine.set(visible=True, color=_HELD_OUT, linewidth=2)
 
 
-def _length_of_newton(outcome: Outcome) -> float:
-    """How long a newton is drawn in a plane [m/N]: the largest force a sixth of the cable."""
-    shapes = outcome.stages[-1].shapes.values() if outcome.stages else []
-    forces = [
-        float(np.linalg.norm(force))
-        for shape in shapes
-        for name, pair in shape.readings.items()
-        for force in pair
-        if name.endswith("force")
-    ]
-    return outcome.config.cable.length / 6 / max(forces, default=1.0)
-
-
-def _draw_forces(axes: Axes, shape: PoseShape, metre: float) -> None:
-    """Forces that were read at the ends, and what a sensor would show of the predicted ones."""
-    for name, place in (("start_force", shape.curve[0]), ("end_force", shape.curve[-1])):
-        for force, color, style in zip(
-            reversed(shape.readings.get(name, ())), (FORCE, BLACK), ("-", ":"), strict=False
-        ):
-            axes.annotate(
-                "",
-                place + metre * force,
-                place,
-                arrowprops={"arrowstyle": "->", "color": color, "ls": style, "shrinkA": 0},
-            )
-
-
-def _common_frame(outcome: Outcome, poses: Sequence[PoseInput]) -> tuple[FloatArray, FloatArray]:
+def _common_frame(
+    outcome: Outcome,
+    poses: Sequence[PoseInput],
+    arrows: Mapping[str, Sequence[tuple[str, FloatArray]]],
+) -> tuple[FloatArray, FloatArray]:
     """Middle and size [m] of a window that holds everything drawn."""
     drawn = [pose.points for pose in poses if len(pose.points)]
     for stage, _, _ in _shown_stages(outcome):
         drawn += [stage.shapes[pose.name].curve for pose in poses if pose.name in stage.shapes]
+    drawn += [arrow for pose in poses for _, arrow in arrows.get(pose.name, ())]
     corners = np.concatenate(drawn) if drawn else np.zeros((1, 2))
     low, high = corners.min(axis=0), corners.max(axis=0)
     span = 1.08 * (high - low) + 0.02 * max(float((high - low).max()), 1e-3)

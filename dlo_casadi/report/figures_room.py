@@ -11,7 +11,7 @@ from dlo_casadi.report.canvas import BLACK, GREEN, GREY, SKY, VERMILLION
 from dlo_casadi.report.room import Mark, Room, seen
 
 FORCE = "#6A3D9A"
-_STYLES: dict[str, dict[str, Any]] = {
+STYLES: dict[str, dict[str, Any]] = {
     "grid": {"color": "#E3E3E3", "lw": 0.6},
     "shadow": {"color": "#9AA5B1", "lw": 1.0},
     "plumb": {"color": "#9AA5B1", "lw": 0.8, "ls": ":"},
@@ -44,8 +44,8 @@ def draw_marks(axes: Axes, marks: Iterable[Mark]) -> None:
                 ha="center",
                 va="center",
             )
-        elif mark.kind in _STYLES:
-            axes.plot(*points.T, **_STYLES[mark.kind])
+        elif mark.kind in STYLES:
+            axes.plot(*points.T, **STYLES[mark.kind])
 
 
 def frame_room(axes: Axes, room: Room) -> None:

@@ -38,6 +38,7 @@ def report_page(outcome: Outcome) -> str:
         pictures=drawn,
         photographs=view_pictures_of(outcome),
         room=drawn[0].room,
+        forces_read=any(mark.kind == "force-read" for item in drawn for mark in item.over),
         scenes=scene_pictures(outcome),
         charts={name: as_data(text) for name, text in charts(outcome).items()},
         **page_data(outcome),

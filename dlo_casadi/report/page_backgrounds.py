@@ -14,6 +14,7 @@ from PIL import Image
 
 from dlo_casadi.config import Config
 from dlo_casadi.errors import MeasurementError
+from dlo_casadi.report.arrows import forces_read
 from dlo_casadi.report.room import Room, rooms, seen
 from dlo_casadi.session.outcome import PoseInput, Stage
 from dlo_casadi.vision import read_image
@@ -110,7 +111,10 @@ def backgrounds(
     photographed = config.experiment.measurement.kind == "images"
     budget = PHOTOGRAPHS // max(1, len(poses))
     predicted = [shape.curve for stage in stages for shape in stage.shapes.values()]
-    board = _board_box(config, [*(pose.points for pose in poses if len(pose.points)), *predicted])
+    read = [forces_read(stage, config.cable.length).values() for stage in stages[-1:]]
+    arrows = [line for every in read for own in every for _, line in own]
+    measured = [pose.points for pose in poses if len(pose.points)]
+    board = _board_box(config, [*measured, *predicted, *arrows])
     found = []
     for pose in poses:
         photograph = photograph_of(files[pose.name], budget) if photographed else None

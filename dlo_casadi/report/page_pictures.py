@@ -8,7 +8,7 @@ their places there, and the page draws them anew as the room is turned.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
+from dlo_casadi.report.arrows import forces_read
 from dlo_casadi.report.canvas import before_after, label_of, millimetres
 from dlo_casadi.report.geometry import beside
 from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds, flat, in_room
@@ -52,11 +53,11 @@ class Line:
 
 @dataclass(frozen=True)
 class Solid:
-    """A line beside the cable in a room, or a word there (see `room.Mark`), as the page has it."""
+    """A line beside the cable, or a word there (see `room.Mark`), as the page has it."""
 
     kind: str
     points: str
-    solid: str
+    solid: str = ""
     label: str = ""
 
 
@@ -81,7 +82,8 @@ class Picture:
     room : Room or None
         In which the cable stands.
     under, over : tuple of Solid
-        What stands there behind the cable, and in front of it.
+        What stands there behind the cable, and in front of it; in a plane the forces that were
+        read, beside the predicted ones.
     """
 
     name: str
@@ -106,7 +108,9 @@ def pictures(outcome: Outcome) -> list[Picture]:
     """A picture of every pose of a run, in the order in which they were taken."""
     stages = [stage for stage in before_after(outcome) if stage is not None]
     behind = backgrounds(outcome.config, outcome.poses, stages)
-    return [_picture(outcome, pose, b) for pose, b in zip(outcome.poses, behind, strict=True)]
+    in_plane = stages and not outcome.config.experiment.in_space
+    read = forces_read(stages[-1], outcome.config.cable.length) if in_plane else {}
+    return [_picture(outcome, pose, b, read) for pose, b in zip(outcome.poses, behind, strict=True)]
 
 
 def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
@@ -167,7 +171,12 @@ def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Pict
     return drawn
 
 
-def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
+def _picture(
+    outcome: Outcome,
+    pose: PoseInput,
+    behind: Background,
+    read: Mapping[str, Sequence[tuple[str, FloatArray]]],
+) -> Picture:
     before, after = before_after(outcome)
     lines, facts = [], []
     measured = behind.points(pose.points)
@@ -206,6 +215,11 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
         facts += [("force-read", *fact) for fact in _readings(outcome, last)]
     declared = next(item for item in outcome.config.experiment.poses if item.name == pose.name)
     under, over = _around(declared, pose, last, behind.room)
+    ends = drawn[-1]
+    if behind.room is None:
+        arrows = [(kind, behind.points(line)) for kind, line in read.get(pose.name, ())]
+        drawn += [line for _, line in arrows]
+        over = tuple(Solid(kind, svg(line, 1)) for kind, line in arrows)
     return Picture(
         name=pose.name,
         role=pose.role,
@@ -215,8 +229,8 @@ def _picture(outcome: Outcome, pose: PoseInput, behind: Background) -> Picture:
         photograph=behind.photograph,
         grid=behind.grid,
         lines=tuple(line for line in lines if line.points),
-        start=None if behind.room else _point(drawn[-1][:1]),
-        end=None if behind.room else _point(drawn[-1][-1:]),
+        start=None if behind.room else _point(ends[:1]),
+        end=None if behind.room else _point(ends[-1:]),
         facts=tuple(facts),
         problem=pose.problem,
         notes=pose.messages,
@@ -266,8 +280,8 @@ def _readings(outcome: Outcome, shape: PoseShape) -> list[tuple[str, str]]:
         std, unit = outcome.measurement.std_of(kind)
         off = float(np.linalg.norm(known - model))
         size = float(np.linalg.norm(known))
-        text = f"{size:.3g} {unit}, {off:.2g} {unit} from predicted"
-        facts.append((name.replace("_", " ") + " read", f"{text} ({off / std:.1f} std)"))
+        text = f"{size:.3g} {unit}, off by {off:.2g} {unit}"
+        facts.append((name.replace("_", " "), f"{text} ({off / std:.1f} std)"))
     return facts
 
 

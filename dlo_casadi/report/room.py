@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
+from dlo_casadi.report.arrows import arrow
 from dlo_casadi.session.outcome import PoseInput, PoseShape, Stage
 
 FloatArray = NDArray[np.floating]
@@ -30,8 +31,6 @@ VIEWS = (
 _MM = 1e3
 # Shares of the cable's length: the longest arrow, an axis of a frame, the air above the floor.
 _ARROW, _AXIS, _AIR = 0.15, 0.09, 0.06
-# An arrow's head, as a share of its length: how long and how wide.
-_HEAD = (0.28, 0.1)
 
 
 @dataclass(frozen=True)
@@ -169,17 +168,6 @@ def around(
         spot = np.stack([at, at + 0.1])
         over += [Mark(f"{kind} {side}", spot) for kind in ("fixture-casing", "fixture")]
     return under, over
-
-
-def arrow(root: FloatArray, shaft: FloatArray) -> FloatArray:
-    """One line (10, 3) that draws an arrow from a root (3,) along a shaft (3,)."""
-    size = max(float(np.linalg.norm(shaft)), 1e-12)
-    across = np.cross(shaft, np.eye(3)[np.abs(shaft).argmin()])
-    across *= size / max(float(np.linalg.norm(across)), 1e-12)
-    tip, back = root + shaft, root + (1 - _HEAD[0]) * shaft
-    sides = (across, np.cross(shaft, across) / size, -across, -np.cross(shaft, across) / size)
-    barbs = [point for side in sides for point in (back + _HEAD[1] * side, tip)]
-    return np.stack([root, tip, *barbs])
 
 
 def seen(points: FloatArray, view: tuple[str, float, float] = VIEWS[0]) -> FloatArray:

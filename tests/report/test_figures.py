@@ -175,8 +175,8 @@ def test_a_prediction_is_drawn(tmp_path, end):
     assert drawn(tmp_path / "shape.png")[1] > 0.005
 
 
-def test_readings_are_drawn_beside_predicted_ones(outcome, tmp_path):
-    """Residuals over their noise, and arrows of one scale at the ends."""
+def with_readings(outcome):
+    """The same with readings in three poses."""
     stage = outcome.stages[-1]
     names = list(stage.shapes)[:3]
     read = {
@@ -186,7 +186,12 @@ def test_readings_are_drawn_beside_predicted_ones(outcome, tmp_path):
     shapes = {k: replace(v, readings=read if k in names else {}) for k, v in stage.shapes.items()}
     measurement = replace(outcome.measurement, readings=6, force_std=0.02, moment_std=0.01)
     stages = (*outcome.stages[:-1], replace(stage, shapes=shapes))
-    shown = replace(outcome, stages=stages, measurement=measurement)
+    return replace(outcome, stages=stages, measurement=measurement)
+
+
+def test_readings_are_drawn_beside_predicted_ones(outcome, tmp_path):
+    """Residuals over their noise, and arrows of one scale at the ends."""
+    shown = with_readings(outcome)
     figures.draw_readings(tmp_path / "readings.png", shown)
     figures.draw_poses(tmp_path, shown)
     assert imread(tmp_path / "readings.png").shape[2] == 4

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bokeh.models import HoverTool
 from PIL import Image
-from test_figures import CANDIDATES, EFFECT, LOAD
+from test_figures import CANDIDATES, EFFECT, LOAD, with_readings
 
 from dlo_casadi.report import page_boards, page_canvas, page_charts
 from dlo_casadi.report.geometry import beside
@@ -233,6 +233,21 @@ def test_a_photograph_that_has_gone_is_replaced_by_the_board(photographed, tmp_p
 
 def coordinates(text):
     return np.array([pair.split(",") for pair in text.split()], dtype=float)
+
+
+def test_forces_that_were_read_stand_beside_the_predicted_ones(outcome):
+    """Two arrows from the end, on one scale: the longest a fifth of the cable."""
+    shown = with_readings(outcome)
+    picture = next(item for item in pictures(shown) if item.over)
+    model, read = picture.over
+    assert (model.kind, read.kind) == ("force", "force-read")
+    root, tip = coordinates(read.points)[:2]
+    assert root == pytest.approx(picture.end, abs=0.1)
+    newton = 200 * shown.config.cable.length / np.hypot(0.1, 1.0)  # mm/N
+    assert tip - root == pytest.approx([0.1 * newton, newton], abs=0.1)  # y down
+    assert any(name == "end force" for _, name, _ in picture.facts)
+    assert "as read" in report_page(shown)
+    assert "as read" not in report_page(outcome)
 
 
 def test_lines_lie_where_the_camera_sees_them(photographed):
