@@ -35,7 +35,7 @@ RISE, PART = 1.5, 0.3
 
 
 def measured_shapes(
-    problem: BatchProblem, roll: float = 0.0, turns: FloatArray | float = 0.0
+    problem: BatchProblem, roll: float = 0.0, turns: FloatArray | None = None
 ) -> tuple[Shapes, list[FloatArray]]:
     """Shapes of all poses: along the measured line where there is one, guessed elsewhere.
 
@@ -47,8 +47,8 @@ def measured_shapes(
     roll : float [rad]
         Of the cable in its end clamp, in space: it decides which of the twists that reach the
         clamp is the one nearest to none.
-    turns : (m,)
-        Full turns of twist beside that one.
+    turns : (m,), optional
+        Turns of twist, see `Pose`, to which each is the nearest; by default as the poses tell.
 
     Returns
     -------
@@ -66,11 +66,10 @@ def measured_shapes(
         [first_nodes(model, model.nominal, flat, item.pose)[0] for item in problem.measured]
     )
     along = predicted.copy()
-    extra = np.broadcast_to(turns, len(predicted))
     for j in used:
         item = problem.measured[j].traced
         pose = item.pose.rolled(roll)
-        pose = replace(pose, turns=pose.turns + extra[j])
+        pose = pose if turns is None else replace(pose, turns=float(turns[j]))
         along[j] = line_nodes(item.points, pose, chain, item.places(chain.length))
     shapes, feet, cost = _kinematics(problem, sweep, along, roll)
     alone = [k for k, j in enumerate(used) if not problem.measured[j].has_line]
@@ -88,8 +87,9 @@ def turned_either_way(
 ) -> Guess:
     """A guess whose poses are twisted the other way round where that fits better.
 
-    Where the end clamp is rolled by nearly half a turn the twist nearest to none is either way
-    round within what is known of the roll; poses are tried one by one, the most twisted first.
+    Where the end clamp is rolled by nearly half a turn and the pose does not tell its turns, the
+    twist nearest to none may be either way round within what is known of the roll; poses are
+    tried one by one, the most twisted first.
 
     Parameters
     ----------
@@ -101,11 +101,11 @@ def turned_either_way(
     node, x = problem.unknowns.model.node, guess.shapes.x
     twist = node.difference(x[:, :-1], x[:, 1:])[..., 0].sum(axis=1)
     order = [j for j in np.argsort(-np.abs(twist)) if abs(twist[j]) > EITHER_WAY]
-    order = [j for j in order if j in problem.used]
+    order = [j for j in order if j in problem.used and not problem.measured[j].pose.turns]
     first = all_at_once(problem, guess, held, LOOK) if order else None
     if first is None:
         return guess
-    others, places = measured_shapes(problem, roll, -np.sign(twist))
+    others, places = measured_shapes(problem, roll, -np.sign(twist) / 2)
     least = first.objective
     for j in order:
         rows, feet = guess.shapes.x.copy(), list(guess.feet)
