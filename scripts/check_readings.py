@@ -272,7 +272,7 @@ def draw(rows: list[dict], path: Path) -> None:
         axes.axhline(APART, color=GREY, ls="--", label="told apart above")
         axes.set(
             xlabel="poses with readings",
-            ylabel="2 ln(evidence of the right model / of the wrong one)",
+            ylabel="twice the log evidence,\nright model over wrong one",
             xticks=NUMBERS,
             title=f"{len(rows)} simulated cables: median and quartiles",
         )
@@ -289,7 +289,11 @@ def print_tables(rows: list[dict]) -> None:
     found = [row["clean"] for row in rows if "clean" in row]
     if found:
         alarms = sum(bool(row["added"]) or row["unexplained"] for row in found)
-        print(f"clean: {alarms} false alarms of {len(found)}, EI inside {share(found, 'inside')}")
+        off = [abs(row["error"]) < 1.96 * row["std"] for row in found]
+        print(
+            f"clean: {alarms} false alarms of {len(found)}, EI inside its interval "
+            f"{share(found, 'inside')}, within 1.96 standard deviations {sum(off)}"
+        )
     known = [row["mass"] for row in rows if "mass" in row]
     for what in ("EI", "mass") if known else ():
         worst = max(abs(row[what]) for row in known)
