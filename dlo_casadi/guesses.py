@@ -100,7 +100,7 @@ def guessed_frames(
 
     Between two ends, four arcs of the cable's length, the first sagging along gravity, the others
     turned about the chord by quarter turns; bent into the clamps, the roll of the end clamp that
-    is nearest to none, and `turns`, spread evenly; where that roll is nearly half a turn, also with
+    is nearest to `turns` spread evenly; of no turns, where that is nearly half a turn, also with
     the one the other way round. With a free end: the rest shape, the cable fallen down, and
     straight on.
     """

@@ -17,6 +17,8 @@ _DECAY = 5
 # Rolls so near to half a turn [rad] are as near to none the other way round: arcs to four sides
 # differ by as much, 1.2 rad in a pose whose lowest equilibrium is the other one.
 HALF_TURN = 1.0
+# Turns by which one twist must be nearer than another: arcs to two sides may lie half a turn apart.
+_ROUNDING = 1e-6
 
 
 def parallel_frames(tangents: FloatArray, first: Rotation) -> Rotation:
@@ -81,8 +83,10 @@ def guessed_frames_of(
     bent : (2, k - 1) [rad]
         Rest bends about the axes y and z from node to node.
     turns : float
+        See `pose.Pose`; counted along the first arc, and as near to that along the others.
     """
     first, last = (None if clamp is None else Rotation.from_quat(clamp) for clamp in clamps)
+    held = (first, last)
     if chord is None:
         return _hanging(u, first, down, bent)
     along = chord / max(float(np.linalg.norm(chord)), 1e-12)
@@ -91,12 +95,16 @@ def guessed_frames_of(
         side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
     found: list[FloatArray] = []
     others: list[FloatArray] = []
+    aimed = turns = 0.0 if None in held else turns
     for quarter in range(4):
         turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
-        tangents = arc_tangents(u, chord, turned)
-        nearest, *other = ways_into_clamps(u, tangents, (first, last), turns)
-        found.append(nearest)
-        others += other
+        frames, roll = carried(u, arc_tangents(u, chord, turned), held)
+        roll = nearest(roll, aimed)
+        if turns and not found:
+            aimed = roll / (2 * np.pi)
+        if not turns and None not in held and abs(roll) > np.pi - HALF_TURN:
+            others.append(rolled(u, frames, held, roll - np.copysign(2 * np.pi, roll)))
+        found.append(rolled(u, frames, held, roll))
     return found + others
 
 
@@ -126,19 +134,7 @@ def into_clamps(
     clamps: tuple[Rotation | None, Rotation | None],
     turns: float,
 ) -> FloatArray:
-    """The first of `ways_into_clamps`."""
-    return ways_into_clamps(u, tangents, clamps, turns)[0]
-
-
-def ways_into_clamps(
-    u: FloatArray,
-    tangents: FloatArray,
-    clamps: tuple[Rotation | None, Rotation | None],
-    turns: float,
-) -> list[FloatArray]:
-    """Frames (k, 4) along tangents (k, 3), bent into the clamps, their roll spread evenly.
-
-    Between two clamps whose roll is nearly half a turn also those rolled the other way round.
+    """Frames (k, 4) along tangents (k, 3), bent into the clamps, of the twist nearest to `turns`.
 
     Parameters
     ----------
@@ -147,7 +143,18 @@ def ways_into_clamps(
     clamps : Rotation or None, each
         Frames of the first and the last node; None where the cable may turn.
     turns : float
-        Full turns of twist beside the roll nearest to none.
+    """
+    frames, roll = carried(u, tangents, clamps)
+    aimed = 0.0 if None in clamps else turns
+    return rolled(u, frames, clamps, nearest(roll, aimed))
+
+
+def carried(
+    u: FloatArray, tangents: FloatArray, clamps: tuple[Rotation | None, Rotation | None]
+) -> tuple[Rotation, float]:
+    """Frames (k,) along tangents bent into the clamps, without twist, and the end clamp's roll.
+
+    It is the angle [rad] about the cable by which the end clamp is turned against the last of them.
     """
     first, last = clamps
     axes = tangents.copy()
@@ -159,16 +166,27 @@ def ways_into_clamps(
     for bend in bends:
         axes = Rotation.from_rotvec(bend).apply(axes)
     frames = parallel_frames(axes, first or smallest_turn(np.array([1.0, 0.0, 0.0]), axes[0]))
-    if last is None:
-        return [same_sign(frames.as_quat())]
-    missing = roll_between(frames[-1], last)
-    rolls = [np.broadcast_to(missing, u.shape)]
-    if first is not None:
-        rolls = [u * (missing + 2 * np.pi * turns)]
-        if abs(missing) > np.pi - HALF_TURN:
-            rolls.append(rolls[0] - u * np.copysign(2 * np.pi, missing))
-    about = [Rotation.from_rotvec(roll[:, None] * np.array([1.0, 0.0, 0.0])) for roll in rolls]
-    return [same_sign((frames * roll).as_quat()) for roll in about]
+    return frames, 0.0 if last is None else roll_between(frames[-1], last)
+
+
+def rolled(
+    u: FloatArray,
+    frames: Rotation,
+    clamps: tuple[Rotation | None, Rotation | None],
+    roll: float,
+) -> FloatArray:
+    """Frames (k, 4) with a roll [rad] at the end: spread evenly from a clamp, alike from a pin."""
+    share = np.ones_like(u) if clamps[0] is None else u
+    about = Rotation.from_rotvec(np.outer(roll * share, [1.0, 0.0, 0.0]))
+    return same_sign((frames * about).as_quat())
+
+
+def nearest(roll: float, aimed: float) -> float:
+    """The roll [rad], by whole turns more or less, nearest to those aimed at [turns].
+
+    Of two that are as near to rounding the larger.
+    """
+    return roll + 2 * np.pi * float(np.floor(aimed - roll / (2 * np.pi) + 0.5 + _ROUNDING))
 
 
 def same_sign(quaternions: FloatArray) -> FloatArray:

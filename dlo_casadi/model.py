@@ -56,14 +56,21 @@ class CableModel(Lagrangian):
         x, _ = self._nodes
         return [x, self._lam, self._p, self._pose, self._deviation]
 
-    def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
-        """A function at increments of zero, its outputs dense."""
+    def _here(
+        self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
+    ) -> ca.Function:
+        """A function at increments of zero, its outputs dense.
+
+        What is evaluated often is worth the search for common subexpressions: it takes away a
+        fifth of the operations, and of many effects' derivatives longer than the evaluation.
+        """
         local, step = self._local
         _, delta = self._nodes
         symbols = [step, delta, local]
         values = [ca.SX.zeros(step.shape), ca.SX.zeros(delta.shape), self._local_of_nodes]
         found = ca.substitute(outputs, symbols, values)
-        return ca.Function(name, arguments, [ca.densify(one) for one in ca.cse(found)])
+        found = ca.cse(found) if often else found
+        return ca.Function(name, arguments, [ca.densify(one) for one in found])
 
     @property
     def _by_slot(self) -> ca.SX:
@@ -181,7 +188,7 @@ class CableModel(Lagrangian):
             mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
         else:
             mixed = ca.jacobian(ca.gradient(self._terms.lagrangian, self._by_slot), by)
-        return self._here("slot_sensitivity", self._slot_arguments, [mixed])
+        return self._here("slot_sensitivity", self._slot_arguments, [mixed], often=False)
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
@@ -215,7 +222,8 @@ class CableModel(Lagrangian):
             blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
         else:
             blocks = [ca.jacobian(self._advanced, by) for by in (self._by_slot, others)]
-        return self._here("slot_curve_slopes", self._slot_arguments, [self._advanced, *blocks])
+        outputs = [self._advanced, *blocks]
+        return self._here("slot_curve_slopes", self._slot_arguments, outputs, often=False)
 
     @cached_property
     def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:

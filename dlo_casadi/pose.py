@@ -33,7 +33,9 @@ class Pose:
     start_orientation, end_orientation : (4,) or None
         Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable.
     turns : float
-        In space, full turns of twist at the end about its x axis beside the roll nearest to none.
+        In space, of the twists about the cable's axis that bring its end into the clamp, the one
+        nearest to so many full turns is meant; +-0.5 tell the ways of half a turn apart. Of 0, and
+        a clamp rolled by half a turn within 1 rad, the way of lower energy.
     branch : "ccw", "cw" or "previous", optional
         Which way the cable turns from start to end: the sign of `Equilibrium.turn`; or as in the
         pose before it, from which whoever predicts a series of poses follows it.

@@ -31,9 +31,6 @@ FloatArray = NDArray[np.floating]
 
 # Arc lengths may miss the cable by so many of its lengths: rounding.
 _ROUNDING = 1e-9
-# Turns by which the twist may differ from what was asked. A loop sheds two; the roll nearest to
-# none takes up to half of one, and a coil, of three ends tried, up to 0.8.
-SLIPPED = 1.25
 
 
 class CableCurve(NodeCurve):
@@ -190,8 +187,8 @@ def predict(
         Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable;
         those that all poses of the session shared by default.
     turns : float
-        In space, full turns of twist at the end about its x axis, beside the roll nearest to none.
-        A cable may shed two of them over a loop; that is an error.
+        In space, the twist nearest to so many full turns, see `Pose`. A cable may shed two of them
+        over a loop; that is an error.
     branch : "ccw" or "cw", optional
         In a plane, which way the cable turns from start to end.
 
@@ -235,15 +232,6 @@ def predict(
             f"{happened}\n  Try: an end in metres, nearer to the start; other {other}.",
             p_des=error.p_des,
         ) from None
-    if pose.turns:
-        held = float(np.mean(eq.twist)) * model.cable.length / (2 * np.pi)
-        if abs(held - pose.turns) > SLIPPED:
-            raise EquilibriumError(
-                f"the cable does not hold {pose.turns:g} turns of twist there: it loops until "
-                f"{held:.2g} are left.\n"
-                "  Try: fewer turns, or the end farther from the start.",
-                p_des=pose.end,
-            )
     return PredictedShape(
         cable, pose, eq, _true_curve(model, p, rest, pose, eq), _curve(model, p, rest, pose, eq)
     )

@@ -33,6 +33,7 @@ from benchmarks import (
     speed,
 )
 
+from dlo_casadi.codegen import STATUSES
 from dlo_casadi.durable import make_folder, write_file
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 
@@ -153,14 +154,23 @@ def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
     for element in ELEMENTS_IN_SPACE:
         rng = np.random.default_rng(0)
         solver = random_cables.AnyCable(random_cables.space_problem(rng, 1, 12, element))
-        counts = {"ok": 0, "wrong": 0, "same": 0, "lower": 0, "higher": 0, "ipopt_failed": 0}
+        counts = {
+            "ok": 0,
+            "turns_shed": 0,
+            "wrong": 0,
+            "same": 0,
+            "lower": 0,
+            "higher": 0,
+            "ipopt_failed": 0,
+        }
         ipopt = space_ipopt.Ipopt(random_cables.space_problem(rng, 1, 12, element).model)
         worst, total = 0.0, 0.0
         for cable in range(cables):
             problem = random_cables.space_problem(rng, poses, 12, element)
             shapes, statuses, seconds = solver.solve(problem)
             total += seconds
-            counts["ok"] += int(np.count_nonzero(statuses == 0))
+            for status in ("ok", "turns_shed"):
+                counts[status] += int(np.count_nonzero(statuses == STATUSES.index(status)))
             for i in np.flatnonzero(statuses == 0)[: max(1, 2000 // cables)]:
                 right, error = random_cables.check_in_space(problem, shapes[i], i)
                 counts["wrong"] += not right

@@ -22,6 +22,7 @@ _HINTS = {
     "not_finite": "finite numbers for end, start and headings.",
     "unstable": "another branch, or a pose nearby.",
     "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
+    "turns_shed": "fewer turns, or the end farther from the start.",
 }
 
 

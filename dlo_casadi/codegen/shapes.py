@@ -20,6 +20,7 @@ STATUSES = (
     "workspace_too_small",
     "bad_argument",
     "other_branch",
+    "turns_shed",
 )
 
 

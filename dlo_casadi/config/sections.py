@@ -380,7 +380,8 @@ class Pose(Section):
     end_orientation: Quaternion | None = None
     """Frame of a clamped end in space, a quaternion [qx, qy, qz, qw]; x forward along the cable."""
     turns: Number = 0.0
-    """Full turns of twist at the end about its x axis, beside the roll nearest to none."""
+    """Of the twists that bring the end into its clamp, the one nearest to so many full turns about
+    its x axis; 0.5 or -0.5 tells which way a clamp is rolled by half a turn."""
     role: Literal["fit", "held_out"] = "fit"
     """fit, or held_out to check the prediction."""
     start_force: Place | None = None

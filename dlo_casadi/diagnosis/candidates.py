@@ -10,6 +10,7 @@ import numpy as np
 
 from dlo_casadi.effects import EFFECTS, Effect, PointLoad, Setup
 from dlo_casadi.effects.effect import Cable
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
 
 
@@ -111,3 +112,26 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
         screened = tuple(name for name in tested if name not in scans[0])
         found.append(Candidate(effect, frees, screened, scans, nuisance=False))
     return found
+
+
+def candidates_of(
+    fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]
+) -> list[Candidate]:
+    """List all effects that may be missing in a fitted model; see `candidates`.
+
+    Parameters
+    ----------
+    center : (float, float), optional [m]
+        Middle of the photographs in the board frame.
+    """
+    problem, shapes = fit.problem, fit.point.shapes
+    setup = setup_of(
+        fit.model,
+        n_poses=len(problem.used),
+        center=center,
+        camera=any(item.pose.camera_center is not None for item in problem.history),
+        readings=tuple({name for item in problem.history for name in item.reactions}),
+        directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
+        largest_bend=float(problem.sweep.bends(shapes, fit.p, fit.rest).max()),
+    )
+    return candidates(fit.model, setup, exclude)

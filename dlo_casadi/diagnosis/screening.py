@@ -158,17 +158,21 @@ class Screen:
         p = self.p.copy()
         for name, value in scan.items():
             p[self.model.names.index(name)] = value
-        # What a pose leaves behind acts through all later ones.
-        if self.still is None or self.fit.model.has_state or not self.carried.isdisjoint(scan):
+        if self.still is None:
             self.still = self._linearized(p)
         else:
-            self._move([c for c in active if len(c.scans) > 1], p)
+            moved = [c for c in active if len(c.scans) > 1]
+            # What a pose leaves behind acts through all later ones, at a cost.
+            for state in (False, True):
+                self._move([c for c in moved if isinstance(c.effect, StateEffect) == state], p)
         still = self.still
         normal = still.problem.normal_equations(still.point, still.lin)
         return normal.hessian, normal.gradient, still.problem.unknowns.names
 
     def _move(self, candidates: Sequence[Candidate], p: FloatArray) -> None:
         """Take the derivatives by the candidates' parameters again, at p."""
+        if not candidates:
+            return
         assert self.still is not None
         key = tuple(candidate.name for candidate in candidates)
         if key not in self.moving:

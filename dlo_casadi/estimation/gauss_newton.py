@@ -392,13 +392,13 @@ class BatchProblem:
             if damping == before:
                 damping = damping / 10 if damping > 1e-6 else 0.0
             point = trial
-            lin = self.linearize(point)
             # Where the residual exceeds the noise, so does a standard deviation's decrease.
             excess = max(1.0, point.data / max(self.n_residuals, 1))
             if gains[-1] < tolerance * excess and damping < 1e-2:
                 return point, True
             if sum(gains) < tolerance * excess:
                 return point, False
+            lin = self.linearize(point)
         return point, False
 
     def _promised(self, point: Point, lin: Linearization) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +16,11 @@ from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, SYSTEMATIC_SHARE
 
 FloatArray = NDArray[np.floating]
 
-# Search for the interval's ends within this factor of the estimate, in steps growing by two.
+# Search for the interval's ends within this factor of the estimate, threefold at most at a time.
 LARGEST_LOG_STEP = float(np.log(1e4))
+FARTHEST_AIM, MOST_REFITS = 3.0, 12
+# A last aim that moves by this share of itself: what is left of it is of second order.
+SAME_CROSSING = 0.03
 
 
 @dataclass(frozen=True)
@@ -71,35 +73,46 @@ def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
     name : str
         The bending stiffness by default.
     """
-    log_ei = float(np.log(fit.value(name)))
-    log_std = fit.std(name) / fit.value(name)
     limit = threshold(fit)
-
-    def held(log_value: float, near: Point) -> tuple[Point, float] | None:
-        tried = _held(fit, log_value, near, name)
-        return None if tried is None else (tried[0], tried[1] - limit)
-
-    def end(direction: int) -> float | None:
-        near = _others(fit, name)
-        low, f_low = 0.0, -limit
-        step = min(max(np.sqrt(limit) * log_std, 1e-4), 0.7)
-        while low < LARGEST_LOG_STEP:
-            tried = held(log_ei + direction * (low + step), near)
-            if tried is None:
-                step /= 4
-                if step < 1e-3:
-                    break
-                continue
-            point, value = tried
-            if value > 0:
-                return _crossing(held, log_ei, direction, (low, f_low), (low + step, value), near)
-            near, low, f_low = point, low + step, value
-            step *= 2
-        return None
-
-    ends = [end(-1), end(1)]
-    low, high = (None if e is None else float(np.exp(e)) for e in ends)
+    std = fit.std(name) / fit.inflation / fit.value(name)
+    first = min(max(np.sqrt(limit) * std, 1e-4), 0.7)
+    ends = [_crossing(_Profile(fit, name), limit, direction * first) for direction in (-1, 1)]
+    low, high = (None if end is None else float(np.exp(end) * fit.value(name)) for end in ends)
     return Interval(low, high)
+
+
+def _crossing(profile: _Profile, limit: float, first: float) -> float | None:
+    """Place where a profile crosses its limit; None where it does not within LARGEST_LOG_STEP.
+
+    A profile is close to a parabola: the square root of its rise is all but linear, and the
+    secant of that root is followed until the place moves by less than SAME_CROSSING of itself.
+    """
+    root, aim, near = np.sqrt(limit), first, profile.lowest
+    low: tuple[float, float] = (0.0, 0.0)
+    high: tuple[float, float] | None = None
+    for _ in range(MOST_REFITS):
+        if abs(aim) > LARGEST_LOG_STEP:
+            return None
+        tried = profile.refitted(aim, near)
+        if tried is None:
+            if high is not None:
+                return aim
+            aim = low[0] + (aim - low[0]) / 4
+            if abs(aim - low[0]) < 1e-3:
+                return None
+            continue
+        here = aim, float(np.sqrt(max(tried.rise, 0.0)))
+        if here[1] < root:
+            low, near = here, tried
+            onward = min(root / max(here[1], 1e-300), FARTHEST_AIM) * aim
+        else:
+            high = here
+        if high is not None:
+            onward = low[0] + (root - low[1]) * (high[0] - low[0]) / (high[1] - low[1])
+        if abs(onward - aim) < SAME_CROSSING * abs(onward):
+            return float(onward)
+        aim = onward
+    return aim if high is not None else None
 
 
 def stiffness_profile(fit: Fit, stiffness: FloatArray) -> FloatArray:
@@ -115,66 +128,76 @@ def stiffness_profile(fit: Fit, stiffness: FloatArray) -> FloatArray:
     (k,)
         To be compared with `threshold`; NaN where no equilibria were found.
     """
-    wanted = np.log(stiffness)
-    here = float(np.log(fit.p[0]))
+    wanted = np.log(stiffness / fit.p[0])
     rises = np.full(len(wanted), np.nan)
     order = np.argsort(wanted)
+    profile = _Profile(fit, BENDING_STIFFNESS)
     # Outwards from the estimate, each refit from its neighbour's.
-    for side in (order[wanted[order] >= here], order[wanted[order] < here][::-1]):
-        near = _others(fit, BENDING_STIFFNESS)
+    for side in (order[wanted[order] >= 0], order[wanted[order] < 0][::-1]):
+        near = profile.lowest
         for k in side:
-            tried = _held(fit, float(wanted[k]), near, BENDING_STIFFNESS)
+            tried = profile.refitted(float(wanted[k]), near)
             if tried is not None:
-                near, rises[k] = tried
+                near, rises[k] = tried, tried.rise
     return rises
 
 
-def _others(fit: Fit, name: str) -> Point:
-    """The fit's minimum without the stiffness among its unknowns."""
-    names = np.array(fit.problem.unknowns.names)
-    return replace(fit.point, theta=fit.point.theta[names != name])
+@dataclass(frozen=True)
+class _Refit:
+    """Everything else refitted where a parameter is held: at the log of its ratio to the fit's."""
+
+    place: float
+    point: Point
+    rise: float
 
 
-def _held(fit: Fit, log_value: float, near: Point, name: str) -> tuple[Point, float] | None:
-    """Refit with the stiffness held, from a neighbour; the rise of twice the objective."""
-    model, found = fit.model, fit.problem.unknowns
-    k = found.names.index(name)
-    base = 2 * fit.point.objective - found.own_prior(fit.point.theta, k)
-    others = np.array([other != name for other in model.names]) & found.free
-    p = fit.p.copy()
-    p[model.names.index(name)] = np.exp(log_value)
-    unknowns = Unknowns(model, others, p, found.rest_free)
-    problem = fit.problem.of(unknowns, sweep=fit.problem.sweep)
-    problem.share_metric(fit.problem)
-    theta = near.theta
-    shapes, converged = problem.sweep.solve(near.shapes, unknowns.p(theta), unknowns.rest(theta))
-    if not converged.all():
+@dataclass(frozen=True)
+class _Profile:
+    """Rise of twice the objective along one parameter of a fit."""
+
+    fit: Fit
+    name: str
+
+    @property
+    def _k(self) -> int:
+        return self.fit.problem.unknowns.names.index(self.name)
+
+    @property
+    def lowest(self) -> _Refit:
+        """The fit's minimum without the parameter among its unknowns."""
+        theta = np.delete(self.fit.point.theta, self._k)
+        return _Refit(0.0, replace(self.fit.point, theta=theta), 0.0)
+
+    def _held(self, place: float) -> Unknowns:
+        model, found = self.fit.model, self.fit.problem.unknowns
+        others = np.array([other != self.name for other in model.names]) & found.free
+        p = self.fit.p.copy()
+        p[model.names.index(self.name)] *= np.exp(place)
+        return Unknowns(model, others, p, found.rest_free)
+
+    def refitted(self, place: float, near: _Refit) -> _Refit | None:
+        """Hold the parameter at a place, from a neighbour; None without equilibria there."""
+        fit, k = self.fit, self._k
+        base = 2 * fit.point.objective - fit.problem.unknowns.own_prior(fit.point.theta, k)
+        unknowns = self._held(place)
+        problem = fit.problem.of(unknowns, sweep=fit.problem.sweep)
+        problem.share_metric(fit.problem)
+        for theta in (self._along(place, near), near.point.theta):
+            shapes, converged = problem.sweep.solve(
+                near.point.shapes, unknowns.p(theta), unknowns.rest(theta)
+            )
+            if converged.all():
+                start = problem.evaluate(theta, shapes, near.point.feet)
+                point, _ = problem.descend(start, tolerance=1e-2)
+                return _Refit(place, point, 2 * point.objective - base)
         return None
-    point, _ = problem.descend(problem.evaluate(theta, shapes, near.feet), tolerance=1e-2)
-    return point, 2 * point.objective - base
 
-
-def _crossing(
-    held: Callable[[float, Point], tuple[Point, float] | None],
-    log_ei: float,
-    direction: int,
-    below: tuple[float, float],
-    above: tuple[float, float],
-    near: Point,
-) -> float:
-    """Place where the profile crosses the threshold, by two secant steps on its root."""
-    (a, f_a), (b, f_b) = below, above
-    for _ in range(2):
-        # The profile is close to a parabola: from its lowest point its square root is linear.
-        share = -f_a / (f_b - f_a)
-        guess = b * np.sqrt(share) if a == 0 else a + (b - a) * share
-        tried = held(log_ei + direction * guess, near)
-        if tried is None:
-            break
-        if tried[1] > 0:
-            b, f_b = guess, tried[1]
-        else:
-            a, f_a = guess, tried[1]
-        if abs(tried[1]) < 0.05 * abs(f_a - f_b) or b - a < 1e-3:
-            return float(log_ei + direction * guess)
-    return float(log_ei + direction * (a + (b - a) * (-f_a) / (f_b - f_a)))
+    def _along(self, place: float, near: _Refit) -> FloatArray:
+        """Where the other unknowns go with the parameter, to first order about the fit."""
+        fit, k = self.fit, self._k
+        whole = fit.problem.unknowns
+        p = np.stack([self._held(at).fixed for at in (near.place, place)])
+        before, after = (whole.pack(row, fit.coefficients)[k] for row in p)
+        slope = np.delete(fit.covariance[:, k], k) / fit.covariance[k, k]
+        lower, upper = self._held(place).bounds
+        return np.clip(near.point.theta + slope * (after - before), lower, upper)

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.diagnosis.diagnose import AddedEffect, Diagnosis
+from dlo_casadi.diagnosis.diagnose import Diagnosis
+from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.result import Fit
 

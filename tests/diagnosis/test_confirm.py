@@ -7,9 +7,9 @@ import pytest
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.confirm import refit_with
-from dlo_casadi.diagnosis.diagnose import _drop
 from dlo_casadi.diagnosis.pull import _Search
 from dlo_casadi.diagnosis.screening import Screen
+from dlo_casadi.diagnosis.search import _drop
 from dlo_casadi.effects import Cable, LumpedMass, UnknownPull
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.gauss_newton import Tolerances

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis import diagnose
 from dlo_casadi.diagnosis.confirm import Confirmed
 from dlo_casadi.diagnosis.crossval import CrossValidation
 from dlo_casadi.diagnosis.repeatability import limiting_spread
+from dlo_casadi.diagnosis.selection import improving
 from dlo_casadi.effects import Cable
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
@@ -57,4 +57,4 @@ def test_only_a_clear_gain_counts_where_poses_do_not_repeat(errors, doubt, kept)
     before = CrossValidation(counts * 1.0, counts, True)
     added = SimpleNamespace(candidate=SimpleNamespace(nuisance=False))
     tried = Confirmed(added, None, CrossValidation(counts * errors, counts, True), 100.0, 90.0)
-    assert diagnose._improving([tried], before, doubt) == ([tried] if kept else [])
+    assert improving([tried], before, doubt) == ([tried] if kept else [])

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 from test_gauss_newton import CABLE, STD, measured_from
 
-from dlo_casadi.diagnosis.diagnose import _p_with_closed_noise
+from dlo_casadi.diagnosis.selection import p_with_closed_noise
 from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
@@ -65,4 +65,4 @@ def test_fewer_points_than_unknowns():
 def test_an_effect_that_leaves_no_point_over_is_not_significant():
     fit = fitted(1, poses=4, std=STD)
     fit.problem.noise = replace(fit.noise, source="estimated")
-    assert _p_with_closed_noise(fit, fit, winner=None, tried=1) == 1.0
+    assert p_with_closed_noise(fit, fit, winner=None, tried=1) == 1.0

@@ -7,8 +7,8 @@ from tiny_sessions import write_session
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.confirm import confirm
 from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.diagnosis.diagnose import screen
 from dlo_casadi.diagnosis.pull import estimate_pull
+from dlo_casadi.diagnosis.search import screen
 from dlo_casadi.effects import RestCurvatureDrift
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.parallel import map_in_order, open_executor

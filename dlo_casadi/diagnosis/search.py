@@ -1,0 +1,317 @@
+"""Adding effects one by one, until what the residual holds is noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+
+from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
+from dlo_casadi.diagnosis.causes import refit_from
+from dlo_casadi.diagnosis.confirm import Confirmed, confirm, confirm_afresh, screened_afresh
+from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.pull import Pull, estimate_pull
+from dlo_casadi.diagnosis.screening import Screen, Screened, survival
+from dlo_casadi.diagnosis.selection import (
+    AddedEffect,
+    Ranked,
+    as_complete,
+    choose,
+    explained_by,
+    improving,
+    misleads,
+    p_with_closed_noise,
+    ranking,
+    sidak,
+)
+from dlo_casadi.diagnosis.structure import (
+    Structure,
+    noise_degrees,
+    screening_degrees,
+    structure_of,
+)
+from dlo_casadi.effects import PointLoad
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.hyperparameters import SETTLED_MODES, settle
+from dlo_casadi.estimation.mesh import fine_enough
+from dlo_casadi.estimation.repeats import different_poses
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.parallel import map_in_order
+from dlo_casadi.thresholds import (
+    BIC_APART,
+    DIFFERENT,
+    LEFT,
+    NEAREST,
+    REFITTED,
+    UNSEEN,
+    UNSEEN_LEFT,
+    WORTH,
+)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a search has ended.
+
+    Parameters
+    ----------
+    fit : Fit
+    added : tuple of AddedEffect
+    ranked : tuple of Ranked
+    validation : CrossValidation
+    structure : Structure
+    unexplained : bool
+    """
+
+    fit: Fit
+    added: tuple[AddedEffect, ...]
+    ranked: tuple[Ranked, ...]
+    validation: CrossValidation
+    structure: Structure
+    unexplained: bool
+
+
+@dataclass(frozen=True)
+class Search:
+    """Search for effects that a declared model lacks: the arguments of `diagnose`."""
+
+    declared: Fit
+    center: tuple[float, float] | None
+    exclude: Sequence[str]
+    significance: float
+    max_effects: int
+    step: Callable[[str, int, int], None]
+    executor: Executor
+    finest: int | None = None
+
+    @cached_property
+    def validation(self) -> CrossValidation:
+        """Of the declared model."""
+        return cross_validate(self.declared)
+
+    @property
+    def error(self) -> float:
+        """Cross-validated error of the declared model [m], 0 where it tells nothing."""
+        return self.validation.error if self.validation.complete else 0.0
+
+    @property
+    def astray(self) -> bool:
+        """Whether the declared model cannot follow the poses that are left out."""
+        return self.several and not self.validation.complete
+
+    @property
+    def several(self) -> bool:
+        """Whether a pull may have a cause: in one pose a force fits as well as any."""
+        return len(self.declared.problem.used) > 1 and self.max_effects > 0
+
+    @property
+    def doubt(self) -> float | None:
+        """What a gain has to be held against where a pose or two were taken again and again."""
+        problem = self.declared.problem
+        count = different_poses(problem.history, problem.unknowns.model.cable.length)
+        return self.significance if count < min(DIFFERENT, len(problem.used)) else None
+
+    @cached_property
+    def first(self) -> list[Screened]:
+        """Score tests in the declared model."""
+        return screen(self.declared, self.center, self.exclude)
+
+    def run(self, pull: Pull | None = None) -> Found:
+        """Add effects until the residual is noise, or nothing improves what is left out.
+
+        Parameters
+        ----------
+        pull : Pull, optional
+            Whose causes are tried in the first step; else all effects, followed from the
+            declared model.
+        """
+        current, validation = self.declared, self.validation
+        added: list[AddedEffect] = []
+        ranked: list[Ranked] = []
+        for k in range(self.max_effects):
+            self.step("search for a missing effect", k, self.max_effects)
+            astray = current.noise.source == "misfit"
+            tried: list[Confirmed | None] = []
+            if astray and pull is None:
+                screened, tried = self._afresh(current)
+            else:
+                screened = self.first if k == 0 else screen(current, self.center, self.exclude)
+            p_values = {
+                item.candidate.name: sidak(item.p_value, len(screened)) for item in screened
+            }
+            if k == 0 and pull is not None:
+                tried = self._causes(pull, screened)
+            elif not astray:
+                tried = self._leading(current, screened, p_values)
+            explaining = explained_by(current, tried)
+            confirmed = explaining or improving(tried, validation, self.doubt)
+            if k == 0:
+                ranked = ranking(screened, p_values, confirmed)
+            # What a second effect explains may be what the first one, if wrong, has left.
+            apart = np.inf if added and not explaining else BIC_APART
+            chosen = choose(confirmed, apart)
+            while (
+                chosen
+                and not (explaining or chosen[0].candidate.nuisance)
+                and misleads(chosen[0].fit, current, validation)
+            ):
+                confirmed.remove(chosen[0])
+                chosen = choose(confirmed, apart)
+            if chosen is None:
+                break
+            winner, rivals = chosen
+            p_value = p_values[winner.candidate.name]
+            if k == 0 and pull is not None:
+                single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
+                p_value = sidak(single, len(screened))
+            closed = winner.fit if explaining else as_complete(winner.fit)
+            if not (closed.errors_known or astray):
+                again = p_with_closed_noise(current, closed, winner, len(screened))
+                p_value = max(p_value, again)
+            if p_value > self.significance:
+                break
+            current = closed
+            after = cross_validate(current)
+            added.append(AddedEffect(winner.candidate, p_value, validation, after, tuple(rivals)))
+            validation = after
+        self.step("search for a missing effect", self.max_effects, self.max_effects)
+        return self._ended(*prune(current, added, self.significance), tuple(ranked))
+
+    def _leading(
+        self, current: Fit, screened: Sequence[Screened], p_values: Mapping[str, float]
+    ) -> list[Confirmed | None]:
+        """Refits of the significant candidates with the highest scores."""
+        significant = [
+            item for item in screened if p_values[item.candidate.name] < self.significance
+        ]
+        leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
+        worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
+        return list(map_in_order(self.executor, partial(confirm, current), worthy))
+
+    def _afresh(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None]]:
+        """Fits from the measured shapes of the candidates that come nearest to them.
+
+        Beside a misfit scores are no order, and a refit leads where the declared model has gone.
+        """
+        listed = candidates_of(current, self.center, self.exclude)
+        begun = screened_afresh(current, listed, self.executor)
+        least = min((start.guess.objective for _, start in begun), default=0.0)
+        near = [pair for pair in begun if pair[1].guess.objective <= NEAREST * least]
+        refit = partial(confirm_afresh, current)
+        tried = list(map_in_order(self.executor, refit, near[:REFITTED]))
+        return [item for item, _ in begun], tried
+
+    def _causes(self, pull: Pull, screened: Sequence[Screened]) -> list[Confirmed | None]:
+        """Refits of all loads at one place, whatever their scores, that give the pull's forces.
+
+        Two free forces in each pose would gain more than their price if the law were wrong.
+        """
+        loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
+        refit = partial(refit_from, self.declared, pull)
+        free = 2 * len(self.declared.problem.used) + 1
+        price = free * np.log(self.declared.problem.n_residuals)
+        return [
+            item
+            for item in map_in_order(self.executor, refit, loads)
+            if item is not None and item.bic >= pull.gain - price
+        ]
+
+    def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
+        """What has been found, and whether it explains the data."""
+        if not added and not fit.noise.known:
+            fit = settle(fit)
+        found = self._judged(fit, added, ranked)
+        if not (found.unexplained and added and self.finest):
+            return found
+        # What effects leave may be the mesh's, which was fine enough for what they explain.
+        finer, _ = fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)
+        return found if finer is fit else self._judged(finer, added, ranked)
+
+    def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
+        validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
+        limit = UNSEEN * max(fit.expected_error, validation.expected)
+        if added:
+            limit = max(limit, UNSEEN_LEFT * self.error)
+        unpredicted = (bool(added) or self.several) and validation.error > limit
+        unexplained = structure.p_noise < self.significance or unpredicted
+        unexplained |= fit.noise.source == "misfit"
+        return Found(fit, tuple(added), ranked, validation, structure, unexplained)
+
+    def with_cause_of(self, pull: Pull | None, found: Found) -> Found:
+        """Return a search that begins with a cause of the pull, if it explains the data."""
+        if pull is None or not self.several:
+            return found
+        other = self.run(pull)
+        return found if other.unexplained else other
+
+    def without_wrong_causes(self, found: Found, pull: Pull | None) -> Found:
+        """Withdraw effects that do not explain nearly all of what the declared model lacks.
+
+        Something is missing still, and a wrong effect may stand for a part of it. Effects stay
+        if the mean square error of what is left out, beyond noise and fixtures, falls to less
+        than LEFT of what it was: then what is missing beside them is small against what they
+        explain. And all go if one force in each pose explains more than they do.
+        """
+        floor = found.fit.expected_error**2
+        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, self.error))
+        if after <= LEFT * before and not self._needless(found, pull):
+            return found
+        return self._ended(self.declared, [], found.ranked)
+
+    def _needless(self, found: Found, alone: Pull | None) -> bool:
+        """Whether one force per pose on the declared model does better than with the effects."""
+        if alone is None or not self.several:
+            return False
+        pull = estimate_pull(found.fit, self.executor)
+        n = np.log(self.declared.problem.n_residuals)
+        extra = sum(len(item.candidate.frees) for item in found.added) * n
+        if pull is None:
+            return True
+        if 2 * alone.fit.point.objective >= 2 * pull.fit.point.objective + extra:
+            return False
+        p_alone, p_found = (
+            structure_of(x, noise_degrees(x)).p_value for x in (alone.fit, found.fit)
+        )
+        return p_alone > p_found
+
+
+def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]) -> list[Screened]:
+    """Score tests of all `candidates_of` a fit, best first."""
+    listed = candidates_of(fit, center, exclude)
+    return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
+
+
+def prune(fit: Fit, added: list[AddedEffect], significance: float) -> tuple[Fit, list[AddedEffect]]:
+    """Backward step: drop an effect that a later one has made superfluous."""
+    if len(added) < 2:
+        return fit, added
+    for effect in list(added[:-1]):
+        smaller = _drop(fit, effect.candidate)
+        if smaller is None:
+            continue
+        again = [
+            item
+            for item in screen(smaller, None, ())
+            if item.candidate.name == effect.candidate.name
+        ]
+        price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
+        gain = 2 * (smaller.point.objective - fit.point.objective)
+        if gain < price or (again and again[0].p_value > significance):
+            fit = settle(smaller)
+            added = [item for item in added if item is not effect]
+    return fit, added
+
+
+def _drop(fit: Fit, candidate: Candidate) -> Fit | None:
+    """Fit without a candidate, from the fit with it."""
+    if candidate.nuisance:
+        return None
+    model = fit.model.without_effect(candidate.effect.label)
+    try:
+        return fit_model(model, fit.problem.history, fit.problem.tolerances, start=fit)
+    except EstimationError:
+        return None

@@ -1,0 +1,207 @@
+"""Which of the refitted candidates is added: evidence, cross-validation, significance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.diagnosis.confirm import Confirmed
+from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.screening import Screened, survival
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.fit import fitted_closely
+from dlo_casadi.estimation.hyperparameters import errors_of, settle
+from dlo_casadi.estimation.prediction import predicted_shapes
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import LEAST_NOISE_DEGREES, MISLEADING
+
+
+@dataclass(frozen=True)
+class AddedEffect:
+    """An effect that the data ask for.
+
+    Parameters
+    ----------
+    candidate : Candidate
+    p_value : float
+        Score test, corrected for places and candidates. Where the noise is estimated, the larger
+        of it and of the test under the noise that is left once the effect is in the model.
+    before, after : CrossValidation
+        Without and with the effect.
+    rivals : tuple of Confirmed
+        Candidates that could not be told apart from it.
+    equivalents : tuple of str
+        What it may stand for, see `equivalents`.
+    """
+
+    candidate: Candidate
+    p_value: float
+    before: CrossValidation
+    after: CrossValidation
+    rivals: tuple[Confirmed, ...]
+    equivalents: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate in the list of all that were tried."""
+
+    name: str
+    score: float
+    p_value: float
+    rmse_cross_validated: float | None
+
+
+def explained_by(current: Fit, tried: Iterable[Confirmed | None]) -> list[Confirmed]:
+    """Candidates that leave none of a misfit once the points are taken as sure as they are.
+
+    Beside a misfit their gains tell little; they are compared by their evidence.
+    """
+    if current.noise.source != "misfit":
+        return []
+    most = current.point.objective / 2
+    likely = [item for item in tried if item is not None and item.fit.point.objective < most]
+    fits = [(item, as_complete(item.fit)) for item in likely]
+    close = [(item, fit) for item, fit in fits if fit.noise.source != "misfit"]
+    least = min((fit.log_evidence for _, fit in close), default=0.0)
+    return [
+        replace(
+            item,
+            fit=fit,
+            validation=cross_validate(fit),
+            bic=2 * (fit.log_evidence - least),
+        )
+        for item, fit in close
+    ]
+
+
+def as_complete(fit: Fit) -> Fit:
+    """A fit with an effect added, as that of a model that may be complete now."""
+    if fit.noise.source != "misfit":
+        return settle(fit)
+    try:
+        return fitted_closely(fit)
+    except EstimationError:
+        return fit
+
+
+def sidak(p_value: float, tried: int) -> float:
+    """Probability that the best of so many independent tests is as good (Sidak)."""
+    return float(-np.expm1(tried * np.log1p(-min(p_value, 1 - 1e-16))))
+
+
+def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) -> float:
+    """Significance of an effect under the noise that is left once it is in the model.
+
+    The noise estimated without the effect holds a part of the effect, or, where it was kept out,
+    lacks a part of the noise. Where nothing else is missing all that is left is noise, its slow
+    modes included; where something is, the noise is too large and the significance too low.
+    """
+    try:
+        noise, rest_scatter = errors_of(
+            closed.problem,
+            closed.point,
+            closed.linearization,
+            modes=0,
+            estimated=not closed.noise.known,
+            repeats=closed.problem.rest_scatter.std == 0,
+        )
+    except EstimationError:  # with the effect hardly a point is left over: nothing is shown
+        return 1.0
+    rough, scatter = open_.problem.roughness_std, open_.problem.scatter
+    larger = closed.problem.changed(noise, rough, scatter, rest_scatter)
+    larger.refresh(closed.point.theta, closed.point.shapes, closed.point.feet)
+    problem = open_.problem.changed(noise, rough, scatter, rest_scatter)
+    problem.share_metric(larger)
+    point = problem.evaluate(open_.point.theta, open_.point.shapes, open_.point.feet)
+    point, _ = problem.descend(point)
+    other = larger.evaluate(closed.point.theta, closed.point.shapes, closed.point.feet)
+    other, _ = larger.descend(other)
+    gain = max(2 * (point.objective - other.objective), 0.0)
+    dof = len(winner.candidate.frees)
+    return sidak(survival(gain, dof, max(LEAST_NOISE_DEGREES, noise.slow_dof)), tried)
+
+
+def improving(
+    tried: Iterable[Confirmed | None], validation: CrossValidation, doubt: float | None
+) -> list[Confirmed]:
+    """Refits that improve both the fit and what it predicts.
+
+    Hangings of one or two poses have in common whatever is wrong with their measurement. There
+    whole hangings decide: a gain as large must have less than the probability `doubt` if those
+    left out are predicted no better (Student's t).
+    """
+    out = []
+    for item in tried:
+        if item is None or item.bic <= 0 or not item.validation.complete:
+            continue
+        # An effect that explains the fitted poses but predicts the others worse is none. A nuisance
+        # is in the model already; without its prior it predicts about as well.
+        worse = item.validation.error > validation.error
+        if item.candidate.nuisance:
+            worse = item.validation.clearly_worse_than(validation)
+        if worse:
+            continue
+        if doubt is None or validation.chance_of_gain(item.validation) < doubt:
+            out.append(item)
+    return out
+
+
+def choose(
+    confirmed: Sequence[Confirmed], apart: float
+) -> tuple[Confirmed, list[Confirmed]] | None:
+    """The best by cross-validation (BIC among those not clearly worse), and its rivals.
+
+    Rivals are those not clearly worse whose BIC falls short by less than `apart`.
+    """
+    if not confirmed:
+        return None
+    leader = min(confirmed, key=lambda item: item.validation.error)
+    close = [
+        item for item in confirmed if not item.validation.clearly_worse_than(leader.validation)
+    ]
+    winner = max(close, key=lambda item: item.bic)
+    rivals = [item for item in close if item is not winner and item.bic > winner.bic - apart]
+    return winner, sorted(rivals, key=lambda item: -item.bic)
+
+
+def misleads(fit: Fit, before: Fit, validation: CrossValidation) -> bool:
+    """Whether a fit with an effect tells a user, who knows the ends alone, worse than one without.
+
+    `validation` follows the branches on which poses were measured, without the effect.
+    """
+    told = _told(fit)
+    return told > validation.rmse and told > MISLEADING * _told(before)
+
+
+def _told(fit: Fit) -> float:
+    """Cross-validated error [m] of poses of which nothing but the ends is known."""
+    shapes = predicted_shapes(fit.problem, fit.point.shapes, fit.p, fit.rest)
+    return cross_validate(fit, shapes=shapes).rmse
+
+
+def ranking(
+    screened: Sequence[Screened], p_values: Mapping[str, float], confirmed: Sequence[Confirmed]
+) -> list[Ranked]:
+    """All candidates: those refitted by BIC, then the others by score."""
+    refitted = {item.candidate.name: item for item in confirmed}
+    rows = [
+        Ranked(
+            item.candidate.name,
+            item.score,
+            p_values[item.candidate.name],
+            refitted[item.candidate.name].validation.rmse
+            if item.candidate.name in refitted
+            else None,
+        )
+        for item in screened
+    ]
+
+    def order(row: Ranked) -> tuple[float, float]:
+        known = refitted.get(row.name)
+        return (-known.bic if known else np.inf, -row.score)
+
+    return sorted(rows, key=order)
