@@ -115,8 +115,7 @@ def implausible_sizes(
             "write gravity: [0, 0]"
         )
         problems.append(Problem(("mass",), text))
-    density = mass / (length * math.pi * diameter**2 / 4)
-    if not problems and density > _DENSEST:
+    if not problems and (density := mass / (length * math.pi * diameter**2 / 4)) > _DENSEST:
         hint = f"did you mean {mass / 1e3:g}? " if density / 1e3 < _DENSEST_METAL else ""
         text = (
             f"{mass:g} kg make it {density / 1e3:.3g} times as dense as water: units are SI, {hint}"
