@@ -125,8 +125,8 @@ class Algorithm1Result:
 
 
 def applies(model: CableModel) -> bool:
-    """Whether the paper's method knows these boundaries: pinned at both ends."""
-    return model.start == "pinned" and model.end == "pinned"
+    """Whether the paper's method knows such a cable: in a plane, pinned at both ends."""
+    return not model.in_space and model.start == model.end == "pinned"
 
 
 def gravity_slopes(phi: FloatArray, weight: FloatArray, h: float) -> FloatArray:

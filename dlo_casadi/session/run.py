@@ -254,7 +254,7 @@ def before_stages(
     if not config.estimation.algorithm1:
         stages.append(algorithm1_stage(None, measured, plain, "switched off"))
     elif not applies(declared.model):
-        note = "the paper's loop needs two pinned ends"
+        note = "the paper's loop needs a plane and two pinned ends"
         stages.append(algorithm1_stage(None, measured, plain, note))
     elif any(item.s is not None for item in inputs):
         note = "the paper's loop needs lines along the cable, not single markers"

@@ -295,6 +295,8 @@ def test_only_pins_are_known():
     assert applies(CableModel(CABLE))
     assert not applies(CableModel(CABLE, start="clamped"))
     assert not applies(CableModel(CABLE, end="free"))
+    in_space = replace(CABLE, torsional_stiffness=CABLE.bending_stiffness)
+    assert not applies(CableModel(in_space, gravity=(0.0, 0.0, -9.81)))
     clamped = MeasuredPose.of_points(
         Pose((0.0, 0.0), (0.5, 0.0), start_heading=0.0, name="p3"), np.eye(2)
     )
