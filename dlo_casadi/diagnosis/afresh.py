@@ -28,7 +28,7 @@ from dlo_casadi.estimation.fit import (
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes
+from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes, twists
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 
@@ -76,10 +76,12 @@ def origins_of(base: Fit) -> tuple[Origin, ...]:
     """What a fit that is astray has found, and what was declared."""
     names, problem = base.model.names, _searched_problem(base, base.model)
     declared = np.where(problem.unknowns.free, base.model.nominal, base.p)
+    # Either way round, as the fit has found to fit best.
+    turns = twists(base.model, base.point.shapes.x) / (2 * np.pi)
     found = []
-    for p in (base.p, declared):
+    for p, own in ((base.p, turns), (declared, None)):
         values = dict(zip(names, map(float, p), strict=True))
-        shapes, feet = measured_shapes(problem, values.get(END_ROLL, 0.0))
+        shapes, feet = measured_shapes(problem, values.get(END_ROLL, 0.0), own)
         found.append(Origin(values, shapes.x, feet, tuple(problem.indices)))
     return tuple(found)
 

@@ -9,7 +9,7 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem, Tolerances
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way
+from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way, twists
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
@@ -52,13 +52,8 @@ def test_twists_are_turned_the_way_that_fits():
     problem.refresh(theta, shapes, feet)
     begun = turned_either_way(problem, Guess(theta, shapes, feet), held, roll)
 
-    true = twists_of(model, measured_shapes(problem, ROLL)[0].x)
-    before, after = (twists_of(model, x) for x in (shapes.x, begun.shapes.x))
+    true = twists(model, measured_shapes(problem, ROLL)[0].x)
+    before, after = (twists(model, x) for x in (shapes.x, begun.shapes.x))
     assert true[0] > 2.0
     assert before[0] < -2.0
     np.testing.assert_allclose(after, true + OFF, atol=0.2)
-
-
-def twists_of(model, x):
-    """Twist [rad] of shapes (m, n_nodes, 4)."""
-    return model.node.difference(x[:, :-1], x[:, 1:])[..., 0].sum(axis=1)
