@@ -87,11 +87,14 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
             shapes, total = follow(shapes, log_ei - direction * min(k, 1) * step, log_ei)
             grid[log_ei] = (shapes, total)
     best = min(grid, key=lambda q: grid[q][1])
+    if not np.isfinite(grid[best][1]):
+        return StiffnessFit(float(np.exp(best)), float("inf"), float("inf"))
     # On the way there some may have lost the branch on which they were measured.
     near = _cold(model, at(best), rest, used) or grid[best][0]
 
     def cost(log_ei: float) -> float:
-        return follow(near, best, log_ei)[1]
+        # Where a pose is lost: worse than any neighbour, but a number that a parabola fits.
+        return min(follow(near, best, log_ei)[1], 10 * grid[best][1])
 
     found = minimize_scalar(
         cost, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-3}
