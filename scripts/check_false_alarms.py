@@ -276,8 +276,10 @@ def run_one(index: int, seed: int, kind: str) -> dict:
     tied = {name for item in diagnosis.added for name in item.equivalents}
     tied |= {rival.candidate.name for item in diagnosis.added for rival in item.rivals}
     explained = diagnosis.verdict != "unexplained"
+    scores = {row.name: (row.score, row.p_value) for row in diagnosis.ranked}
     return {
         "hidden": hidden,
+        "score, p": scores.get(hidden),
         "right": explained and (not named if hidden is None else hidden in named | tied),
         "session": config.cable.name,
         "verdict": diagnosis.verdict,
