@@ -1,4 +1,4 @@
-"""Models of electrical cables from photographs: fit, diagnose, predict, embed."""
+"""Elastic models of cables in the plane and in space: fit, diagnose, predict, embed."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -93,7 +93,7 @@ def _overview() -> str:
     listed = "\n".join(f"  {name:{width}}  {text}" for name, text in COMMANDS.items())
     return (
         "usage: dlo SUBCOMMAND ...\n\n"
-        "Models of electrical cables from photographs: fit, diagnose, predict, embed.\n\n"
+        "Elastic models of cables in the plane and in space: fit, diagnose, predict, embed.\n\n"
         f"subcommands:\n{listed}\n\n{EXAMPLES}\n\n"
         "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
     )
