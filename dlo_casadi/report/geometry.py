@@ -49,8 +49,8 @@ def residual_along(shape: PoseShape, direction: str) -> FloatArray:
 def residual_range(stage: Stage, noise: float) -> tuple[float, float]:
     """From where to where residuals are drawn, in standard deviations `noise` [m] of them.
 
-    Beyond 95 % of the noise and all residuals; of poses that were measured in another equilibrium than the predicted one, which are off by a
-    hundred times as much, only where there are no others.
+    Beyond 95 % of the noise, and all residuals; of poses that were measured in another equilibrium
+    than the predicted one, which are off by a hundred times as much, only where all are.
     """
     shown = [shape.residual for shape in stage.shapes.values() if len(shape.residual)]
     near = [
