@@ -17,7 +17,7 @@ _BESIDE = 2.2  # where the surroundings begin, in blurs beyond the edge
 _BODY = 0.4  # half of the part in the middle that shows the cable's own level, in widths
 _LOCAL = 2.0  # diameters along the cable, over which steps are averaged
 # Widths along the cable to either side over which it is lit alike. Beside a card that hides part of
-# a rendered cable lines are 0.93 mm off with 2, 0.73 mm with 5 and 0.69 mm with 12.
+# a rendered cable lines on a board are 0.93 mm off with 2, 0.73 mm with 5 and 0.69 mm with 12.
 _LIT = 5.0
 _INNER = 0.15  # of the width: nearer to the middle both sides look alike
 _CLEAR = 1.3  # blurs inside an edge: there nine tenths of the step are behind
@@ -174,7 +174,9 @@ def local_directions(
     return np.where(other[:, None], own, direction)
 
 
-def find_edges(profiles: Profiles, direction: Array, shape: EdgeShape) -> Crossings:
+def find_edges(
+    profiles: Profiles, direction: Array, shape: EdgeShape, lit_aside: bool = False
+) -> Crossings:
     """Find both edges of every profile, and the middle between them.
 
     The direction (3,) or (K, 3) weighs the colours.
@@ -187,8 +189,8 @@ def find_edges(profiles: Profiles, direction: Array, shape: EdgeShape) -> Crossi
 
         x_edge = integral_0^out clip(2 Q(x) - 1/2, 0, 1) dx
 
-    The cable's level is the one that differs most from the surroundings, over a third of it, on
-    the side that is turned to the light brighter than on the other.
+    The cable's level is the one that differs most from the surroundings, over a third of it; with
+    `lit_aside` it is another one on the side that is turned to the light.
     """
     data = np.einsum(
         "kmc,kc->km", profiles.values, np.broadcast_to(direction, (len(profiles.t), 3))
@@ -205,10 +207,11 @@ def find_edges(profiles: Profiles, direction: Array, shape: EdgeShape) -> Crossi
         sides = [(side, side[:, -3:].mean(axis=1)) for side in (left, right)]
         around = 0.5 * (sides[0][1] + sides[1][1])
         core = _own_level(np.hstack([left[:, :body], right[:, :body]]), around)
-        limit = _MOST_SHADE * np.abs(core - around)
-        shade = _shading(left, right, reach, shape)
-        shade[np.abs(shade) > limit] = 0.0
-        tilt = median_filter(shade, size=near, mode="nearest")
+        tilt = np.zeros(len(data))
+        if lit_aside:
+            shade = _shading(left, right, reach, shape)
+            shade[np.abs(shade) > _MOST_SHADE * np.abs(core - around)] = 0.0
+            tilt = median_filter(shade, size=near, mode="nearest")
         places = [
             _mean_crossing(side, core + sign * tilt, level, step)
             for sign, (side, level) in zip((-1, 1), sides, strict=True)
