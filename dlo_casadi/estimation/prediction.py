@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Given, Shapes
+from dlo_casadi.composition import END_ROLL
 from dlo_casadi.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.chords import line_nodes
@@ -54,6 +55,10 @@ class Prediction:
         return tipping is not None and tipping < EITHER
 
 
+# Turns that tell which way round a clamp is rolled by half a turn, see `Pose`.
+WAYS_ROUND = (0.5, -0.5)
+
+
 @dataclass(frozen=True)
 class MeasuredBranch:
     """The equilibrium in which a pose was measured, where another one is predicted.
@@ -65,10 +70,13 @@ class MeasuredBranch:
         the branch.
     branch : "ccw", "cw", "previous" or None
         What the pose has to name for this equilibrium to be predicted; None if no name does.
+    turns : 0.5, -0.5 or None
+        The same of a cable in space that is twisted the other way round, see `Pose`.
     """
 
     prediction: Prediction
     branch: PoseBranch | None
+    turns: float | None = None
 
 
 def predict_each(
@@ -194,27 +202,43 @@ def measured_elsewhere(
         Nodes (n_nodes, coordinates) of the poses whose shapes a fit has found, by name; others
         start from the chords of their points.
     """
-    known = fitted or {}
+    fits, lines = fitted or {}, [item.traced for item in measured]
     starts = [
-        known.get(item.pose.name)
-        if item.pose.name in known
-        else line_nodes(item.points, item.pose, model.chain, item.places(model.cable.length))
-        if item.readable
-        else None
-        for item in (one.traced for one in measured)
+        [fits[line.pose.name]] if line.pose.name in fits else _along_line(model, p, line)
+        for line in lines
     ]
-    solved = predict_poses(model, p, rest, [item.pose for item in measured], starts)
-    return [
-        found
-        if item.readable
-        and known is not None
-        and found is not None
-        and found.equilibrium.stable
-        and not model.node.same(known.equilibrium.x, found.equilibrium.x, NEARBY)
-        and _square(found, item) < _square(known, item)
-        else None
-        for item, known, found in zip(measured, predictions, solved, strict=True)
-    ]
+    of = [j for j, ways in enumerate(starts) for _ in ways]
+    poses = [measured[j].pose for j in of]
+    solved = predict_poses(model, p, rest, poses, [x for ways in starts for x in ways])
+    out: list[Prediction | None] = []
+    for j, (item, known) in enumerate(zip(measured, predictions, strict=True)):
+        ways = [x for k, x in zip(of, solved, strict=True) if k == j and x is not None]
+        stable = [x for x in ways if x.equilibrium.stable]
+        if not (item.readable and known is not None and stable):
+            out.append(None)
+            continue
+        found = stable[int(np.argmin([_square(x, item) for x in stable]))]
+        same = model.node.same(known.equilibrium.x, found.equilibrium.x, NEARBY)
+        out.append(None if same or _square(found, item) >= _square(known, item) else found)
+    return out
+
+
+def _along_line(model: CableModel, p: FloatArray, line: MeasuredPose) -> list[FloatArray | None]:
+    """Nodes along a measured line; between two clamps in space twisted either way round."""
+    if not line.readable:
+        return [None]
+    pose = line.pose
+    if END_ROLL in model.names:
+        pose = pose.rolled(float(p[model.names.index(END_ROLL)]))
+    either = _either_way(model, pose) and not model.has_state
+    ways = [replace(pose, turns=turns) for turns in WAYS_ROUND] if either else [pose]
+    places = line.places(model.cable.length)
+    return [line_nodes(line.points, way, model.chain, places) for way in ways]
+
+
+def _either_way(model: CableModel, pose: Pose) -> bool:
+    """Whether a cable may be twisted either way round: in space, between clamps, not told."""
+    return model.in_space and not pose.turns and (model.start, model.end) == ("clamped", "clamped")
 
 
 def measured_branches(
@@ -232,7 +256,9 @@ def measured_branches(
     for item, known, found in zip(measured, predictions, others, strict=True):
         branch = None
         if found is not None:
-            branch = MeasuredBranch(found, _name_of(model, p, item.pose, found, last))
+            turns = _turns_of(model, p, item.pose, found)
+            named = None if turns else _name_of(model, p, item.pose, found, last)
+            branch = MeasuredBranch(found, named, turns)
         out.append(branch)
         there = found or known
         last = last if there is None else (item.pose, there.equilibrium.x)
@@ -242,6 +268,18 @@ def measured_branches(
 def _square(prediction: Prediction, item: MeasuredPose) -> float:
     """Mean square distance [m^2] of measured points to a prediction."""
     return float((item.distances(prediction.curve) ** 2).mean())
+
+
+def _turns_of(model: CableModel, p: FloatArray, pose: Pose, found: Prediction) -> float | None:
+    """The turns that a pose between two clamps has to tell for an equilibrium to be predicted."""
+    if not _either_way(model, pose):
+        return None
+    for turns in WAYS_ROUND:
+        with suppress(EquilibriumError):
+            eq = solve_equilibrium(model, p, found.rest, replace(pose, turns=turns))
+            if model.node.same(eq.x, found.equilibrium.x, NEARBY):
+                return turns
+    return None
 
 
 def _name_of(

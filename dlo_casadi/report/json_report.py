@@ -164,6 +164,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
                 "rmse": stage.shapes[pose].rmse,
                 "rmse_measured_branch": found.rmse,
                 "branch": found.branch,
+                "turns": found.turns,
             }
             for pose, found in stage.other_branch.items()
         },

@@ -302,8 +302,7 @@ def predicted_share(outcome: Outcome, stage: Stage) -> str:
 
 def branch_text(found: BranchShape) -> str:
     """Error of a pose in the equilibrium in which it was measured, and how to choose that one."""
-    cure = "no branch chooses it" if found.branch is None else f"branch: {found.branch}"
-    return f"{ON_BRANCH} {_mm(found.rmse)} ({cure})"
+    return f"{ON_BRANCH} {_mm(found.rmse)} ({found.chosen_by or 'no branch chooses it'})"
 
 
 def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:

@@ -75,10 +75,20 @@ class BranchShape:
         Root mean square distance of the measured points to it.
     branch : "ccw", "cw", "previous" or None
         What the pose has to name for it to be predicted; None if no name does.
+    turns : 0.5, -0.5 or None
+        Or tell, see `Pose`.
     """
 
     rmse: float
     branch: PoseBranch | None
+    turns: float | None = None
+
+    @property
+    def chosen_by(self) -> str | None:
+        """What a pose has to hold for it to be predicted, as in a configuration."""
+        if self.turns:
+            return f"turns: {self.turns:g}"
+        return f"branch: {self.branch}" if self.branch else None
 
 
 @dataclass(frozen=True)

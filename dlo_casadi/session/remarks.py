@@ -12,7 +12,7 @@ from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.estimation.mesh import allowed_mesh_error
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.pose import SIGNS, PoseBranch
+from dlo_casadi.pose import SIGNS
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
 from dlo_casadi.thresholds import EITHER, FIXTURES, MESH_SHARE, UNSEEN
 
@@ -60,14 +60,15 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
     for stage in stages:
         if stage.name not in ("batch", "closed"):
             continue
-        for branch in dict.fromkeys(shape.branch for shape in stage.other_branch.values()):
-            found = {k: shape for k, shape in stage.other_branch.items() if shape.branch == branch}
+        others = stage.other_branch
+        for chosen_by in dict.fromkeys(shape.chosen_by for shape in others.values()):
+            found = {k: shape for k, shape in others.items() if shape.chosen_by == chosen_by}
             predicted = max(stage.shapes[name].rmse or 0.0 for name in found)
             measured = max(shape.rmse for shape in found.values())
             lines.append(
                 f"stage {stage.name}: {', '.join(found)}: the equilibrium of lowest energy, which "
                 f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
-                f"off, on the measured branch {1e3 * measured:.3g} mm; {_cure(branch)}"
+                f"off, on the measured branch {1e3 * measured:.3g} mm; {_cure(chosen_by)}"
             )
     for stage in stages[-1:]:
         either = [
@@ -86,10 +87,10 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
     return lines
 
 
-def _cure(branch: PoseBranch | None) -> str:
-    if branch is None:
+def _cure(chosen_by: str | None) -> str:
+    if chosen_by is None:
         return "no `branch` of these poses would choose it: take them again, or leave them out"
-    return f"`branch: {branch}` in these poses chooses it"
+    return f"`{chosen_by}` in these poses chooses it"
 
 
 def weight_warning(weight: Mapping[str, Any], expected: float) -> str:
@@ -183,7 +184,7 @@ def doubts_of(
         for name, other in elsewhere.items():
             text += (
                 f". The model's lowest equilibrium in {name} is another one than the measured one, "
-                f"to which it comes within {1e3 * other.rmse:.3g} mm; {_cure(other.branch)}"
+                f"to which it comes within {1e3 * other.rmse:.3g} mm; {_cure(other.chosen_by)}"
             )
         lines.append(text)
     return tuple(lines)

@@ -61,7 +61,7 @@ def pose_shape(
         gap = item.traced.points - curve.at(s)
     if item.readable and other is not None:
         distances = item.distances(other.prediction.curve)
-        branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch)
+        branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch, other.turns)
     return PoseShape(
         curve.at(places),
         rmse,

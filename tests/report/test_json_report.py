@@ -113,7 +113,7 @@ def test_a_pose_on_another_branch_is_there_with_both_errors(outcome):
     found = replace(outcome, stages=(*outcome.stages[:-1], replace(batch, shapes=shapes)))
 
     entry = report_dict(found)["stages"][-1]
-    row = {"rmse": shape.rmse, "rmse_measured_branch": 1e-4, "branch": "cw"}
+    row = {"rmse": shape.rmse, "rmse_measured_branch": 1e-4, "branch": "cw", "turns": None}
     assert entry["other_branch"] == {name: row}
     assert entry["held_out"] == {"predicted": 3, "declared": 3, "missing": []}
 

@@ -10,13 +10,17 @@ from dlo_casadi.effects import Cable
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.prediction import predict_poses, predicted_shapes
+from dlo_casadi.estimation.prediction import (
+    measured_branches,
+    predict_poses,
+    predicted_shapes,
+)
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler
 from dlo_casadi.session.simpler import not_worse
-from dlo_casadi.session.stages import fit_stage, initial_stage
+from dlo_casadi.session.stages import fit_stage, initial_stage, pose_shape
 
 # Stiff beside its weight, EI / (w L^3) = 3: its bow is stable upwards, and lower downwards.
 MODEL = CableModel(Cable(0.5, 0.02, 0.006, 0.08), 12, n_rest=0)
@@ -142,3 +146,24 @@ def test_a_fit_is_no_worse_than_the_stiffness_alone():
     again = not_worse(stopped, [stages[0], stage])
     assert again.point.objective < 1.01 * fit.point.objective
     assert again.converged
+
+
+def test_a_cable_twisted_the_other_way_round_is_told_by_its_turns():
+    """Its end clamp is rolled by nearly half a turn."""
+    cable = Cable(1.0, 0.1, 0.01, bending_stiffness=0.05, torsional_stiffness=0.04)
+    held = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
+    model = CableModel(cable, 10, "quadratic", **held)
+    ahead, rolled = (0.0, 0.0, 0.0, 1.0), (np.sin(1.45), 0.0, 0.0, np.cos(1.45))
+    pose = Pose((0, 0, 0), (0.9, 0.1, 0), start_orientation=ahead, end_orientation=rolled)
+    flat = np.zeros(model.chain.n_rests)
+    poses = [pose, *(replace(pose, turns=turns) for turns in (0.5, -0.5))]
+    predicted, *either = predict_poses(model, model.nominal, flat, poses)
+    (turns, other) = max(
+        zip((0.5, -0.5), either, strict=True), key=lambda way: way[1].equilibrium.energy
+    )
+    item = MeasuredPose.of_points(pose, other.curve.at(np.linspace(0.05, 0.95, 20)))
+    (found,) = measured_branches(model, model.nominal, flat, [item], [predicted])
+    assert (found.branch, found.turns) == (None, turns)
+    shape = pose_shape(predicted, item, found).measured_branch
+    assert shape.chosen_by == f"turns: {turns}"
+    assert shape.rmse < 1e-4
