@@ -255,7 +255,11 @@ def _pose(
     if model.end == "free" and end is not None:
         raise DloError(f"the end of {name!r} is free: it cannot be held at {end} m")
     if model.end != "free" and end is None:
-        raise DloError(f"the end of {name!r} is {model.end}: where is it? (end)")
+        place = "X Y Z" if model.in_space else "X Y"
+        raise DloError(
+            f"the end of {name!r} is {model.end}: where is it?\n"
+            f"  Try: --end {place} [m], in Python end."
+        )
     turns = _number(turns, "turns", "full turns")
     if turns and not (model.in_space and model.start == model.end == "clamped"):
         raise DloError(f"{name!r} has no turns: it is not in space and clamped at both ends")
@@ -313,6 +317,10 @@ def _point(values: Sequence[float], what: str, size: int) -> tuple[float, ...]:
 
 def _orientation(values: Sequence[float], what: str) -> tuple[float, ...]:
     quaternion = _finite(values)
+    if not quaternion:
+        raise DloError(
+            f"{what}: four finite numbers [qx, qy, qz, qw] belong here, found {values!r}"
+        )
     if wrong := implausible_quaternion(quaternion):
         raise DloError(f"{what}: {wrong}, found {values!r}")
     return quaternion

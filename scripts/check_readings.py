@@ -1,9 +1,11 @@
 """What readings of forces and moments tell, on sessions simulated by this toolkit's own model.
 
     python scripts/check_readings.py [--sets 4] [--tables clean mass loads clamps] [--jobs N]
+        [--figure power.png]
 
 The cable and the poses of configs/cable.yaml, 0.3 mm of white noise, fixtures and sensors off by
-draws from their tolerances; forces of 15 mN and moments of 1 mN m of noise. Four tables:
+draws from their tolerances; forces of 15 mN and moments of 1 mN m of noise. Four tables, the last
+two also as a figure:
 
 - clean: readings of the end's force on three poses, nothing hidden: false alarms of the diagnosis,
   and how often intervals of EI hold the truth;
@@ -42,6 +44,7 @@ from dlo_casadi.estimation.mesh import fine_enough
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.report.canvas import BLUE, GREY, VERMILLION, figure
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import conditions
@@ -49,10 +52,11 @@ from dlo_casadi.session.measure import conditions
 ROOT = Path(__file__).resolve().parent.parent
 STD, FORCE_STD, MOMENT_STD = 3e-4, 0.015, 1e-3  # m, N, N m
 TABLES = ("clean", "mass", "loads", "clamps")
-NUMBERS = (0, 3, 12)  # of poses with readings
+NUMBERS = (0, 1, 3, 6, 12)  # of poses with readings
 MASS, POSITION = 0.03, 0.3  # kg, m: of the lumped mass
-STIFFNESS, HEADING = 600.0, 0.35  # N m/rad, rad: of the spring at the start
+STIFFNESS, HEADING = 1500.0, 0.35  # N m/rad, rad: of the spring at the start
 APART = 10.0  # of twice the log evidence, as BIC_APART of the diagnosis
+RIVALS = {"loads": "lumped_mass over point_force", "clamps": "start_spring over clamp_angle"}
 
 
 def measured_with(config: Config, readings: tuple[str, ...], number: int) -> Config:
@@ -240,6 +244,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tables", nargs="+", choices=TABLES, default=TABLES)
     parser.add_argument("--output", type=Path)
+    parser.add_argument("--figure", type=Path, help="of what is told apart (loads, clamps)")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     args = parser.parse_args()
     rows = []
@@ -251,6 +256,32 @@ def main() -> None:
     if args.output:
         write_file(args.output, json.dumps(rows))
     print_tables(rows)
+    if args.figure:
+        draw(rows, args.figure)
+
+
+def draw(rows: list[dict], path: Path) -> None:
+    """Evidence against the number of readings: medians and quartiles of all sets."""
+    with figure(path, (6.4, 4.2)) as drawing:
+        axes = drawing.subplots()
+        for (table, label), color in zip(RIVALS.items(), (BLUE, VERMILLION), strict=True):
+            if table in rows[0]:
+                quartiles = np.percentile(gains_of(rows, table), (25, 50, 75), axis=0)
+                axes.fill_between(NUMBERS, quartiles[0], quartiles[2], color=color, alpha=0.2)
+                axes.plot(NUMBERS, quartiles[1], "o-", color=color, label=label)
+        axes.axhline(APART, color=GREY, ls="--", label="told apart above")
+        axes.set(
+            xlabel="poses with readings",
+            ylabel="twice the log evidence,\nright model over wrong one",
+            xticks=NUMBERS,
+            title=f"{len(rows)} simulated cables: median and quartiles",
+        )
+        axes.legend()
+
+
+def gains_of(rows: list[dict], table: str) -> np.ndarray:
+    """Twice the log evidence (sets, numbers) of the right model over the wrong one."""
+    return np.array([[own["gain"] for own in row[table]] for row in rows])
 
 
 def print_tables(rows: list[dict]) -> None:
@@ -258,7 +289,11 @@ def print_tables(rows: list[dict]) -> None:
     found = [row["clean"] for row in rows if "clean" in row]
     if found:
         alarms = sum(bool(row["added"]) or row["unexplained"] for row in found)
-        print(f"clean: {alarms} false alarms of {len(found)}, EI inside {share(found, 'inside')}")
+        off = [abs(row["error"]) < 1.96 * row["std"] for row in found]
+        print(
+            f"clean: {alarms} false alarms of {len(found)}, EI inside its interval "
+            f"{share(found, 'inside')}, within 1.96 standard deviations {sum(off)}"
+        )
     known = [row["mass"] for row in rows if "mass" in row]
     for what in ("EI", "mass") if known else ():
         worst = max(abs(row[what]) for row in known)
@@ -267,13 +302,13 @@ def print_tables(rows: list[dict]) -> None:
             f"mass unknown: {what} off by {rms:.2%} RMS, {worst:.2%} at most, inside "
             f"{share(known, f'{what}_inside')}"
         )
-    for table, what in (("loads", "lumped_mass | point_force"), ("clamps", "spring | clamp")):
+    for table, what in RIVALS.items():
         if table not in rows[0]:
             continue
         print(f"{what}, poses with readings: share told apart (by {APART:g}), median")
         for k, number in enumerate(NUMBERS):
-            gains = [row[table][k]["gain"] for row in rows]
-            told_apart = float(np.mean(np.array(gains) > APART))
+            gains = gains_of(rows, table)[:, k]
+            told_apart = float(np.mean(gains > APART))
             print(f"  {number:3d}: {told_apart:.0%}, {np.median(gains):.1f}")
 
 

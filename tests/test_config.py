@@ -198,6 +198,12 @@ def test_a_configuration_cannot_be_changed(tmp_path):
         # units
         ("length: 0.8", "length: 812.5", 3, "812.5 m: units are SI, did you mean 0.8125?"),
         ("mass: 0.23", "mass: 230", 4, "230 kg for 0.8 m: units are SI, did you mean 0.23?"),
+        (
+            "1.28e-2",
+            "1.0e-4",
+            4,
+            "times as dense as water: units are SI, diameter and length in m?",
+        ),
         ("1.28e-2", "12.8", 5, "12.8 m is larger than the length 0.8 m.* did you mean 0.0128?"),
         # words
         ("held_out", "test", 14, "role: allowed are 'fit' or 'held_out', found 'test'"),
@@ -620,7 +626,6 @@ def test_reference_points_are_two(tmp_path):
     ("old", "new", "warning"),
     [
         ("4.55e8", "455", "youngs_modulus 455 Pa is softer than any cable"),
-        ("1.28e-2", "1.0e-4", "times as dense as water"),
         ("length: 0.8", "length: 81", "81 m long, but its ends are never more than 0.5"),
         ("-9.81", "-9810", "gravity is 9810 m/s"),
         ("3e-4", "0.3", "std 0.3 m is large"),

@@ -50,6 +50,9 @@ _THINNEST = 1.0e-6
 _LIGHTEST = 1.0e-10
 # A metre of a submarine power cable has 100 kg.
 _HEAVIEST, _HEAVIEST_PER_METRE = 1000.0, 100.0
+# Osmium, the densest metal [kg/m^3]; some forty times as much only a strip whose thickness is
+# declared as its diameter seems to have: one of 0.9 mm, 0.25 m and 17 g has 1.1e5.
+_DENSEST_METAL, _DENSEST = 2.26e4, 1.0e6
 # A carbon fibre has E pi d^4 / 64 = 2.3e11 pi (5e-6)^4 / 64 = 7e-12 N m^2, a steel bar of 0.5 m
 # 6e8 N m^2: the bounds of the fit itself.
 STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
@@ -110,6 +113,13 @@ def implausible_sizes(
         text = (
             f"{mass:g} kg: no cable is lighter than {_LIGHTEST:g} kg; to leave its weight out, "
             "write gravity: [0, 0]"
+        )
+        problems.append(Problem(("mass",), text))
+    if not problems and (density := mass / (length * math.pi * diameter**2 / 4)) > _DENSEST:
+        hint = f"did you mean {mass / 1e3:g}? " if density / 1e3 < _DENSEST_METAL else ""
+        text = (
+            f"{mass:g} kg make it {density / 1e3:.3g} times as dense as water: units are SI, {hint}"
+            "diameter and length in m?"
         )
         problems.append(Problem(("mass",), text))
     if stiffness is not None:

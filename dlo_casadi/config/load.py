@@ -307,12 +307,6 @@ def _oddities(file: File) -> list[str]:
             f"cable.mass is not declared: stages before the batch take {cable.prior_mass:.3g} kg, "
             "that of a solid cable of this diameter; the readings tell it from there on"
         )
-    density = cable.prior_mass / (cable.length * math.pi * cable.diameter**2 / 4.0)
-    if density > 1.0e6:
-        warnings.append(
-            f"the cable is {density / 1000:.3g} times as dense as water: "
-            "mass in kg, diameter and length in m?"
-        )
     spans = [math.dist(pose.start, pose.end) for pose in poses if pose.end is not None]
     if spans and 0.0 < 50.0 * max(spans) < cable.length:
         warnings.append(

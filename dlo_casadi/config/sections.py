@@ -30,7 +30,7 @@ from dlo_casadi.config.limits import (
     implausible_pixels,
     implausible_sizes,
 )
-from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean, show
+from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, did_you_mean, show
 from dlo_casadi.ends import REACTIONS
 from dlo_casadi.errors import well_formed
 from dlo_casadi.thresholds import SIGNIFICANCE
@@ -434,6 +434,8 @@ class Pose(Section):
     def _absolute(cls, value: object, info: ValidationInfo) -> object:
         if not isinstance(value, str | Path) or not str(value).strip():
             raise ValueError(f"a file name belongs here, found {show(value)}")
+        if value == PLACEHOLDER:
+            raise ValueError("a file name belongs here")
         folder = (info.context or {}).get("folder", Path())
         return (folder / value).absolute()
 

@@ -47,7 +47,7 @@ class Structure:
         of its plane, a scale), the same in all poses; as a normal score, at most LARGEST_SCORE.
     per_pose : dict
         Slow energy per degree of freedom by pose name.
-    p_systematic : float
+    p_systematic : float or None
         Where the cable does not repeat: probability of as much that poses which are alike have in
         common, if each hanging has a rest curvature of its own and nothing else is missing.
     """
@@ -61,12 +61,16 @@ class Structure:
     span_z: float
     position_z: float
     per_pose: dict[str, float]
-    p_systematic: float = 1.0
+    p_systematic: float | None = None
 
     @property
     def p_noise(self) -> float:
-        """Probability of the residual if it is noise and rest curvatures of each hanging's own."""
-        return min(self.p_value, self.p_systematic)
+        """Probability of the residual if it is noise and rest curvatures of each hanging's own.
+
+        Of the less likely of the tests that were made, for as many (Sidak).
+        """
+        made = [p for p in (self.p_value, self.p_systematic) if p is not None]
+        return 1 - (1 - min(made)) ** len(made)
 
 
 def noise_degrees(fit: Fit) -> float:
@@ -144,10 +148,10 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     )
 
 
-def _systematic(fit: Fit) -> float:
-    """Probability of what poses that are alike have in common; 1 where the cable repeats."""
+def _systematic(fit: Fit) -> float | None:
+    """Probability of what poses that are alike have in common; None where the cable repeats."""
     if fit.problem.rest_scatter.std == 0:
-        return 1.0
+        return None
     found = rest_scatter_of(fit.problem, fit.point, fit.linearization, fit.noise)
     return found.p_systematic
 

@@ -23,7 +23,13 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes
+from dlo_casadi.estimation.start import (
+    Guess,
+    all_at_once,
+    equilibria_near,
+    measured_shapes,
+    turned_either_way,
+)
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 from dlo_casadi.solve import continued, solve_equilibrium
@@ -35,8 +41,9 @@ FloatArray = NDArray[np.floating]
 DECADES = (0, -1, 1, -2, 2, -3, 3)
 # Rolls of the end [rad] about which twists are counted in turn: a standard deviation to both sides.
 ROLLS = (0.0, 1.0, -1.0)
-# And two, tried where from those nothing comes near: a cable rolled by 2.05 rad was not found.
-FAR_ROLLS = (2.0, -2.0)
+# Tried where from those nothing comes near, all twists either way round: a cable rolled by 2.05 rad
+# was not found, nor one by 2.3 rad of which one pose's twist came within 0.1 rad of half a turn.
+FAR_ROLLS = (0.0, 1.0, -1.0, 2.0, -2.0)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
 # Iterations of all starts, and how many more the promising ones take in space, where frames take
 # longer: at the true stiffnesses, none of three sessions in which an effect is missing had settled
@@ -72,11 +79,13 @@ def starting_points(
     theta: FloatArray,
     decades: Sequence[float] = DECADES,
     rolls: Sequence[float] = ROLLS,
+    *,
+    either_way: bool = False,
 ) -> list[Point]:
     """Equilibria near the measured shapes for stiffnesses over decades, best first.
 
     All starts take a few iterations, then the most promising take more, until as many as are
-    descended from have led to equilibria.
+    descended from have led to equilibria. `either_way`: see `turned_either_way`.
     """
     names = problem.unknowns.names
     # Bending and torsion go together: their ratio is known better than either.
@@ -90,12 +99,17 @@ def starting_points(
         shapes, feet = measured_shapes(problem, roll)
         if not problem.has_metric:
             problem.refresh(theta, shapes, feet)
+        rolled = theta.copy()
+        if roll:
+            own = names.index(END_ROLL)
+            rolled[own] += roll / problem.unknowns.scales[own]
+        if either_way:
+            still = held | (np.array(names) == END_ROLL)
+            turned = turned_either_way(problem, Guess(rolled, shapes, feet), still, roll)
+            shapes, feet = turned.shapes, turned.feet
         for decade in decades:
-            start = theta.copy()
+            start = rolled.copy()
             start[stiffnesses] += decade * np.log(10)
-            if roll:
-                own = names.index(END_ROLL)
-                start[own] += roll / problem.unknowns.scales[own]
             guess = all_at_once(problem, Guess(start, shapes, feet), held, FIRST_LOOK)
             if guess is not None:
                 guesses.append(guess)
@@ -225,7 +239,7 @@ def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]
         )
     if model.in_space and _misfits(problem, best):
         if END_ROLL in problem.unknowns.names:
-            other = _search(problem, theta, decades, FAR_ROLLS)
+            other = _search(problem, theta, decades, FAR_ROLLS, either_way=True)
             best = other if other is not None and other.objective < best.objective else best
         if _misfits(problem, best):
             return _fit_to_misfit(problem, best)
@@ -244,6 +258,8 @@ def _search(
     theta: FloatArray,
     decades: Sequence[float],
     rolls: Sequence[float] = ROLLS,
+    *,
+    either_way: bool = False,
 ) -> Point | None:
     """The best of the minima that the starts over decades of stiffness lead to.
 
@@ -252,10 +268,10 @@ def _search(
     """
     loosely = problem.noise.doubted(SEARCH_STD * problem.unknowns.model.cable.length)
     if not problem.unknowns.model.in_space or loosely is problem.noise:
-        return _best(problem, theta, decades, rolls)
+        return _best(problem, theta, decades, rolls, either_way=either_way)
     rest = problem.rest_scatter
     loose = problem.changed(loosely, problem.roughness_std, problem.scatter, rest)
-    found = _best(loose, theta, decades, rolls)
+    found = _best(loose, theta, decades, rolls, either_way=either_way)
     if found is None:
         return None
     return problem.taken_over(found)
@@ -303,11 +319,13 @@ def _best(
     theta: FloatArray,
     decades: Sequence[float],
     rolls: Sequence[float] = ROLLS,
+    *,
+    either_way: bool = False,
 ) -> Point | None:
     """Descend from the most promising starts."""
-    points = starting_points(problem, theta, decades, rolls) or starting_points(
-        problem, theta, BETWEEN_DECADES, rolls
-    )
+    points: list[Point] = []
+    for tried in (decades, BETWEEN_DECADES):
+        points = points or starting_points(problem, theta, tried, rolls, either_way=either_way)
     best: Point | None = None
     for point in points:
         steps = STEPS_OF_A_RIVAL if best else 40

@@ -27,11 +27,16 @@ _STEPS_WITHOUT_DEPTH = 20
 SETTLED = 1e-3
 # No node turns farther in a step [rad]: linearised, balance holds for moderate turns. A judgement.
 LONGEST = 0.7
+# Twist [rad] from which the other way round is tried: rolls are tried one radian apart, and a
+# quarter of a turn of what is missing may be in the rest shape. Iterations that tell the two apart.
+EITHER_WAY, LOOK = np.pi / 2, 4
 # A step is taken back where the objective has risen beyond this factor, and this part is tried.
 RISE, PART = 1.5, 0.3
 
 
-def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, list[FloatArray]]:
+def measured_shapes(
+    problem: BatchProblem, roll: float = 0.0, turns: FloatArray | None = None
+) -> tuple[Shapes, list[FloatArray]]:
     """Shapes of all poses: along the measured line where there is one, guessed elsewhere.
 
     Gauss-Newton on the kinematics alone, all poses in step: distances of the points, with a
@@ -42,6 +47,8 @@ def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, l
     roll : float [rad]
         Of the cable in its end clamp, in space: it decides which of the twists that reach the
         clamp is the one nearest to none.
+    turns : (m,), optional
+        Turns of twist, see `Pose`, to which each is the nearest; by default as the poses tell.
 
     Returns
     -------
@@ -61,7 +68,9 @@ def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, l
     along = predicted.copy()
     for j in used:
         item = problem.measured[j].traced
-        along[j] = line_nodes(item.points, item.pose.rolled(roll), chain, item.places(chain.length))
+        pose = item.pose.rolled(roll)
+        pose = pose if turns is None else replace(pose, turns=float(turns[j]))
+        along[j] = line_nodes(item.points, pose, chain, item.places(chain.length))
     shapes, feet, cost = _kinematics(problem, sweep, along, roll)
     alone = [k for k, j in enumerate(used) if not problem.measured[j].has_line]
     if alone:
@@ -71,6 +80,42 @@ def measured_shapes(problem: BatchProblem, roll: float = 0.0) -> tuple[Shapes, l
             if costs[k] < cost[k]:
                 shapes.x[used[k]], feet[k] = others.x[used[k]], places[k]
     return shapes, feet
+
+
+def turned_either_way(
+    problem: BatchProblem, guess: Guess, held: NDArray[np.bool_], roll: float
+) -> Guess:
+    """A guess whose poses are twisted the other way round where that fits better.
+
+    Where the end clamp is rolled by nearly half a turn and the pose does not tell its turns, the
+    twist nearest to none may be either way round within what is known of the roll; poses are
+    tried one by one, the most twisted first.
+
+    Parameters
+    ----------
+    held : (size,) bool
+        Entries of theta that stay where they are; the roll should.
+    roll : float [rad]
+        Of the cable in its end clamp, by which the guess's shapes were found.
+    """
+    node, x = problem.unknowns.model.node, guess.shapes.x
+    twist = node.difference(x[:, :-1], x[:, 1:])[..., 0].sum(axis=1)
+    order = [j for j in np.argsort(-np.abs(twist)) if abs(twist[j]) > EITHER_WAY]
+    order = [j for j in order if j in problem.used and not problem.measured[j].pose.turns]
+    first = all_at_once(problem, guess, held, LOOK) if order else None
+    if first is None:
+        return guess
+    others, places = measured_shapes(problem, roll, -np.sign(twist) / 2)
+    least = first.objective
+    for j in order:
+        rows, feet = guess.shapes.x.copy(), list(guess.feet)
+        k = problem.used.index(j)
+        rows[j], feet[k] = others.x[j], places[k]
+        other = replace(guess, shapes=replace(guess.shapes, x=rows), feet=feet)
+        tried = all_at_once(problem, other, held, LOOK)
+        if tried is not None and tried.objective < least:
+            guess, least = other, tried.objective
+    return guess
 
 
 def _kinematics(

@@ -51,6 +51,8 @@ FloatArray = NDArray[np.floating]
 _POSES_A_PAGE = 20
 _HELD_OUT = PURPLE
 _HELD_OUT_TEXT = "#8C3B6C"
+# A candidate that was not refitted.
+_UNTRIED = "#C8C8C8"
 # A typical deviation is drawn about this share of the cable's length wide.
 _VISIBLE = 0.02
 _FACTORS = (1, 5, 10, 20, 50, 100)
@@ -483,7 +485,8 @@ def draw_candidates(path: Path, outcome: Outcome) -> None:
     with figure(path, (8.5, 1.9 + 0.3 * len(rows))) as drawing:
         axes = drawing.subplots()
         for k, (row, score) in enumerate(zip(rows, scores, strict=True)):
-            known = {True: BLUE, False: GREY}[row["name"] in added]
+            lost = _UNTRIED if row["rmse_cross_validated"] is None else GREY
+            known = BLUE if row["name"] in added else lost
             color = ORANGE if row["name"] in tied else known
             axes.barh(-k, score, height=0.72, color=color)
             error = row["rmse_cross_validated"]
@@ -498,11 +501,13 @@ def draw_candidates(path: Path, outcome: Outcome) -> None:
         handles = [
             Patch(color=BLUE, label="added to the model"),
             Patch(color=ORANGE, label="cannot be told apart from it"),
-            Patch(color=GREY, label="not needed"),
+            Patch(color=GREY, label=f"refitted, {'explains less' if added else 'not enough'}"),
+            Patch(color=_UNTRIED, label="not refitted: others promise more"),
         ]
-        shown = [bool(added), bool(tied), True]
+        refitted = [row["rmse_cross_validated"] is not None for row in rows]
+        shown = [bool(added), bool(tied), sum(refitted) > len(added | tied), not all(refitted)]
         handles = [handle for handle, show in zip(handles, shown, strict=True) if show]
-        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
+        drawing.legend(handles=handles, loc="outside lower center", ncols=2)
         title = "what the declared model may lack: refits by BIC, then by score"
         if outcome.verdict == "unexplained":
             title = "candidates tried; what is left is not explained by any"

@@ -104,8 +104,10 @@ def trace_cable(
         curve = fit_curve(t, points, sound.astype(float), 2 * diameter, 0.5 * diameter)
         usual = sound
     raw = sample_profiles(bright, view, curve, t, diameter)
-    rough = find_edges(average(raw, raw.inside, _RAW * diameter), direction, shape)
-    fine = find_edges(average(raw, sound, FINE * diameter), direction, shape)
+    # In a plane light shifts all photographs alike, harmonics that `edge_bias` takes up better: EI
+    # of the rendered `connector` is 0.2 % off then, 2 % with what is left of them here.
+    rough = find_edges(average(raw, raw.inside, _RAW * diameter), direction, shape, in_space)
+    fine = find_edges(average(raw, sound, FINE * diameter), direction, shape, in_space)
     sound = _without_rims(
         raw.inside & _is_usual(rough, sound, diameter) & _is_usual(fine, sound, diameter)
     )

@@ -72,11 +72,12 @@ def test_a_random_rest_curvature_is_found_beside_unknown_noise():
 
 
 def test_a_cable_that_repeats_has_none():
-    """A threshold of one percent: at most one of twenty sessions."""
+    """A threshold of five percent for the best of three smoothnesses: three of twenty at most."""
     found = [
         estimate_rest_scatter(RestLikelihood(*session(0.0, seed=k))).rest.std for k in range(20)
     ]
-    assert np.count_nonzero(found) <= 1
+    assert np.count_nonzero(found) <= 3
+    assert np.median(found) == 0
 
 
 def test_what_poses_that_are_alike_have_in_common_is_not_random():
