@@ -39,6 +39,7 @@ from dlo_casadi.report.geometry import (
     magnified,
     measured_line,
     residual_along,
+    residual_range,
     rest_about,
 )
 from dlo_casadi.report.overlay import write_overlays
@@ -217,6 +218,9 @@ def _draw_pose(
     factor: int,
     place: Callable[[FloatArray], FloatArray],
 ) -> None:
+    last = lines[-1][0].shapes.get(pose.name) if lines else None
+    elsewhere = last is not None and last.measured_branch is not None
+    factor = 1 if elsewhere else factor  # so far off, larger deviations would leave the picture
     for stage, color, style in lines:
         shape = stage.shapes.get(pose.name)
         if shape is not None:
@@ -229,7 +233,6 @@ def _draw_pose(
         shown = pose.points[:: max(1, len(pose.points) // 60)]
         axes.plot(*place(shown).T, ".", color=BLACK, ms=2.5)
     axes.set_aspect("equal")
-    last = lines[-1][0].shapes.get(pose.name) if lines else None
     if last is not None:
         ends = place(last.curve[[0, -1]])
         axes.plot(*ends[0], "s", color=BLACK, ms=4)
@@ -244,7 +247,7 @@ def _draw_pose(
     if last is not None and not last.stable:
         title += ", unstable"
     if last is not None and last.measured_branch is not None:
-        title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch"
+        title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch; true size"
     axes.set_title(title)
     if pose.role == "held_out":
         axes.title.set_color(_HELD_OUT_TEXT)
@@ -301,6 +304,7 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
             along = direction and f", along {direction}"
             axes.set_title(label_of(stage, outcome) + along + quality, loc="left")
             axes.set_ylabel("distance / noise")
+            axes.set_ylim(residual_range(stage, outcome.measurement.std))
         grid[-1, 0].set_xlabel("arc length from the start s [m]")
         grid[-1, 0].set_xlim(0, outcome.config.cable.length)
         handles = [Line2D([], [], color=BLUE, label="fit pose")]
@@ -501,8 +505,8 @@ def draw_candidates(path: Path, outcome: Outcome) -> None:
         handles = [
             Patch(color=BLUE, label="added to the model"),
             Patch(color=ORANGE, label="cannot be told apart from it"),
-            Patch(color=GREY, label=f"refitted, {'explains less' if added else 'not enough'}"),
-            Patch(color=_UNTRIED, label="not refitted: others promise more"),
+            Patch(color=GREY, label="refitted, not added: by BIC"),
+            Patch(color=_UNTRIED, label="not refitted"),
         ]
         refitted = [row["rmse_cross_validated"] is not None for row in rows]
         shown = [bool(added), bool(tied), sum(refitted) > len(added | tied), not all(refitted)]

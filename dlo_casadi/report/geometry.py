@@ -46,6 +46,23 @@ def residual_along(shape: PoseShape, direction: str) -> FloatArray:
     return shape.residual[:, "yz".index(direction)] if direction else shape.residual
 
 
+def residual_range(stage: Stage, noise: float) -> tuple[float, float]:
+    """From where to where residuals are drawn, in standard deviations `noise` [m] of them.
+
+    Beyond 95 % of the noise, and all residuals; of poses that were measured in another equilibrium
+    than the predicted one, which are off by a hundred times as much, only where all are.
+    """
+    shown = [shape.residual for shape in stage.shapes.values() if len(shape.residual)]
+    near = [
+        shape.residual
+        for shape in stage.shapes.values()
+        if len(shape.residual) and shape.measured_branch is None
+    ]
+    values = np.concatenate([part.ravel() for part in near or shown or [np.zeros(1)]])
+    low, high = min(values.min() / noise, -2.0), max(values.max() / noise, 2.0)
+    return low - 0.08 * (high - low), high + 0.08 * (high - low)
+
+
 def rest_about(stage: Stage, direction: str) -> RestCurvatureEstimate:
     """Rest curvature (M,) about one of the `directions`; in a plane that about its normal."""
     rest = stage.rest_curvature

@@ -11,7 +11,6 @@ from bokeh.layouts import column
 from bokeh.models import (
     BoxAnnotation,
     ColumnDataSource,
-    DataRange1d,
     FixedTicker,
     Model,
     PrintfTickFormatter,
@@ -22,7 +21,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from dlo_casadi.report.canvas import before_after, label_of
-from dlo_casadi.report.geometry import directions, residual_along, rest_about
+from dlo_casadi.report.geometry import directions, residual_along, residual_range, rest_about
 from dlo_casadi.report.page_boards import next_pose_chart, pull_chart
 from dlo_casadi.report.page_canvas import AFTER, BEFORE, FAINT, HELD_OUT, INK, empty_chart, hover
 from dlo_casadi.report.terminal import cross_validated
@@ -185,7 +184,7 @@ def residuals_chart(outcome: Outcome) -> Model:
     for kind, stage, color in (("before", before, BEFORE), ("after", after, AFTER)):
         if stage is None:
             continue
-        own = DataRange1d(range_padding=0.08)
+        own = Range1d(*residual_range(stage, outcome.measurement.std))
         for direction in directions(outcome):
             chart = empty_chart(
                 230 if kind == "before" else 260,
