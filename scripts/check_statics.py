@@ -252,6 +252,7 @@ def shot_at(
         with np.errstate(all="ignore"):
             (half, end), matrix, points = kirchhoff.shot(rod, y[left])
         sane = np.abs(end[:, : FORCE.start]).max(axis=1) < 2.0
+        sane &= np.isfinite(matrix).all(axis=(1, 2))
         turn = Rotation.from_quat(np.where(sane[:, None], end[:, FRAME], 1.0)).inv() * frame[left]
         missed = np.concatenate([place[left] - end[:, PLACE], turn.as_rotvec()], axis=1)
         there = sane & (np.abs(missed).max(axis=1) < REACHED)
@@ -261,7 +262,9 @@ def shot_at(
         left = left[on]
         if not len(left):
             break
-        y[left, FORCE.start :] += np.linalg.solve(matrix[on], missed[on][..., None])[..., 0]
+        y[left, FORCE.start :] += (np.linalg.pinv(matrix[on], 1e-15) @ missed[on][..., None])[
+            ..., 0
+        ]
     return apart, conjugate
 
 

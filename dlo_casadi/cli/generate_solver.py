@@ -22,7 +22,8 @@ def main(argv: Sequence[str]) -> int:
     parser = command(
         "generate-solver",
         "Write the C solver of a fitted cable for planners to embed: <prefix>_solver.h,\n"
-        "<prefix>_solver.c, CMakeLists.txt, <prefix>_solver.pc.in and example.c.",
+        "<prefix>_solver.c, <prefix>_solver.hpp for C++, CMakeLists.txt, <prefix>_solver.pc.in and "
+        "example.c.",
         EXAMPLES,
     )
     parser.add_argument("parameters", type=Path, help="parameters.yaml of a fit, or its folder")

@@ -23,6 +23,8 @@ from dlo_casadi.model import CableModel
 
 FloatArray = NDArray[np.floating]
 
+# The way of a path from pose to pose is parted into so many at most, as in the templates.
+FINEST = 4096
 # By which a generated file is known, in all templates.
 MARK = "written by dlo-casadi"
 
@@ -191,12 +193,14 @@ def generate(
     digest = solver_hash(model, p, rest)
     own, kind = (space, "space") if model.in_space else (plane, "plane")
     values = _values(model, prefix, digest) | own.values(model, p, rest, inline)
+    values["PATH_STEPS"] = str(int(values["STEPS"]) + own.TRY_STEPS * (2 * FINEST + 13))
     texts = {**own.TEXTS, "TYPES": _template(f"{kind}_types.h.in").rstrip()}
     own_parts = [f"{kind}{part}.c.in" for part in ("", "_guesses", "_shape")]
     parts = [*own_parts, "clearance.c.in", "interface.c.in"]
     source = "".join(_template(name) for name in parts)
     names = {
         f"{prefix}_solver.h": "solver.h.in",
+        f"{prefix}_solver.hpp": "solver.hpp.in",
         "CMakeLists.txt": "CMakeLists.txt.in",
         f"{prefix}_solver.pc.in": "solver.pc.in",
         "example.c": "example.c.in",

@@ -19,6 +19,8 @@ FloatArray = NDArray[np.floating]
 
 # Doubles of a workspace per slot; as in the template.
 _ARRAYS = 38
+# Newton steps for a part of a path; the template checks the number.
+TRY_STEPS = 13
 # Parts of the templates.
 TEXTS = {
     "WHERE": "in a plane",

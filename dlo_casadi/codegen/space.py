@@ -29,6 +29,8 @@ _NUMBERS, _COARSE_SHAPES = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 8
 # clamped problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than if all first
 # guesses are followed on the fine mesh.
 LEAST_COARSE, COARSENING = 6, 2.0
+# Newton steps for a part of a path; the template checks the number.
+TRY_STEPS = 12
 # Parts of the templates.
 TEXTS = {
     "WHERE": "in space",

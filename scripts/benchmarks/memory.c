@@ -13,7 +13,7 @@
 
 typedef struct {
     long problems;
-    long counts[DLO_OTHER_BRANCH + 1];
+    long counts[DLO_TURNS_SHED + 1];
     double sum; /* of what was found */
 } job_t;
 

@@ -102,7 +102,9 @@ def test_random_clamped_cables_in_space_have_stable_equilibria():
     for _ in range(10):
         problem = space_problem(rng, 50, 10)
         shapes, statuses, _ = solver.solve(problem)
-        failed += np.count_nonzero(statuses)
+        # Twisted by two turns, some loop, and say that they hold them no more.
+        shed = (statuses == STATUSES.index("turns_shed")) & (np.abs(problem.table[:, -1]) == 2)
+        failed += np.count_nonzero(statuses[~shed])
         for i in np.flatnonzero(statuses == 0)[:6]:
             right, error = check_in_space(problem, shapes[i], i)
             assert right

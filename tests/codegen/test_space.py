@@ -429,9 +429,52 @@ def test_compiles_without_a_warning_and_with_another_prefix(tmp_path, compiler, 
     assert "bend radius" in shown.stdout
 
 
-def test_sanitizers_and_threads_with_a_workspace_each_are_silent(tmp_path):
+CALLER = """
+#include "harness_solver.hpp"
+
+int main()
+{
+    harness::Solver solver;
+    harness_pose pose = {};
+    pose.end[0] = 0.7 * HARNESS_LENGTH;
+    pose.start_orientation[3] = pose.end_orientation[3] = 1.0;
+    const harness_shape shape = solver.solve(pose);
+    std::size_t jump = 0;
+    if (solver.path({pose, pose}, jump).size() != 2 || jump != 2)
+        return 1;
+    if (solver.step(pose, shape, 4).energy > shape.energy + 1e-9)
+        return 2;
+    (void)solver.sensitivity(pose, shape);
+    try {
+        pose.end[0] = 2.0 * HARNESS_LENGTH;
+        (void)solver.solve(pose);
+    } catch (const harness::Error &error) {
+        return error.status == HARNESS_UNREACHABLE ? 0 : 3;
+    }
+    return 4;
+}
+"""
+
+
+def test_c_plus_plus_throws_what_fails(tmp_path):
+    if shutil.which("c++") is None:
+        pytest.skip("no C++ compiler (c++)")
+    generate(*problem("arc", 6), "harness").write(tmp_path)
+    (tmp_path / "caller.cpp").write_text(CALLER)
+    for command in (
+        ["cc", "-O0", "-c", "harness_solver.c"],
+        ["c++", "-std=c++11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-c", "caller.cpp"],
+        ["c++", "caller.o", "harness_solver.o", "-lm", "-o", "caller"],
+        ["./caller"],
+    ):
+        run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize("end", ["clamped", "free"])
+def test_sanitizers_and_threads_with_a_workspace_each_are_silent(tmp_path, end):
     """scripts/benchmark.py --only memory runs more, under valgrind, too."""
-    generate(*problem("arc", 6)).write(tmp_path)
+    generate(*problem("arc", 6, end=end)).write(tmp_path)
     shutil.copy(memory.HERE / "memory.c", tmp_path)
     flags = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     assert memory.build_and_run(tmp_path, flags, [], 5, threads=8).startswith("silent")
