@@ -39,6 +39,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.durable import write_file
 from dlo_casadi.effects import EFFECTS
+from dlo_casadi.estimation.mesh import SEARCH_MESH
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
@@ -270,7 +271,7 @@ def run_one(index: int, seed: int, kind: str) -> dict:
     begin = time.perf_counter()
     fit, _ = fit_declared(config, declared_model(config), measured)
     fitted = time.perf_counter()
-    diagnosis = diagnose(fit)
+    diagnosis = diagnose(fit, finest=SEARCH_MESH)
     intervals = profile_intervals(diagnosis.after)
     named = {item.candidate.name for item in diagnosis.added}
     tied = {name for item in diagnosis.added for name in item.equivalents}
