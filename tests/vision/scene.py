@@ -124,8 +124,11 @@ def photograph(points, where, *, cable=(40, 60, 190), diameter=DIAMETER, blur=0.
     grid = np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), 2).reshape(-1, 2)
 
     def cover(line, depth, soft):
-        away, nearest = cKDTree(line).query(grid)
-        radius = 0.5 * CAMERA.focal * diameter / depth[nearest]
+        radii = 0.5 * CAMERA.focal * diameter / depth
+        # Pixels beyond are not covered: they are not looked for.
+        farthest = float(radii.max()) + 0.5 * soft
+        away, nearest = cKDTree(line).query(grid, distance_upper_bound=farthest)
+        radius = np.append(radii, 0.0)[nearest]
         return np.clip((0.5 * soft + radius - away) / soft, 0.0, 1.0).reshape(SHAPE)
 
     dark = cover(CAMERA.distort(shadow[:, :2] / shadow[:, 2:]), shadow[:, 2], 6.0)
