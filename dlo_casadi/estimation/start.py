@@ -332,7 +332,8 @@ def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step
     for j, solved in zip(problem.used, inner, strict=True):
         deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
     change = correction + problem.shape_step(along, step, deviation)
-    if not (np.isfinite(objective) and np.all(np.isfinite(change.x))):
+    # A sum of squares: below zero the matrices are singular but for rounding, and promise anything.
+    if not (0 <= objective < np.inf and np.all(np.isfinite(change.x))):
         return None
     return _Step(objective, step, change, deviation, point.feet)
 
