@@ -40,8 +40,8 @@ SMOOTHNESS = (0.5, 0.25, 0.12)
 # Ranges of what is systematic that are tried, shares of the RMS distance of the poses' shapes.
 RANGES = (0.25, 1.0)
 # Decrease of -2 log likelihood from which a size is not taken as zero: at that bound 5 % exceed it
-# by chance. At 0.5 % the scatter of 5 of 17 simulated cables that do not repeat was taken as none,
-# and their intervals were too narrow.
+# by chance. At 0.5 % the scatter of 3 of 17 simulated cables that do not repeat was taken as none,
+# for decreases of 3.5 to 5.9; the stiffness of one of them was two standard deviations off.
 TELLING = float(chdtri(1, 0.1))
 # Poses that are used at most, evenly picked.
 MOST_POSES = 40
