@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from dlo_casadi.durable import write_file
 from dlo_casadi.session.outcome import Outcome, Stage, StageName
@@ -53,7 +55,7 @@ def figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
         save_figure(path, drawing, _DPI)
 
 
-def save_figure(path: Path, drawing: Figure, dpi: float, **options: Any) -> None:
+def save_figure(path: Path, drawing: Figure, dpi: float) -> None:
     """Write a figure in the format of the file's ending, whole or not at all."""
     form, layout = path.suffix[1:], drawing.get_layout_engine()
     drawing.set_dpi(dpi)
@@ -61,7 +63,16 @@ def save_figure(path: Path, drawing: Figure, dpi: float, **options: Any) -> None
         # A figure that still has an engine is drawn twice: for its layout, and for the file.
         layout.execute(drawing)
         drawing.set_layout_engine(None)
-    write_file(path, lambda stream: drawing.savefig(stream, format=form, dpi=dpi, **options))
+    write_file(path, lambda stream: drawing.savefig(stream, format=form, dpi=dpi))
+
+
+def drawn(drawing: Figure, dpi: float) -> NDArray[np.uint8]:
+    """Pixels (H, W, 4; red, green, blue, opacity) of a figure without its background."""
+    drawing.set_dpi(dpi)
+    drawing.patch.set_alpha(0.0)
+    canvas = FigureCanvasAgg(drawing)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
 
 
 @contextmanager

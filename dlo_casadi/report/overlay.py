@@ -7,16 +7,17 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from dlo_casadi.durable import make_folder
+from dlo_casadi.durable import make_folder, write_file
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.report.canvas import (
     BLUE,
     ORANGE,
     before_after,
+    drawn,
     label_of,
     millimetres,
-    save_figure,
     styled,
 )
 from dlo_casadi.session.outcome import Outcome, PoseInput
@@ -53,13 +54,14 @@ def draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome:
     measured = np.zeros((0, 2)) if pose.pixels is None else pose.pixels
     (left, top), (right, bottom) = _window(image, [measured, *(line[0] for line in lines)])
     zoom = min(_LARGEST[0] / (right - left), _LARGEST[1] / (bottom - top))
-    width, height = (right - left) * zoom, (bottom - top) * zoom
-    width = max(width, _NARROWEST)
-    with styled((width / _DPI, (height + _STRIP) / _DPI), layout=None) as drawing:
+    width, height = round((right - left) * zoom), round((bottom - top) * zoom)
+    part = Image.fromarray(image[top:bottom, left:right]).resize(
+        (width, height), Image.Resampling.BILINEAR
+    )
+    whole = max(width, _NARROWEST)
+    with styled((whole / _DPI, (height + _STRIP) / _DPI), layout=None) as drawing:
         share = _STRIP / (height + _STRIP)
-        axes = drawing.add_axes((0, share, 1, 1 - share))
-        extent = (left - 0.5, right - 0.5, bottom - 0.5, top - 0.5)
-        axes.imshow(image[top:bottom, left:right], extent=extent, interpolation="bilinear")
+        axes = drawing.add_axes(((1 - width / whole) / 2, share, width / whole, 1 - share))
         axes.set_axis_off()
         axes.plot(*measured.T, ".", color="white", ms=4.2)
         axes.plot(*measured.T, ".", color="black", ms=2.2, label="measured")
@@ -72,7 +74,12 @@ def draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome:
         drawing.legend(
             loc="lower center", ncols=3, fontsize=9, frameon=False, title=f"{pose.name} ({role})"
         )
-        save_figure(path, drawing, _DPI, pil_kwargs={"quality": 88})
+        over = Image.fromarray(drawn(drawing, _DPI))
+    # Matplotlib takes longer to draw a photograph than all that lies over it.
+    page = Image.new("RGB", over.size, "white")
+    page.paste(part, ((whole - width) // 2, 0))
+    page.paste(over, mask=over)
+    write_file(path, lambda stream: page.save(stream, "JPEG", quality=88))
 
 
 def _window(
