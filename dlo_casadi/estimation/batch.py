@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Shapes
+from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.sensors import ObservedChange
@@ -72,7 +73,7 @@ def solve_batch(problem: BatchProblem, start: Point, max_solves: int = 4) -> Bat
     EstimationError
         If IPOPT does not converge.
     """
-    nlp = _BatchNlp(problem)
+    nlp = _BatchNlp(problem, problem.unknowns.p(start.theta))
     point, iterations, solves = start, 0, 0
     while True:
         rows, targets = zip(*_compressed(problem, point), strict=True)
@@ -130,7 +131,7 @@ class _BatchNlp:
     differentiating the assembled NLP would cost as many sweeps as a pose has unknowns.
     """
 
-    def __init__(self, problem: BatchProblem) -> None:
+    def __init__(self, problem: BatchProblem, p: FloatArray) -> None:
         self.problem = problem
         unknowns, model = problem.unknowns, problem.unknowns.model
         self.poses = list(range(problem.sweep.m)) if model.has_state else list(problem.used)
@@ -140,7 +141,7 @@ class _BatchNlp:
         self.n_rest = model.chain.n_rests if model.has_state else 0
         self.stride = self.n_x + self.n_lam + self.n_dev + self.n_rest
         # Multipliers and balance in units of a typical force: EI turns^2.
-        self.force = model.cable.bending_stiffness * model.cable.curvature_scale**2
+        self.force = float(p[model.names.index(BENDING_STIFFNESS)]) * model.cable.curvature_scale**2
         self._differentiate()
         lower, upper = unknowns.bounds
         free = np.full(self.stride * len(self.poses), np.inf)

@@ -15,6 +15,7 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
 from dlo_casadi.estimation.hyperparameters import (
     SCATTER_FLOOR,
     SMOOTH_MODES,
+    errors_of,
     first_reading_noise,
     refine,
 )
@@ -214,22 +215,25 @@ def fit_model(
         # left: search once more as if every hanging had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
         loose = problem.changed(noise, ROUGHNESS_START, scatter, first)
+        near = _found(loose, theta, decades)
         try:
-            other = _searched(loose, theta, decades)
+            others = [_refined(loose, near)] if near and _scatters(loose, near) else []
         except EstimationError:
             return fit
-        return max(fit, other, key=lambda found: found.log_evidence)
+        return max([fit, *others], key=lambda found: found.log_evidence)
     return fit
+
+
+def _scatters(problem: BatchProblem, point: Point) -> bool:
+    """Whether what a point leaves differs from hanging to hanging, and not as their shapes do."""
+    lin, estimated = problem.linearize(point), not problem.noise.known
+    return errors_of(problem, point, lin, estimated=estimated, repeats=False)[1].std > 0
 
 
 def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Fit:
     """The best minimum from starts over decades of stiffness, noise and scatters estimated."""
     model = problem.unknowns.model
-    best = None
-    if len(problem.used) > POSES_OF_A_SEARCH and not model.has_state:
-        rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)
-        best = rough and _search(problem, rough.theta, (0,))
-    best = best or _search(problem, theta, decades)
+    best = _found(problem, theta, decades)
     if best is None:
         raise EstimationError(
             f"no stiffness within {max(decades)} decades of {model.cable.bending_stiffness:.3g} "
@@ -243,8 +247,21 @@ def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]
             best = other if other is not None and other.objective < best.objective else best
         if _misfits(problem, best):
             return _fit_to_misfit(problem, best)
-    problem, point, converged = refine(problem, best, estimate=not problem.noise.known, first=True)
-    return Fit(problem, point, converged)
+    return _refined(problem, best)
+
+
+def _found(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Point | None:
+    """The best minimum from starts over decades of stiffness, that of a part of many poses first."""
+    best = None
+    if len(problem.used) > POSES_OF_A_SEARCH and not problem.unknowns.model.has_state:
+        rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)
+        best = rough and _search(problem, rough.theta, (0,))
+    return best or _search(problem, theta, decades)
+
+
+def _refined(problem: BatchProblem, near: Point) -> Fit:
+    """A minimum with noise, roughness and scatters estimated."""
+    return Fit(*refine(problem, near, estimate=not problem.noise.known, first=True))
 
 
 def _misfits(problem: BatchProblem, point: Point) -> bool:
@@ -310,7 +327,7 @@ def fitted_closely(fit: Fit) -> Fit:
         return fit
     scatter = problem.tolerances.deviation(fit.model.node)
     tight = problem.changed(known, ROUGHNESS_START, scatter, RestScatter())
-    closely = Fit(*refine(tight, tight.taken_over(near), estimate=not known.known, first=True))
+    closely = _refined(tight, tight.taken_over(near))
     return fit if _misfits(closely.problem, closely.point) else closely
 
 

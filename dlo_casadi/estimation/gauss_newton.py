@@ -341,8 +341,8 @@ class BatchProblem:
         return Normal(hessian, gradient, inner)
 
     def _step(self, point: Point, normal: Normal, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Damped step of theta within its bounds, and the deviations that go with it."""
-        lower, upper = self.unknowns.bounds
+        """Damped step of theta within its reach, and the deviations that go with it."""
+        lower, upper = self.unknowns.reach(point.theta)
         scale = np.maximum(np.diag(normal.hessian), 1e-12)
         # A direction without any information (the place of a mass of zero) must not move.
         matrix = normal.hessian + damping * np.diag(scale) + NO_INFORMATION * np.eye(len(scale))

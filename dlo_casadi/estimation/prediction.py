@@ -19,8 +19,8 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Branch, Pose, PoseBranch
-from dlo_casadi.solve import continued, solve_equilibria, solve_equilibrium
+from dlo_casadi.pose import SIGNS, Pose, PoseBranch
+from dlo_casadi.solve import continued, solve_equilibria
 from dlo_casadi.thresholds import EITHER
 
 FloatArray = NDArray[np.floating]
@@ -251,14 +251,19 @@ def measured_branches(
 ) -> list[MeasuredBranch | None]:
     """What `measured_elsewhere` finds, with the branch that a pose has to name for it."""
     others = measured_elsewhere(model, p, rest, measured, predictions, fitted)
+    told = _told(model, p, [item.pose for item in measured], others)
     out: list[MeasuredBranch | None] = []
     last: tuple[Pose, FloatArray] | None = None
-    for item, known, found in zip(measured, predictions, others, strict=True):
+    for item, known, found, way in zip(measured, predictions, others, told, strict=True):
         branch = None
         if found is not None:
-            turns = _turns_of(model, p, item.pose, found)
-            named = None if turns else _name_of(model, p, item.pose, found, last)
-            branch = MeasuredBranch(found, named, turns)
+            branch = MeasuredBranch(found, None)
+            if way is not None and _either_way(model, item.pose):
+                branch = MeasuredBranch(found, None, way.turns)
+            elif way is not None:
+                branch = MeasuredBranch(found, way.branch)
+            elif _continues(model, p, item.pose, found, last):
+                branch = MeasuredBranch(found, "previous")
         out.append(branch)
         there = found or known
         last = last if there is None else (item.pose, there.equilibrium.x)
@@ -270,43 +275,48 @@ def _square(prediction: Prediction, item: MeasuredPose) -> float:
     return float((item.distances(prediction.curve) ** 2).mean())
 
 
-def _turns_of(model: CableModel, p: FloatArray, pose: Pose, found: Prediction) -> float | None:
-    """The turns that a pose between two clamps has to tell for an equilibrium to be predicted."""
-    if not _either_way(model, pose):
-        return None
-    for turns in WAYS_ROUND:
-        with suppress(EquilibriumError):
-            eq = solve_equilibrium(model, p, found.rest, replace(pose, turns=turns))
-            if model.node.same(eq.x, found.equilibrium.x, NEARBY):
-                return turns
-    return None
+def _told(
+    model: CableModel, p: FloatArray, poses: Sequence[Pose], others: Sequence[Prediction | None]
+) -> list[Pose | None]:
+    """Poses that tell the branch or the turns for which others are predicted, where one does."""
+    ways = [
+        [] if found is None else _ways(model, pose)
+        for pose, found in zip(poses, others, strict=True)
+    ]
+    out: list[Pose | None] = [None] * len(poses)
+    asked = [j for j, own in enumerate(ways) if own]
+    for group in [[j] for j in asked] if model.has_state else [asked]:
+        of = [(j, way) for j in group for way in ways[j]]
+        rest = next((found.rest for j in group if (found := others[j])), np.zeros(0))
+        solved = solve_equilibria(model, p, rest, [way for _, way in of])
+        for (j, way), eq in zip(of, solved, strict=True):
+            there = others[j]
+            if out[j] is None and there is not None and isinstance(eq, Equilibrium):
+                same = model.node.same(eq.x, there.equilibrium.x, NEARBY)
+                out[j] = way if same else None
+    return out
 
 
-def _name_of(
+def _ways(model: CableModel, pose: Pose) -> list[Pose]:
+    """A pose with each branch, or way round, that it may name."""
+    if _either_way(model, pose):
+        return [replace(pose, turns=turns) for turns in WAYS_ROUND]
+    return [] if model.in_space else [replace(pose, branch=name) for name in SIGNS]
+
+
+def _continues(
     model: CableModel,
     p: FloatArray,
     pose: Pose,
     found: Prediction,
     last: tuple[Pose, FloatArray] | None,
-) -> PoseBranch | None:
-    """The branch that a pose has to name for an equilibrium to be predicted.
-
-    `last` is the pose before it and its nodes (n_nodes, coordinates), as measured.
-    """
-    names: tuple[Branch, ...] = () if model.in_space else ("ccw", "cw")
-    for name in names:
-        try:
-            eq = solve_equilibrium(model, p, found.rest, replace(pose, branch=name))
-        except EquilibriumError:
-            continue
-        if model.node.same(eq.x, found.equilibrium.x, NEARBY):
-            return name
+) -> bool:
+    """Whether an equilibrium is that to which the pose before it, as measured, leads."""
     if last is not None:
         with suppress(EquilibriumError):
             eq = continued(model, p, found.rest, pose, *last)
-            if model.node.same(eq.x, found.equilibrium.x, NEARBY):
-                return "previous"
-    return None
+            return bool(model.node.same(eq.x, found.equilibrium.x, NEARBY))
+    return False
 
 
 def rms_distance(

@@ -16,6 +16,9 @@ BoolArray = NDArray[np.bool_]
 
 # A weak prior of the rest curvature: a turn per length, one standard deviation.
 REST_TURNS_STD = 1.0
+# Where shapes do not tell a stiffness, a step would lead to its bounds at once, and poses would have
+# no equilibria there. A factor of 20.
+FARTHEST = 3.0
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,13 @@ class Unknowns:
             upper.append(high / scale)
         rest = np.full(self.n_rest, 20.0)
         return np.concatenate([lower, -rest]), np.concatenate([upper, rest])
+
+    def reach(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of theta after one step: logarithms change by FARTHEST at most."""
+        far = np.full(self.size, np.inf)
+        far[: self.n_parameters][[self.model.parameters[i].log for i in self._used]] = FARTHEST
+        lower, upper = self.bounds
+        return np.maximum(lower, theta - far), np.minimum(upper, theta + far)
 
     def prior_mean(self) -> FloatArray:
         """Mean of the Gaussian prior of theta."""
