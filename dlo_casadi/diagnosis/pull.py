@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import fit_model, starting_points
+from dlo_casadi.estimation.fit import DECADES, fit_model, starting_points
 from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -123,18 +125,36 @@ class _Search:
 
     def run(self, executor: Executor) -> list[Fit]:
         """Fits from the most promising places, the best first."""
-        starts = map_in_order(executor, self.start, PULL_PLACES)
+        middle = PULL_PLACES[len(PULL_PLACES) // 2]
+        first = self.start((middle, DECADES))
+        asked = [(share, self.decades_about(first)) for share in PULL_PLACES if share != middle]
+        starts = [first, *map_in_order(executor, self.start, asked)]
+        places = [middle, *(share for share, _ in asked)]
         ways = [
-            (share, point)
-            for share, point in zip(PULL_PLACES, starts, strict=True)
-            if point is not None
+            (share, point) for share, point in zip(places, starts, strict=True) if point is not None
         ]
         likely = sorted(ways, key=lambda way: way[1].objective)
         fits = map_in_order(executor, self.fit_from, likely[:TRIED])
         return sorted(fits, key=lambda fit: fit.point.objective)
 
-    def start(self, share: float) -> Point | None:
-        """Equilibria near the measured shapes for a load at a share of the length."""
+    def decades_about(self, point: Point | None) -> tuple[float, ...]:
+        """Stiffnesses to start from at other places: at all, what was left had one valley.
+
+        Of a simulated cable with a tether, over nine places; the valley moved by a decade at most.
+        """
+        if point is None:
+            return DECADES
+        p = self.held_at(PULL_PLACES[0]).unknowns.p(point.theta)
+        own = self.model.names.index(BENDING_STIFFNESS)
+        best = round(float(np.log10(p[own] / self.model.nominal[own])))
+        return (best, best - 1, best + 1)
+
+    def start(self, way: tuple[float, Sequence[float]]) -> Point | None:
+        """Equilibria near the measured shapes for a load at a share of the length.
+
+        `way` is the share, and the decades about the prior stiffness to start from.
+        """
+        share, decades = way
         problem = self.held_at(share)
         unknowns = problem.unknowns
         theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.n_coefficients))
@@ -142,7 +162,7 @@ class _Search:
             # Frames tell the stiffness over the weight better than headings do; a start costs more.
             theta = unknowns.pack(self.base.values_in(self.model), self.base.coefficients)
             return next(iter(starting_points(problem, theta, (0,))), None)
-        points = starting_points(problem, theta)
+        points = starting_points(problem, theta, decades)
         return points[0] if points else None
 
     def fit_from(self, way: tuple[float, Point]) -> Fit:

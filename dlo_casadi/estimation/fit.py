@@ -251,7 +251,7 @@ def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]
 
 
 def _found(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Point | None:
-    """The best minimum from starts over decades of stiffness, that of a part of many poses first."""
+    """The best minimum from starts over decades of stiffness; of many poses, of a part first."""
     best = None
     if len(problem.used) > POSES_OF_A_SEARCH and not problem.unknowns.model.has_state:
         rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)

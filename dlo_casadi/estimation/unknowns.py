@@ -16,8 +16,8 @@ BoolArray = NDArray[np.bool_]
 
 # A weak prior of the rest curvature: a turn per length, one standard deviation.
 REST_TURNS_STD = 1.0
-# Where shapes do not tell a stiffness, a step would lead to its bounds at once, and poses would have
-# no equilibria there. A factor of 20.
+# Logarithms change by so much in a step, a factor of 20. Where shapes hardly tell a stiffness, a
+# step led to its bounds, where equilibria are lost to rounding: 40 steps that crept, instead of 7.
 FARTHEST = 3.0
 
 
