@@ -502,8 +502,10 @@ def _bounded_step(
     matrix: FloatArray, gradient: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> FloatArray:
     """Minimise the quadratic model within bounds."""
-    factor = np.linalg.cholesky(matrix).T
-    target = -np.linalg.solve(factor.T, gradient)
+    # The matrix, a Schur complement, is positive but for rounding.
+    values, vectors = np.linalg.eigh(matrix)
+    root = np.sqrt(np.maximum(values, NO_INFORMATION))
+    factor, target = root[:, None] * vectors.T, -(vectors.T @ gradient) / root
     low, high = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
     high = np.where(high - low < 1e-14, low + 1e-14, high)
     return np.asarray(lsq_linear(factor, target, bounds=(low, high), method="bvls").x)
