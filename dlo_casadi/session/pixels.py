@@ -133,11 +133,13 @@ class Pixels(OfPoints):
         """Measured minus model (K,) [m]."""
         return self._compared(seen.curve, places)[0]
 
-    def residual_along(
+    def linearized(
         self, seen: Observed, places: FloatArray, along: ObservedChange
-    ) -> FloatArray:
-        """Change (K, q) of the residual along directions."""
-        return -self.components(seen.curve, places, seen.curve.moved(places, along.curve))
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (K,) [m] and its change (K, q) along directions."""
+        away, slopes = self._compared(seen.curve, places)
+        moved = seen.curve.moved(places, along.curve)
+        return away, np.einsum("kd,kdq->kq", slopes, moved)
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (K, K) [1/m] with W cov W^T = 1, errors of the camera's place among them."""

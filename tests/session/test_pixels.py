@@ -68,9 +68,10 @@ def test_derivatives_are_those_of_the_residual():
     table = now.numbers
     places = pixels.located(Observed(now, np.zeros(0)), S)
     step = np.random.default_rng(0).normal(size=(*table.shape, 1))
-    change = pixels.residual_along(
+    residual, change = pixels.linearized(
         Observed(now, np.zeros(0)), places, ObservedChange(step, np.zeros((0, 1)))
     )
+    np.testing.assert_array_equal(residual, pixels.residual(Observed(now, np.zeros(0)), places))
     ahead, behind = (
         pixels.residual(
             Observed(NodeCurve.of(LENGTH, table + h * step[..., 0]), np.zeros(0)), places
