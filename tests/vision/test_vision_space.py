@@ -175,7 +175,7 @@ def test_one_photograph_is_no_line_but_pixels(pictures):
     found = measured({"ahead": pictures["bow"]["ahead"]}, curve)
     assert found.line is None
     assert rms(cKDTree(true_pixels(curve, "ahead")).query(found.sights["ahead"].pixels)[0]) < 0.15
-    assert "ahead alone gives no line in space" in found.messages[-1]
+    assert "ahead: one photograph alone gives no line in space" in found.messages[-1]
 
 
 def test_a_photograph_of_another_pose_is_named_and_left_out(pictures):
