@@ -147,8 +147,9 @@ def measure_views(
     if line is None and len(sights) == 1:
         messages.append(
             f"{next(iter(sights))}: one photograph alone gives no line in space: its pixels serve "
-            "a fit, which has the depth from the cable's mechanics alone. Try: a second photograph "
-            "from another place, 30 to 90 degrees around the cable."
+            "a fit, which has the depth from the cable's mechanics alone, and errors are those "
+            "across the line of sight. Try: a second photograph from another place, 30 to 90 "
+            "degrees around the cable."
         )
     elif fit is not None and line is None:
         messages.append(
