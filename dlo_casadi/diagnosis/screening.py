@@ -118,7 +118,7 @@ class _Moving:
         out: list[FloatArray] = []
         for j, s in zip(problem.used, fit.point.feet, strict=True):
             now, change = seen.pose(j, unknowns.model.cable.length)
-            moved = problem.measured[j].residual_along(now, s, change)
+            _, moved = problem.measured[j].linearized(now, s, change)
             out.append(problem.whitening(j) @ moved[:, : len(columns)])
         return out
 

@@ -106,9 +106,10 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
         curve, readings = seen[j].curve.numbers, seen[j].readings
         each = ObservedChange(unit[: curve.size].reshape((*curve.shape, size)), unit[curve.size :])
         item, white = problem.measured[j], problem.whitening(j)
-        rows = -white @ item.residual_along(seen[j], s, each)
+        residual, change = item.linearized(seen[j], s, each)
+        rows = -white @ change
         here = np.concatenate([curve.ravel(), readings])
-        target = white @ item.residual(seen[j], s) + rows @ here
+        target = white @ residual + rows @ here
         triangle = np.linalg.qr(np.column_stack([rows, target]), mode="r")
         padded = np.zeros((count, size + 1))
         keep = min(count, len(triangle))

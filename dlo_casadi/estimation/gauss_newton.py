@@ -72,8 +72,8 @@ class Tolerances:
 
 
 @dataclass(frozen=True)
-class Point:
-    """Everything at one value of the unknowns.
+class Values:
+    """Unknowns and shapes, in equilibrium or not.
 
     Parameters
     ----------
@@ -81,6 +81,19 @@ class Point:
     shapes : Shapes
     feet : list of (K_j,) [m]
         Arc lengths at which the fitted poses' points are compared.
+    """
+
+    theta: FloatArray
+    shapes: Shapes
+    feet: list[FloatArray]
+
+
+@dataclass(frozen=True)
+class Point(Values):
+    """Everything at one value of the unknowns.
+
+    Parameters
+    ----------
     objective : float
         Half the sum of squares, priors included.
     data : float
@@ -89,9 +102,6 @@ class Point:
         These, whitened, of the fitted poses.
     """
 
-    theta: FloatArray
-    shapes: Shapes
-    feet: list[FloatArray]
     objective: float
     data: float
     residuals: list[FloatArray]
@@ -241,7 +251,7 @@ class BatchProblem:
         out = []
         for j, s in zip(self.used, feet, strict=True):
             now, change = seen.pose(j, self.unknowns.model.cable.length)
-            out.append(self.measured[j].residual_along(now, s, change))
+            out.append(self.measured[j].linearized(now, s, change)[1])
         return out
 
     @property
@@ -261,16 +271,22 @@ class BatchProblem:
         self.refresh(near.theta, near.shapes, near.feet)
         return self.evaluate(near.theta, near.shapes, near.feet)
 
+    def located(self, seen: list[Observed], feet: list[FloatArray]) -> list[FloatArray]:
+        """Arc lengths (K_j,) [m] at which the fitted poses' points are compared, near those given.
+
+        `seen` are all poses.
+        """
+        places = zip(self.used, feet, strict=True)
+        return [self.measured[j].located(seen[j], guess) for j, guess in places]
+
     def evaluate(self, theta: FloatArray, shapes: Shapes, feet: list[FloatArray]) -> Point:
         """Objective at given unknowns and equilibria."""
         seen = self.observed(theta, shapes)
-        moved: list[FloatArray] = []
-        residuals: list[FloatArray] = []
-        for j, guess in zip(self.used, feet, strict=True):
-            item = self.measured[j]
-            s = item.located(seen[j], guess)
-            moved.append(s)
-            residuals.append(self.whitening(j) @ item.residual(seen[j], s))
+        moved = self.located(seen, feet)
+        residuals: list[FloatArray] = [
+            self.whitening(j) @ self.measured[j].residual(seen[j], s)
+            for j, s in zip(self.used, moved, strict=True)
+        ]
         data = float(sum(white @ white for white in residuals))
         gap = theta - self.mean
         used = shapes.deviation[np.ix_(self.used, self.sweep.used_deviations)]
@@ -289,7 +305,7 @@ class BatchProblem:
         return self.linearize_along(point, along)
 
     def linearize_along(
-        self, point: Point, along: Directions, correction: Vector | None = None
+        self, point: Values, along: Directions, correction: Vector | None = None
     ) -> Linearization:
         """Residuals and derivatives for given derivatives of the shapes and parameters.
 
@@ -307,7 +323,7 @@ class BatchProblem:
         for j, s in zip(self.used, point.feet, strict=True):
             (now, change), item = seen.pose(j, length), self.measured[j]
             white = self.whitening(j)
-            d, directions = item.residual(now, s), item.residual_along(now, s, change)
+            d, directions = item.linearized(now, s, change)
             if correction is not None:
                 d, directions = d + directions[:, -1], directions[:, :-1]
             whitened = white @ directions

@@ -308,17 +308,19 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
     low, high = np.log(0.002), np.log(0.1)
 
     def unit(q: FloatArray) -> NoiseModel:
-        share = 0.98 / (1 + np.exp(-np.clip(q[0], -8, 8)))
-        return NoiseModel(
-            1.0, float(share), float(cable_length * np.exp(np.clip(q[1], low, high))), kernel
-        )
+        length = cable_length * np.exp(np.clip(q[1], low, high))
+        return NoiseModel(1.0, 0.98 * _logistic(q[0]), float(length), kernel)
 
     def noise_at(q: FloatArray) -> NoiseModel:
         return replace(unit(q), std=restricted_deviance(unit(q), samples)[1])
 
     def deviance(q: FloatArray) -> float:
-        outside = 10 * float((q[1] - np.clip(q[1], low, high)) ** 2) + 0.02 * float(q[0] ** 2)
-        return restricted_deviance(unit(q), samples)[0] + outside
+        # All shares are as likely before: slow modes are projected out, and of photographs the
+        # likelihood alone made 0.11 mm of slow errors of 0.015 mm, by a smooth kernel.
+        share = _logistic(q[0])
+        prior = -2 * np.log(4 * share * (1 - share))
+        outside = 10 * float((q[1] - np.clip(q[1], low, high)) ** 2)
+        return restricted_deviance(unit(q), samples)[0] + float(prior) + outside
 
     simplex = np.log([[0.5, 0.04], [2.0, 0.04], [0.7, 0.1]])
     found = minimize(
@@ -345,6 +347,11 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
     spread = 2 / _degrees(samples) + 2 * float((along**2 / np.maximum(values, 0.04)).sum())
     noise = noise_at(found.x)
     return _Estimate(noise, float(found.fun), _log_slow(noise, samples, cable_length), spread)
+
+
+def _logistic(q: float) -> float:
+    """Share of a logit, within 3e-4 of its limits."""
+    return float(1 / (1 + np.exp(-np.clip(q, -8, 8))))
 
 
 def _degrees(samples: list[NoiseSample]) -> float:

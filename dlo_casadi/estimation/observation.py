@@ -187,12 +187,14 @@ class MeasuredPose:
         parts = zip(self.sensors, self._parts(places), strict=True)
         return np.concatenate([sensor.residual(seen, s) for sensor, s in parts])
 
-    def residual_along(
+    def linearized(
         self, seen: Observed, places: FloatArray, along: ObservedChange
-    ) -> FloatArray:
-        """Change (R, q) of the residual along directions."""
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) and its change (R, q) along directions."""
         parts = zip(self.sensors, self._parts(places), strict=True)
-        return np.concatenate([sensor.residual_along(seen, s, along) for sensor, s in parts])
+        found = [sensor.linearized(seen, s, along) for sensor, s in parts]
+        residual, change = (np.concatenate(part) for part in zip(*found, strict=True))
+        return residual, change
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) with W cov W^T = 1; sensors are independent."""

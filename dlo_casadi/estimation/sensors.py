@@ -98,10 +98,10 @@ class Sensor(Protocol):
         """Measured minus model (R,)."""
         ...
 
-    def residual_along(
+    def linearized(
         self, seen: Observed, places: FloatArray, along: ObservedChange
-    ) -> FloatArray:
-        """Change (R, q) of the residual along directions."""
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) and its change (R, q) along directions."""
         ...
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
@@ -145,11 +145,14 @@ class _Points(OfPoints):
         gap = self.points - seen.curve.at(places)
         return self.components(seen.curve, places, gap[..., None])[:, 0]
 
-    def residual_along(
+    def linearized(
         self, seen: Observed, places: FloatArray, along: ObservedChange
-    ) -> FloatArray:
-        """Change (R, q) of the residual along directions."""
-        return -self.components(seen.curve, places, seen.curve.moved(places, along.curve))
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) [m] and its change (R, q) along directions."""
+        gap = self.points - seen.curve.at(places)
+        moved = -seen.curve.moved(places, along.curve)
+        both = self.components(seen.curve, places, np.dstack([gap, moved]))
+        return both[:, 0], both[:, 1:]
 
     @abstractmethod
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
@@ -317,11 +320,12 @@ class Wrench:
         """Measured minus model (R,)."""
         return np.concatenate([known - model for known, model in self.beside(seen).values()])
 
-    def residual_along(
+    def linearized(
         self, seen: Observed, places: FloatArray, along: ObservedChange
-    ) -> FloatArray:
-        """Change (R, q) of the residual along directions."""
-        return -np.concatenate([along.readings[at] for at in self._rows.values()])
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) and its change (R, q) along directions."""
+        change = -np.concatenate([along.readings[at] for at in self._rows.values()])
+        return self.residual(seen, places), change
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) with W cov W^T = 1; all components are independent."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.estimation.chords import line_nodes
-from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem, Point
+from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem, Point, Values
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep
@@ -183,7 +183,8 @@ def _kinematic_step(
         gaps = [*(item.points - curve.at(s)).T]
     else:  # a single photograph tells no depth
         on = item.on_points
-        towards, gaps = [-item.residual_along(now, s, change)[on]], [item.residual(now, s)[on]]
+        residual, moved = item.linearized(now, s, change)
+        towards, gaps = [-moved[on]], [residual[on]]
     system: list[FloatArray] = [*towards, rough]
     target: list[FloatArray] = [*gaps, -weight * np.diff(bends, axis=0).ravel()]
     if item.pose.end is not None:
@@ -205,21 +206,15 @@ def _kinematic_step(
 
 
 @dataclass(frozen=True)
-class Guess:
+class Guess(Values):
     """Values on the way to a first point: shapes that need not be equilibria yet.
 
     Parameters
     ----------
-    theta : (size,)
-    shapes : Shapes
-    feet : list of (K_j,) [m]
     objective : float
         What the linearised balance of forces promises at this theta.
     """
 
-    theta: FloatArray
-    shapes: Shapes
-    feet: list[FloatArray]
     objective: float = np.inf
 
 
@@ -303,8 +298,8 @@ def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step
         correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
     except np.linalg.LinAlgError:
         return None
-    point = problem.evaluate(theta, shapes, guess.feet)
-    ahead = problem.linearize_along(point, along, correction)
+    feet = problem.located(problem.observed(theta, shapes), guess.feet)
+    ahead = problem.linearize_along(replace(guess, feet=feet), along, correction)
     gap = theta - problem.mean
     hessian, gradient = problem.precision.copy(), problem.precision @ gap
     objective = float(gap @ gradient) / 2
@@ -335,7 +330,7 @@ def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step
     # A sum of squares: below zero the matrices are singular but for rounding, and promise anything.
     if not (0 <= objective < np.inf and np.all(np.isfinite(change.x))):
         return None
-    return _Step(objective, step, change, deviation, point.feet)
+    return _Step(objective, step, change, deviation, feet)
 
 
 def equilibria_near(problem: BatchProblem, guess: Guess) -> Point | None:

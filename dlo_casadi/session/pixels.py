@@ -133,11 +133,13 @@ class Pixels(OfPoints):
         """Measured minus model (K,) [m]."""
         return self._compared(seen.curve, places)[0]
 
-    def residual_along(
+    def linearized(
         self, seen: Observed, places: FloatArray, along: ObservedChange
-    ) -> FloatArray:
-        """Change (K, q) of the residual along directions."""
-        return -self.components(seen.curve, places, seen.curve.moved(places, along.curve))
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (K,) [m] and its change (K, q) along directions."""
+        away, slopes = self._compared(seen.curve, places)
+        moved = seen.curve.moved(places, along.curve)
+        return away, np.einsum("kd,kdq->kq", slopes, moved)
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (K, K) [1/m] with W cov W^T = 1, errors of the camera's place among them."""
@@ -160,9 +162,11 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     """The sensor of a photograph; None if none of its pixels is of the cable.
 
     Pixels share their errors with their neighbours over the length of the average along the
-    cable: of those nearer to each other one is taken. Where that average reaches over an end of
-    the line, into what holds the cable, to where another stretch hides an edge, or to where the
-    cable runs along the line of sight, none is.
+    cable; of those nearer to each other than twice its integral, where a correlation of 4 % is
+    left, one is taken. What remains correlated is then what changes slowly along the cable, such
+    as light; nearer pixels would hide that from the estimate of the noise. None is taken where the
+    average reaches over an end of the line, into what holds the cable, to where another stretch
+    hides an edge, or to where the cable runs along the line of sight.
 
     Parameters
     ----------
@@ -172,7 +176,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
         Standard deviation of a pixel of weight one.
     """
     sight = view.sight
-    every = max(1, int(np.ceil(sight.correlation / sight.spacing)))
+    every = max(1, int(np.ceil(2.0 * sight.correlation / sight.spacing)))
     steps = np.linalg.norm(np.diff(sight.pixels, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     sure = sight.whole & (sight.std < _UNSURE * np.median(sight.std))

@@ -31,10 +31,8 @@ def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
     lines = [
         f"{pose.name} is left out: {pose.reason}" for pose in skipped if pose.name not in shown
     ]
-    for item in inputs:
-        if item.problem:
-            lines.append(f"{item.name} is left out: {item.problem}")
-        lines += [f"{item.name}: {text}" for text in item.messages]
+    lines += [f"{item.name} is left out: {item.problem}" for item in inputs if item.problem]
+    lines += _noticed(inputs)
     missing = held_out_missing(inputs, skipped)
     if missing:
         declared = len({item.name for item in inputs if item.role == "held_out"} | set(missing))
@@ -43,6 +41,18 @@ def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
             f"{len(missing)} of {declared} held-out poses"
         )
     return lines
+
+
+def _noticed(inputs: Sequence[PoseInput]) -> list[str]:
+    """Messages of poses and photographs, the same ones once, with the names of all."""
+    names: dict[str, list[str]] = {}
+    for item in inputs:
+        views = {view.name for view in item.views}
+        for message in item.messages:
+            name, _, text = message.partition(": ")
+            name, text = (name, text) if name in views else (item.name, message)
+            names.setdefault(text, []).append(name)
+    return [f"{', '.join(own)}: {text}" for text, own in names.items()]
 
 
 def held_out_missing(

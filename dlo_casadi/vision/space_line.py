@@ -18,14 +18,12 @@ from dlo_casadi.vision.space_curve import CurveFit, first_curve, fit_curve_to_si
 from dlo_casadi.vision.view import Array, Camera
 
 _SPACING = 0.0025  # m, as of centre-lines in the plane
-_SPAN = (
-    2.0  # diameters, of the spline: no cable bends sharper; with half of it the lines in space of
-)
-# rendered photographs move by less than a tenth of their std
+# Diameters, of the spline: no cable bends sharper; with half of it the lines in space of rendered
+# photographs move by less than a tenth of their std.
+_SPAN = 2.0
 _SPANS = (20, 100)
-_AGREE = (
-    0.6  # share of its pixels that must agree with the others: each may hide parts of the cable
-)
+_AGREE = 0.6  # share of its pixels that must agree with the others: each may hide parts
+_UNKNOWN = 0.05  # of the length: from there on it is said why
 _KNOWN = 0.25  # diameters: standard deviation beyond which a point is not told
 _MISSING = 0.1  # of the length: a line that is so much shorter passes by a stretch that none shows
 _SURE = 0.9  # share from which no other pair is tried for the first curve
@@ -146,9 +144,10 @@ def measure_views(
     ]
     if line is None and len(sights) == 1:
         messages.append(
-            f"{next(iter(sights))} alone gives no line in space: its pixels serve a fit, which has "
-            "the depth from the cable's mechanics alone. Try: a second photograph from another "
-            "place, 30 to 90 degrees around the cable."
+            f"{next(iter(sights))}: one photograph alone gives no line in space: its pixels serve "
+            "a fit, which has the depth from the cable's mechanics alone, and errors are those "
+            "across the line of sight. Try: a second photograph from another place, 30 to 90 "
+            "degrees around the cable."
         )
     elif fit is not None and line is None:
         messages.append(
@@ -158,6 +157,10 @@ def measure_views(
         )
     elif fit is not None and line is not None:
         messages += _line_messages(line, fit, fixtures, length)
+        unknown = 1.0 - _seen(line) / length
+        if unknown > _UNKNOWN:
+            why = _unsure(sights, photographs, diameter)
+            messages.append(f"{100 * unknown:.0f} % of the cable are not known in space: {why}")
     return Views(line, sights, problems, tuple(messages), places)
 
 
@@ -360,8 +363,6 @@ def _line_messages(
 ) -> list[str]:
     """Sentences on how the line in space fits its fixtures and its length."""
     messages = []
-    steps = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
-    seen = float(np.delete(steps, list(line.gaps)).sum())
     whole = _whole(fit, fixtures)
     ends = fit.curve.position(np.array([0.0, 1.0]))
     for name, end, at in zip(("start", "end"), ends, fixtures, strict=False):
@@ -374,9 +375,31 @@ def _line_messages(
             f"{'longer' if whole > length else 'shorter'} than declared ({whole:.3f} of "
             f"{length:g} m, up to both fixtures): check the length, camera.matrix and marker_size"
         )
-    if seen < 0.95 * length:
-        messages.append(
-            f"{100 * (1 - seen / length):.0f} % of the cable are not known in space: hidden, or "
-            "seen along their depth. A third photograph from another side would show them"
-        )
     return messages
+
+
+def _seen(line: SpaceLine) -> float:
+    """Length [m] of what is known."""
+    steps = np.linalg.norm(np.diff(line.points, axis=0), axis=1)
+    return float(np.delete(steps, list(line.gaps)).sum())
+
+
+def _unsure(
+    sights: Mapping[str, Sight], photographs: Mapping[str, NDArray[np.uint8]], diameter: float
+) -> str:
+    """Why a part of the line is not known, and what to try."""
+    places = {
+        name: float(np.sqrt(np.linalg.eigvalsh(sight.viewpoint.covariance[3:, 3:])[-1]))
+        for name, sight in sights.items()
+    }
+    worst = max(places, key=lambda name: places[name])
+    if places[worst] < _KNOWN * diameter:
+        return (
+            "hidden, or seen along their depth. A third photograph from another side would show "
+            "them"
+        )
+    return (
+        f"the markers in {worst} tell where its camera stands to {1e3 * places[worst]:.1f} mm, "
+        f"their corners are {sights[worst].viewpoint.reprojection_error:.2f} px RMS off. Try: that "
+        f"photograph once more, sharp and not too bright.{spoilt(photographs[worst])}"
+    )

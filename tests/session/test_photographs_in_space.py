@@ -54,7 +54,7 @@ def test_a_session_of_views_one_view_and_markers(config, inputs):
     assert third.s is not None
     assert all(item.readable and not item.problem for item in inputs)
     assert any(text.startswith("pose_01_c: ") and "overexposed" in text for text in first.messages)
-    assert any("pose_02_a alone gives no line" in text for text in second.messages)
+    assert any("pose_02_a: one photograph alone gives no line" in text for text in second.messages)
     poses = measured_poses(config, inputs)
     assert [len(item.sensors) for item in poses] == [2, 1, 1]
     assert [item.has_line for item in poses] == [True, False, True]

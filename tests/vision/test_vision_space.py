@@ -18,6 +18,7 @@ from dlo_casadi.vision import (
     project_outline,
     see_cable,
 )
+from dlo_casadi.vision.space_line import _unsure
 
 CURVES = {"bow": bow(), "loop": loop()}
 
@@ -175,7 +176,7 @@ def test_one_photograph_is_no_line_but_pixels(pictures):
     found = measured({"ahead": pictures["bow"]["ahead"]}, curve)
     assert found.line is None
     assert rms(cKDTree(true_pixels(curve, "ahead")).query(found.sights["ahead"].pixels)[0]) < 0.15
-    assert "ahead alone gives no line in space" in found.messages[-1]
+    assert "ahead: one photograph alone gives no line in space" in found.messages[-1]
 
 
 def test_a_photograph_of_another_pose_is_named_and_left_out(pictures):
@@ -190,6 +191,16 @@ def test_a_photograph_of_another_pose_is_named_and_left_out(pictures):
     assert found.line is None
     assert list(found.sights) == ["left"]
     assert found.problems["ahead"].startswith("ahead: ")
+
+
+def test_a_camera_whose_place_is_not_known_is_named(pictures):
+    """Where its markers tell that to 6 mm; otherwise a part of the line is not seen well."""
+    images = {where: pictures["bow"][where] for where in ("left", "ahead")}
+    sights = measured(images, CURVES["bow"]).sights
+    assert _unsure(sights, images, DIAMETER).startswith("hidden, or seen along their depth")
+    vague = replace(sights["left"].viewpoint, covariance=36e-6 * np.eye(6))
+    found = _unsure({**sights, "left": replace(sights["left"], viewpoint=vague)}, images, DIAMETER)
+    assert "markers in left tell where its camera stands to 6.0 mm" in found
 
 
 def test_two_photographs_from_one_place_have_no_depth(pictures):
