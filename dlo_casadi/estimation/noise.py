@@ -309,7 +309,7 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
 
     def unit(q: FloatArray) -> NoiseModel:
         length = cable_length * np.exp(np.clip(q[1], low, high))
-        return NoiseModel(1.0, 0.98 * _logistic(q[0]), float(length), kernel)
+        return NoiseModel(1.0, _logistic(q[0]), float(length), kernel)
 
     def noise_at(q: FloatArray) -> NoiseModel:
         return replace(unit(q), std=restricted_deviance(unit(q), samples)[1])
