@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
 from dlo_casadi.errors import VisionError
@@ -225,6 +226,32 @@ def other_stretches(points: Array, t: Array, width: float) -> Array:
     beside = np.full(len(points), np.nan)
     beside[here[farthest_first]] = offset[farthest_first]
     return beside
+
+
+def loops_either_way(sight: Sight) -> list[Sight]:
+    """The sight as it was ordered, and with each loop of its line run through the other way.
+
+    Where a line meets itself, one photograph tells little of whether its two stretches cross or
+    turn back: the loop between them may be in either order.
+    """
+    apart = np.linalg.norm(sight.pixels[:, None] - sight.pixels[None], axis=2)
+    t = chord_length(sight.pixels)
+    meets = (apart < sight.width) & (t[None] - t[:, None] > _APART * sight.width)
+    labels, count = label(meets, np.ones((3, 3)))
+    ways = [sight]
+    for where in range(1, count + 1):
+        i, j = np.unravel_index(np.where(labels == where, apart, np.inf).argmin(), apart.shape)
+        order = np.arange(len(t))
+        order[i + 1 : j] = order[i + 1 : j][::-1]
+        ways.append(
+            replace(
+                sight,
+                pixels=sight.pixels[order],
+                std=sight.std[order],
+                whole=sight.whole[order],
+            )
+        )
+    return ways
 
 
 def see_beside(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,14 @@ from dlo_casadi.vision.board import Board, locate_camera
 from dlo_casadi.vision.correspondence import Match, match_lines, triangulate
 from dlo_casadi.vision.curve import chord_length
 from dlo_casadi.vision.image import spoilt
-from dlo_casadi.vision.sight import TIP, Sight, other_stretches, see_beside, see_cable
+from dlo_casadi.vision.sight import (
+    TIP,
+    Sight,
+    loops_either_way,
+    other_stretches,
+    see_beside,
+    see_cable,
+)
 from dlo_casadi.vision.space_curve import CurveFit, first_curve, fit_curve_to_sights
 from dlo_casadi.vision.view import Array, Camera
 
@@ -26,6 +34,7 @@ _AGREE = 0.6  # share of its pixels that must agree with the others: each may hi
 _UNKNOWN = 0.05  # of the length: from there on it is said why
 _KNOWN = 0.25  # diameters: standard deviation beyond which a point is not told
 _MISSING = 0.1  # of the length: a line that is so much shorter passes by a stretch that none shows
+_READINGS = 8  # at most, of all photographs of a pose together: loops are few
 _SURE = 0.9  # share from which no other pair is tried for the first curve
 _AGREE_PX = 1.0  # px, beside four standard deviations: errors of cameras' places
 _FAR = 0.05  # of the length, beside what is not seen: a line that ends farther away is another's
@@ -196,29 +205,72 @@ def _agreeing_fit(
                 )
                 del sights[name]
             break
-        best: tuple[float, CurveFit, str] | None = None
-        for pair in pairs:
-            fit = _fit(sights, pair, spans) if pair.match.share > _AGREE else None
-            if fit is None or not _possible(fit, list(sights.values()), fixtures, length):
-                continue
-            shares = dict(zip(sights, map(_agreement, sights.values(), fit.residuals), strict=True))
-            worst = min(shares, key=lambda name: shares[name])
-            if best is None or shares[worst] > best[0]:
-                best = shares[worst], fit, worst
-            if best[0] > _SURE:
-                break
+        best: _Agreement | None = None
+        for reading in _readings(sights):
+            found = _agreement_of(reading, fixtures, length, spans)
+            if found is not None and (best is None or found.score > best.score):
+                best = found
+            if best is not None and best.share > _SURE and len(sights) > 2:
+                break  # of three drawn photographs of a loop a wrong order left 84 % at most
         if best is None:
             _blame(sights, problems, pairs[0], fixtures)
-        elif best[0] > _AGREE:
-            return best[1], list(sights)
-        else:
-            problems[best[2]] = (
-                f"{best[2]}: only {100 * best[0]:.0f} % of the line in it lie on the line in space "
-                "that the photographs of this pose show together. Try: is it of this pose? Was the "
-                "cable or the board moved between the photographs?"
-            )
-            del sights[best[2]]
+            continue
+        sights.update(best.sights)
+        if best.share > _AGREE:
+            return best.fit, list(sights)
+        problems[best.worst] = (
+            f"{best.worst}: only {100 * best.share:.0f} % of the line in it lie on the line in "
+            "space that the photographs of this pose show together. Try: is it of this pose? Was "
+            "the cable or the board moved between the photographs?"
+        )
+        del sights[best.worst]
     return None, []
+
+
+@dataclass(frozen=True)
+class _Agreement:
+    """A curve that photographs, read in one way, show together.
+
+    `share` of its pixels in the photograph that agrees least, `worst`.
+    """
+
+    sights: Mapping[str, Sight]
+    fit: CurveFit
+    share: float
+    worst: str
+
+    @property
+    def score(self) -> tuple[float, float]:
+        """What of two readings the better one has more of: agreement, then likelihood."""
+        return min(self.share, _SURE), -self.fit.surprise
+
+
+def _readings(sights: Mapping[str, Sight]) -> list[dict[str, Sight]]:
+    """All ways to read the photographs, those first that turn the fewest loops round."""
+    ways = [loops_either_way(sight) for sight in sights.values()]
+    turned = sorted(product(*(range(len(way)) for way in ways)), key=np.count_nonzero)
+    return [
+        {name: way[k] for name, way, k in zip(sights, ways, chosen, strict=True)}
+        for chosen in turned[:_READINGS]
+    ]
+
+
+def _agreement_of(
+    sights: dict[str, Sight], fixtures: list[Array], length: float, spans: int
+) -> _Agreement | None:
+    """The curve from a pair that most photographs agree on; None where no pair gives one."""
+    best: _Agreement | None = None
+    for pair in _pairs(sights):
+        fit = _fit(sights, pair, spans) if pair.match.share > _AGREE else None
+        if fit is None or not _possible(fit, list(sights.values()), fixtures, length):
+            continue
+        shares = dict(zip(sights, map(_agreement, sights.values(), fit.residuals), strict=True))
+        worst = min(shares, key=lambda name: shares[name])
+        if best is None or shares[worst] > best.share:
+            best = _Agreement(sights, fit, shares[worst], worst)
+        if best.share > _SURE:
+            break
+    return best
 
 
 def _pairs(sights: dict[str, Sight]) -> list[_Pair]:

@@ -18,7 +18,8 @@ from dlo_casadi.vision import (
     project_outline,
     see_cable,
 )
-from dlo_casadi.vision.space_line import _unsure
+from dlo_casadi.vision.sight import loops_either_way
+from dlo_casadi.vision.space_line import _agreeing_fit, _unsure
 
 CURVES = {"bow": bow(), "loop": loop()}
 
@@ -201,6 +202,29 @@ def test_a_camera_whose_place_is_not_known_is_named(pictures):
     vague = replace(sights["left"].viewpoint, covariance=36e-6 * np.eye(6))
     found = _unsure({**sights, "left": replace(sights["left"], viewpoint=vague)}, images, DIAMETER)
     assert "markers in left tell where its camera stands to 6.0 mm" in found
+
+
+def test_a_loop_that_was_read_the_wrong_way_round_is_turned(pictures):
+    """Of both orders in one photograph the line in space tells which is likelier."""
+    curve = CURVES["loop"]
+    images = {where: pictures["loop"][where] for where in ("left", "right")}
+    sights = {
+        where: see_cable(
+            image,
+            locate_camera(image, BOARD, CAMERA),
+            start=curve[0],
+            end=curve[-1],
+            diameter=DIAMETER,
+            length=length_of(curve),
+        )
+        for where, image in images.items()
+    }
+    for where, sight in sights.items():
+        for way in loops_either_way(sight)[1:]:
+            found = {**sights, where: way}
+            fit, _ = _agreeing_fit(found, {}, [curve[0], curve[-1]], length_of(curve), 50)
+            away = cKDTree(curve).query(fit.curve.position(np.linspace(0.05, 0.95, 200)))[0]
+            assert rms(away) < 1e-3
 
 
 def test_two_photographs_from_one_place_have_no_depth(pictures):
