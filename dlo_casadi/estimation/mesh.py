@@ -69,7 +69,8 @@ def fine_enough(
 ) -> tuple[Fit, float]:
     """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
 
-    Where an effect is missing, the mesh need not be finer than what is missing.
+    Where an effect is missing, the mesh need not be finer than what is missing, nor than the
+    search for it.
     """
     while True:
         if fit.noise.source == "misfit":
@@ -77,7 +78,8 @@ def fine_enough(
         if n != fit.model.n:
             fit = refine_mesh(fit, n, modes)
         error = mesh_error(fit)
-        largest = finest if np.isfinite(error) else SEARCH_MESH
+        lacking = fit.beyond_noise and error < fit.residual_rms / 2
+        largest = SEARCH_MESH if lacking or not np.isfinite(error) else finest
         allowed = allowed_mesh_error(fit)
         if error <= allowed or n >= largest:
             return fit, error
