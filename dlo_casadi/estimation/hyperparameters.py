@@ -19,6 +19,7 @@ from dlo_casadi.estimation.noise import (
 )
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import (
+    MODES,
     MOST_POSES,
     RestLikelihood,
     RestScatter,
@@ -223,7 +224,8 @@ def rest_scatter_of(
     shapes = shapes - shapes[:, :1]
     gap = shapes[:, None] - shapes[None]
     distances = np.sqrt((gap**2).sum(axis=3).mean(axis=2))
-    return estimate_rest_scatter(RestLikelihood(samples, distances))
+    sparse = max(len(s) for s in point.feet) <= MODES
+    return estimate_rest_scatter(RestLikelihood(samples, distances), sparse=sparse)
 
 
 def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:

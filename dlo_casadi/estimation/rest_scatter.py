@@ -210,7 +210,12 @@ class RestLikelihood:
         return self.free * 2 * np.log(noise) + logdet + quadratic, quadratic
 
     def best(
-        self, smoothness: float, range_: float | None, std: bool = True, guess: float = 0.1
+        self,
+        smoothness: float,
+        range_: float | None,
+        std: bool = True,
+        guess: float = 0.1,
+        weight: float = 0.0,
     ) -> Variances:
         """Most likely sizes for a smoothness, and a range of what is systematic, or none.
 
@@ -220,6 +225,8 @@ class RestLikelihood:
             Whether there may be a random part at all.
         guess : float [1/m]
             Where to start.
+        weight : float
+            Of a prior std^weight of the random part, which keeps it from zero.
         """
         free = [True, std, range_ is not None]
         low = guess * np.exp(_LOWEST)
@@ -232,8 +239,9 @@ class RestLikelihood:
 
         def deviance(q: FloatArray) -> float:
             outside = float(((q - np.clip(q, _LOWEST, _HIGHEST)) ** 2).sum())
+            prior = -2 * weight * np.log(sizes(q)[1])
             try:
-                return self.deviance(*sizes(q), smoothness, range_ or 1.0)[0] + outside
+                return self.deviance(*sizes(q), smoothness, range_ or 1.0)[0] + prior + outside
             except np.linalg.LinAlgError:  # sizes so large that their sums are lost in rounding
                 return np.inf
 
@@ -282,13 +290,26 @@ class ScatterEstimate:
     p_systematic: float
 
 
-def estimate_rest_scatter(likelihood: RestLikelihood) -> ScatterEstimate:
-    """Sizes of maximal restricted likelihood: only what differs between poses alike is random."""
-    alone = {s: likelihood.best(s, None) for s in SMOOTHNESS}
+def estimate_rest_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -> ScatterEstimate:
+    """Sizes of maximal restricted likelihood: only what differs between poses alike is random.
+
+    Parameters
+    ----------
+    sparse : bool
+        Whether a pose has no more points than a rest curvature has modes: they hardly tell noise
+        from scatter. The likeliest scatter is none by chance then, and intervals are too narrow: a
+        prior proportional to the scatter keeps it from there, by about a standard error.
+
+    References
+    ----------
+    Chung et al., Psychometrika 78 (2013).
+    """
+    weight = float(sparse)
+    alone = {s: likelihood.best(s, None, weight=weight) for s in SMOOTHNESS}
     smoothness = min(alone, key=lambda s: alone[s].deviance)
     chosen, range_, guess = alone[smoothness], None, alone[smoothness].std
     ranges = [r * likelihood.apart for r in RANGES] if likelihood.m > 2 else []
-    both = {r: likelihood.best(smoothness, r, guess=guess) for r in ranges}
+    both = {r: likelihood.best(smoothness, r, guess=guess, weight=weight) for r in ranges}
     joint = min(both, key=lambda r: both[r].deviance, default=None)
     gain = 0.0 if joint is None else max(chosen.deviance - both[joint].deviance, 0.0)
     # The best of the ranges; at a bound of zero half of chi-square's probability.
@@ -297,7 +318,7 @@ def estimate_rest_scatter(likelihood: RestLikelihood) -> ScatterEstimate:
     if joint is not None and p_systematic < SIGNIFICANCE / 2:
         chosen, range_ = both[joint], joint
     without = likelihood.best(smoothness, range_, std=False, guess=guess)
-    if without.deviance - chosen.deviance < TELLING:
+    if not sparse and without.deviance - chosen.deviance < TELLING:
         return ScatterEstimate(RestScatter(), without.noise, p_systematic)
     dof = likelihood.degrees(chosen, smoothness, range_)
     return ScatterEstimate(RestScatter(chosen.std, smoothness, dof), chosen.noise, p_systematic)
