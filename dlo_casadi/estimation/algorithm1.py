@@ -498,9 +498,10 @@ def _message(
     status: Algorithm1Status, history: list[float], seconds: float, failed: int, n_poses: int
 ) -> str:
     """Say in words how the loop ended."""
+    count = len(history) - 1
     text = (
-        f"After {len(history) - 1} iterations ({seconds:.1f} s) {status.value}; k_theta went from "
-        f"{history[0]:.3g} to {history[-1]:.3g} N m/rad."
+        f"After {count} iteration{'' if count == 1 else 's'} ({seconds:.1f} s) {status.value}; "
+        f"k_theta went from {history[0]:.3g} to {history[-1]:.3g} N m/rad."
     )
     if failed:
         text += f" The shapes of {failed} of {n_poses} poses did not converge in the last one."

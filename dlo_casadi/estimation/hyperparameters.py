@@ -283,7 +283,7 @@ def _noise_samples(
     samples = []
     for j, raw, s, own, block in zip(problem.used, raws, point.feet, bases, blocks, strict=True):
         samples += [
-            NoiseSample(raw[rows], s[points], sensor.weight, own[rows], block[rows])
+            NoiseSample(raw[rows], s[points], sensor.weight, own[rows], block[rows], sensor.grain)
             for sensor, points, rows in problem.measured[j].slices
         ]
     return samples

@@ -104,19 +104,25 @@ class NoiseModel:
         """Whether it does not depend on the model that is fitted."""
         return self.source != "estimated"
 
-    def covariance(self, s: FloatArray, weight: FloatArray) -> FloatArray:
+    def covariance(self, s: FloatArray, weight: FloatArray, grain: float = 0.0) -> FloatArray:
         """Covariance matrix (K, K) [m^2] at arc lengths s."""
-        return (
-            self.std**2 * self.correlation(np.abs(s[:, None] - s[None])) * np.outer(weight, weight)
-        )
+        unit = self.correlation(np.abs(s[:, None] - s[None]), grain)
+        return self.std**2 * unit * np.outer(weight, weight)
 
-    def correlation(self, distance: FloatArray) -> FloatArray:
-        """Correlation matrix (K, K) of points at distances (K, K) [m] along the cable."""
+    def correlation(self, distance: FloatArray, grain: float = 0.0) -> FloatArray:
+        """Correlation matrix (K, K) of points at distances (K, K) [m] along the cable.
+
+        Over `grain` [m] they share the errors that are white otherwise, by a Gaussian.
+        """
         if self.share > 0:
             unit = self.share * correlation(self.kernel, distance / self.length)
         else:
             unit = np.zeros_like(distance)
-        unit.flat[:: len(unit) + 1] += 1 - self.share + 1e-9
+        if grain:
+            unit += (1 - self.share) * correlation("gaussian", distance / grain)
+        else:
+            unit.flat[:: len(unit) + 1] += 1 - self.share
+        unit.flat[:: len(unit) + 1] += 1e-9
         return unit
 
     def units(self, kinds: NDArray[np.str_]) -> FloatArray:
@@ -135,11 +141,11 @@ class NoiseModel:
         grown = replace(own, force=factor * own.force, moment=factor * own.moment)
         return NoiseModel(std, readings=grown)
 
-    def whitening(self, s: FloatArray, weight: FloatArray) -> FloatArray:
+    def whitening(self, s: FloatArray, weight: FloatArray, grain: float = 0.0) -> FloatArray:
         """Matrix W (K, K) with W cov W^T = 1."""
-        if self.share == 0:
+        if self.share == 0 and grain == 0:
             return np.diag(1 / (self.std * weight))
-        factor = np.linalg.cholesky(self.covariance(s, weight))
+        factor = np.linalg.cholesky(self.covariance(s, weight, grain))
         return solve_triangular(factor, np.eye(len(s)), lower=True)
 
 
@@ -166,6 +172,8 @@ class NoiseSample:
     shared : (R, b)
         Directions along which all poses move together; projected out. Stacked over the poses
         they are independent of one another and of the poses' own directions.
+    grain : scalar [m]
+        Over which the points share the errors that are white otherwise.
     """
 
     residuals: FloatArray
@@ -173,6 +181,7 @@ class NoiseSample:
     weight: FloatArray
     own: FloatArray
     shared: FloatArray
+    grain: float = 0.0
 
     def thinned(self, most: int) -> NoiseSample:
         """Keep at most so many points, evenly picked, and of the own directions what they tell.
@@ -189,6 +198,7 @@ class NoiseSample:
             self.weight[kept],
             basis[:, values > _DEPENDENT * values.max(initial=0.0)],
             self.shared[rows],
+            self.grain,
         )
 
     @property
@@ -222,7 +232,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
     logdet, count = 0.0, 0
     gram = np.zeros((samples[0].shared.shape[1] + 1,) * 2)
     for sample in samples:
-        factor = np.linalg.cholesky(unit.correlation(sample.distance))
+        factor = np.linalg.cholesky(unit.correlation(sample.distance, sample.grain))
         points, each, columns = sample.scaled.shape
         # LAPACK itself: of matrices this small SciPy's checks take longer than the solution.
         y = dtrtrs(factor.T, sample.scaled.reshape((points, -1)), lower=0, trans=1)[0]
@@ -373,7 +383,7 @@ def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float
     # Sines vanish at the fixtures, where points may lie: they determine no mode.
     count = min(SLOW_MODES, max(1, len(sample.places) - 3))
     modes = smooth_modes(sample.places, cable_length, count, free_end=False)
-    seen = noise.whitening(sample.places, sample.weight) @ modes
+    seen = noise.whitening(sample.places, sample.weight, sample.grain) @ modes
     return -float(np.linalg.slogdet(seen.T @ seen)[1]) / count
 
 

@@ -80,7 +80,7 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
                 none = np.zeros((len(e), 0))
                 if len(s):
                     weight = sensor.weight[inside[points]]
-                    samples.append(NoiseSample(e, s, weight, none, none))
+                    samples.append(NoiseSample(e, s, weight, none, none, sensor.grain))
     if not tell_of_noise(samples):
         return noise
     found = estimate_noise(samples, length)

@@ -68,6 +68,11 @@ class Sensor(Protocol):
         ...
 
     @property
+    def grain(self) -> float:
+        """Length [m] over which points share the errors that are white otherwise."""
+        ...
+
+    @property
     def kinds(self) -> NDArray[np.str_]:
         """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
         ...
@@ -121,6 +126,11 @@ class OfPoints(ABC):
     """What sensors of points have in common."""
 
     points: FloatArray
+
+    @property
+    def grain(self) -> float:
+        """None: points err by themselves."""
+        return 0.0
 
     @property
     @abstractmethod
@@ -268,6 +278,7 @@ class Wrench:
     node: type[Node]
     per_point = 0
     marked = True
+    grain = 0.0
 
     @property
     def _rows(self) -> dict[str, slice]:

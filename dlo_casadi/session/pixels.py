@@ -63,6 +63,9 @@ class Pixels(OfPoints):
         Of a pixel at the cable.
     together : (K, 6) [m]
         What a standard deviation of each error of the camera's place does to the residuals.
+    grain : scalar [m]
+        Length over which the average along the cable correlates the pixels' errors: what else is
+        correlated, such as by light that changes along the cable, is left to the noise model.
     on_line : bool
         Whether the points are of a line in space, and no guess.
     """
@@ -74,6 +77,7 @@ class Pixels(OfPoints):
     weight: FloatArray
     size: float
     together: FloatArray
+    grain: float = 0.0
     on_line: bool = False
 
     marked = False
@@ -143,7 +147,7 @@ class Pixels(OfPoints):
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (K, K) [1/m] with W cov W^T = 1, errors of the camera's place among them."""
-        white = noise.whitening(places, self.weight)
+        white = noise.whitening(places, self.weight, self.grain)
         seen = white @ self.together
         factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
         return np.asarray(solve_triangular(factor, white, lower=True))
@@ -162,9 +166,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     """The sensor of a photograph; None if none of its pixels is of the cable.
 
     Pixels share their errors with their neighbours over the length of the average along the
-    cable; of those nearer to each other than twice its integral, where a correlation of 4 % is
-    left, one is taken. What remains correlated is then what changes slowly along the cable, such
-    as light; nearer pixels would hide that from the estimate of the noise. None is taken where the
+    cable: of those nearer to each other than its integral one is taken. None is taken where the
     average reaches over an end of the line, into what holds the cable, to where another stretch
     hides an edge, or to where the cable runs along the line of sight.
 
@@ -176,7 +178,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
         Standard deviation of a pixel of weight one.
     """
     sight = view.sight
-    every = max(1, int(np.ceil(2.0 * sight.correlation / sight.spacing)))
+    every = max(1, int(np.ceil(sight.correlation / sight.spacing)))
     steps = np.linalg.norm(np.diff(sight.pixels, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     sure = sight.whole & (sight.std < _UNSURE * np.median(sight.std))
@@ -199,7 +201,9 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     error = np.linalg.cholesky(viewpoint.covariance)
     together = size * np.column_stack([by_turn, by_shift]) @ error
     weight = sight.std[kept] * size / std
-    return Pixels(viewpoint, pixels, sight.diameter, points, weight, size, together, on_line)
+    # Of an average with a Gaussian, whose errors are correlated over sqrt(2) of its own length.
+    grain = np.sqrt(2.0 / np.pi) * sight.correlation * size
+    return Pixels(viewpoint, pixels, sight.diameter, points, weight, size, together, grain, on_line)
 
 
 def _across(view: ViewInput) -> FloatArray:

@@ -1,5 +1,6 @@
 """Pixels of a photograph as a sensor, against a curve that is known."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,8 +91,20 @@ def test_errors_of_the_cameras_place_are_part_of_the_covariance():
     np.testing.assert_allclose(white @ covariance @ white.T, np.eye(len(S)), atol=1e-9)
 
 
+def test_errors_are_correlated_over_the_average_along_the_cable():
+    """All of what is not correlated otherwise: pixels two lengths apart share exp(-2) of it."""
+    pixels = replace(sensor(0.4, curve()), grain=0.02)
+    places = np.array([0.1, 0.14, 0.5])
+    noise, together = NoiseModel(1e-4, 0.5, 0.01, "exponential"), np.zeros((3, 6))
+    pixels = replace(pixels, weight=np.ones(3), together=together)
+    white = pixels.whitening(noise, places)
+    inverse = np.linalg.inv(white.T @ white) / 1e-8
+    assert inverse[0, 1] == pytest.approx(0.5 * (np.exp(-2) + np.exp(-4)), rel=1e-6)
+    assert inverse[0, 2] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_pixels_near_the_ends_and_beside_each_other_are_left_out():
-    """Of a straight line of 1 px steps averaged over 4 px: one of every 15, none near an end."""
+    """Of a straight line of 1 px steps averaged over 4 px: one of every 8, none near an end."""
     camera, count = viewpoint(0.0), 301
     pixels = np.column_stack([np.arange(count) + 400.0, np.full(count, 500.0)])
     places = np.column_stack([np.linspace(0.2, 0.6, count), np.zeros(count), np.zeros(count)])
@@ -105,8 +118,9 @@ def test_pixels_near_the_ends_and_beside_each_other_are_left_out():
     u = found.pixels[:, 0] - 400.0
     assert u.min() > 12.0
     assert u.max() < count - 13.0
-    np.testing.assert_allclose(np.diff(u), 15.0)
+    np.testing.assert_allclose(np.diff(u), 8.0)
     np.testing.assert_allclose(found.weight, 1.0)
+    assert found.grain == pytest.approx(np.sqrt(2) * 4.0 * 1.2 / 1000)
 
 
 @pytest.mark.parametrize("line", [True, False])
