@@ -28,10 +28,11 @@ SLOW_MODES = 6
 # Directions below this share of the largest tell nothing of their own: the square root of rounding
 # in their products, 1e-8, and two digits.
 _DEPENDENT = 1e-6
-# Points of a pose from which noise is estimated. Finer ones tell of the kernel's shape, not of slow
-# errors: of rendered photographs those came out at 0.9 of their variance from 80 points a pose, and
-# at 0.37 from 160, against 54.
-MOST_POINTS = 60
+# Share of the variance from which on noise is smooth along the cable. Points nearer to one another
+# than its correlation length tell of the kernel's shape then, not of slow errors: of rendered
+# photographs those came out at 0.9 of their variance from 80 points a pose, at 0.37 from 160,
+# against 54.
+SMOOTH = 0.9
 # Points beyond its own directions that a pose needs to tell of the noise, and degrees of freedom
 # that all poses need together for a size and a correlation.
 _SPARE_POINTS, _LEAST_DEGREES = 5, 6
@@ -258,10 +259,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
 
 
 def estimate_noise(
-    samples: list[NoiseSample],
-    cable_length: float,
-    max_points: int = MOST_POINTS,
-    max_poses: int = 60,
+    samples: list[NoiseSample], cable_length: float, max_points: int = 80, max_poses: int = 60
 ) -> NoiseModel:
     """Estimate size and correlation of the noise from the residuals of all poses.
 
@@ -270,7 +268,7 @@ def estimate_noise(
     samples : list of NoiseSample
     cable_length : float [m]
     max_points : int
-        Points used per pose; evenly thinned beyond that.
+        Points used per pose; evenly thinned beyond that, and where smooth noise makes them alike.
     max_poses : int
         Poses from which the correlation is estimated, evenly picked; its size is that of all.
 
@@ -285,6 +283,9 @@ def estimate_noise(
     found = [_white(samples, cable_length)]
     found += [_correlated(samples, cable_length, kernel) for kernel in KERNELS]
     best = min(found, key=lambda item: item.deviance)
+    apart = int(cable_length / best.noise.length) if best.noise.share > SMOOTH else max_points
+    if apart < max_points:
+        return estimate_noise(everything, cable_length, apart, max_poses)
     noise = replace(best.noise, slow_dof=_slow_dof(found))
     if len(everything) == len(samples):
         return noise

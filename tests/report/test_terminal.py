@@ -68,7 +68,7 @@ def test_no_number_is_given_for_what_the_shapes_do_not_tell(outcome, interval, w
     text = said(with_stiffness(outcome, interval))
 
     assert words in text
-    assert "17" not in text.split("Distance of the measured points")[0].split("points;")[1]
+    assert " 17" not in text.split("Distance of the measured points")[0].split("points;")[1]
 
 
 def test_a_parameter_on_its_bound_says_so(outcome):
