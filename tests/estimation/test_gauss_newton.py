@@ -391,3 +391,19 @@ def test_nothing_to_fit_says_so():
     (pose,) = poses_at(1)
     with pytest.raises(EstimationError, match="no pose to fit"):
         fit_model(model, [MeasuredPose.of_points(pose, np.empty((0, 2)))], Tolerances(), STD)
+
+
+def test_a_step_changes_a_stiffness_by_a_factor_of_twenty_at_most():
+    model = CableModel(CABLE, n=8)
+    unknowns = Unknowns(model, np.ones(len(model.names), dtype=bool), model.nominal)
+    theta = unknowns.pack(model.nominal, np.zeros(model.n_coefficients))
+    lower, upper = unknowns.reach(theta)
+    stiffness = unknowns.names.index("bending_stiffness")
+    assert np.exp([lower[stiffness], upper[stiffness]]) == pytest.approx(
+        [0.05 / 20, 0.05 * 20], 0.01
+    )
+    np.testing.assert_array_equal(
+        np.delete(upper, stiffness), np.delete(unknowns.bounds[1], stiffness)
+    )
+    theta[stiffness] = unknowns.bounds[1][stiffness]
+    assert unknowns.reach(theta)[1][stiffness] == theta[stiffness]

@@ -250,15 +250,40 @@ def test_correlated_noise_is_recovered(truth):
         assert [noise.length for noise in found] == pytest.approx([truth.length] * 3, rel=0.1)
 
 
+def log_slow_variance(covariance: np.ndarray, s: np.ndarray) -> float:
+    """Logarithm of the geometric mean of the variance of six slow modes."""
+    modes = smooth_modes(s, LENGTH, 6, free_end=False)
+    seen = np.linalg.solve(np.linalg.cholesky(covariance), modes)
+    return -float(np.linalg.slogdet(seen.T @ seen)[1]) / 6
+
+
+def test_slow_errors_beside_smooth_ones_are_seen_in_dense_points():
+    """An average along the cable makes noise smooth; the estimate must not tell of that alone."""
+    parts = [
+        NoiseModel(3e-5, 0.999, 0.015, "gaussian"),
+        NoiseModel(2e-5, 0.999, 0.04, "gaussian"),
+    ]
+    s = np.linspace(0.01, LENGTH - 0.01, 160)
+    true = log_slow_variance(sum(part.covariance(s, np.ones(160)) for part in parts), s)
+    errors = []
+    for seed in range(3):
+        one, other = (simulated(part, 14, 160, seed + 10 * k) for k, part in enumerate(parts))
+        both = [
+            replace(a, residuals=a.residuals + b.residuals) for a, b in zip(one, other, strict=True)
+        ]
+        found = estimate_noise(both, LENGTH)
+        errors.append(log_slow_variance(found.covariance(s, np.ones(160)), s) - true)
+    # What is told, 2 / slow_dof, is a standard deviation of 0.16 to 0.2: two of them.
+    assert np.abs(errors).max() < 0.35
+
+
 def test_how_well_slow_modes_are_known_is_known():
     """Logarithm of the variance of slow modes: its spread over sessions, and that which is told."""
     truth = NoiseModel(3e-4, 0.5, 0.03, "gaussian")
     s, weight = np.linspace(0.01, LENGTH - 0.01, 80), np.ones(80)
-    modes = smooth_modes(s, LENGTH, 6, free_end=False)
 
     def log_variance(noise: NoiseModel) -> float:
-        seen = noise.whitening(s, weight) @ modes
-        return -float(np.linalg.slogdet(seen.T @ seen)[1]) / 6
+        return log_slow_variance(noise.covariance(s, weight), s)
 
     found = [estimate_noise(simulated(truth, 6, 80, seed=k), LENGTH) for k in range(24)]
     errors = np.array([log_variance(noise) - log_variance(truth) for noise in found])

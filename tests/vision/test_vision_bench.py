@@ -85,6 +85,8 @@ def test_rendered_sessions_are_measured_to_a_fortieth_of_a_pixel(name):
     shift, misses, shares, gaps = measure(configs[name], truth)
     rms = np.sqrt(np.mean(np.concatenate(misses) ** 2))
     assert rms < 1.9e-3 / 40, f"RMS {1e3 * rms:.3f} mm"
+    ends = np.concatenate([np.concatenate([miss[:6], miss[-6:]]) for miss in misses])
+    assert np.sqrt(np.mean(ends**2)) < 1.9e-3 / 40
     assert max(np.sqrt(np.mean(miss**2)) for miss in misses) < 1.9e-3 / 25  # of one picture
     assert np.linalg.norm(shift) < 12.8e-3 / 50
     assert shares.min() > 0.97
