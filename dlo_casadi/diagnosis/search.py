@@ -150,7 +150,7 @@ class Search:
             explaining = explained_by(current, tried)
             confirmed = explaining or improving(tried, validation, self.doubt)
             if k == 0:
-                ranked = ranking(screened, p_values, confirmed)
+                ranked = ranking(screened, p_values, confirmed, tried)
             # What a second effect explains may be what the first one, if wrong, has left.
             apart = np.inf if added and not explaining else BIC_APART
             chosen = choose(confirmed, apart)

@@ -184,24 +184,26 @@ def _told(fit: Fit) -> float:
 
 
 def ranking(
-    screened: Sequence[Screened], p_values: Mapping[str, float], confirmed: Sequence[Confirmed]
+    screened: Sequence[Screened],
+    p_values: Mapping[str, float],
+    confirmed: Sequence[Confirmed],
+    tried: Iterable[Confirmed | None],
 ) -> list[Ranked]:
-    """All candidates: those refitted by BIC, then the others by score."""
-    refitted = {item.candidate.name: item for item in confirmed}
-    rows = [
-        Ranked(
-            item.candidate.name,
-            item.score,
-            p_values[item.candidate.name],
-            refitted[item.candidate.name].validation.rmse
-            if item.candidate.name in refitted
-            else None,
-        )
-        for item in screened
-    ]
+    """All candidates: those confirmed, then other refits, by BIC; the rest by score."""
+    worthy = {item.candidate.name: item for item in confirmed}
+    refitted = {item.candidate.name: item for item in tried if item is not None} | worthy
 
-    def order(row: Ranked) -> tuple[float, float]:
+    def error(name: str) -> float | None:
+        found = refitted.get(name)
+        return found.validation.rmse if found and found.validation.complete else None
+
+    def order(row: Ranked) -> tuple[bool, float, float]:
         known = refitted.get(row.name)
-        return (-known.bic if known else np.inf, -row.score)
+        return (row.name not in worthy, -known.bic if known else np.inf, -row.score)
 
+    names = [item.candidate.name for item in screened]
+    rows = [
+        Ranked(name, item.score, p_values[name], error(name))
+        for name, item in zip(names, screened, strict=True)
+    ]
     return sorted(rows, key=order)

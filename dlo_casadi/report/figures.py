@@ -505,14 +505,14 @@ def draw_candidates(path: Path, outcome: Outcome) -> None:
         handles = [
             Patch(color=BLUE, label="added to the model"),
             Patch(color=ORANGE, label="cannot be told apart from it"),
-            Patch(color=GREY, label="refitted, not added: by BIC"),
+            Patch(color=GREY, label="refitted, not added"),
             Patch(color=_UNTRIED, label="not refitted"),
         ]
         refitted = [row["rmse_cross_validated"] is not None for row in rows]
         shown = [bool(added), bool(tied), sum(refitted) > len(added | tied), not all(refitted)]
         handles = [handle for handle, show in zip(handles, shown, strict=True) if show]
         drawing.legend(handles=handles, loc="outside lower center", ncols=2)
-        title = "what the declared model may lack: refits by BIC, then by score"
+        title = "what the declared model may lack: refits, then by score"
         if outcome.verdict == "unexplained":
             title = "candidates tried; what is left is not explained by any"
         elif not outcome.effects:

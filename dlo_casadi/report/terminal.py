@@ -459,7 +459,7 @@ def _quantity(name: str, row: dict[str, Any]) -> str:
 
 
 # How candidates are ordered; the score alone does not tell how well a refit does.
-CANDIDATE_ORDER = "first those that a refit confirms, by BIC, then the others by score"
+CANDIDATE_ORDER = "first those that a refit confirms, by BIC, then other refits, the rest by score"
 
 
 def p_value_note(outcome: Outcome) -> str:
