@@ -283,7 +283,9 @@ def estimate_noise(
     found = [_white(samples, cable_length)]
     found += [_correlated(samples, cable_length, kernel) for kernel in KERNELS]
     best = min(found, key=lambda item: item.deviance)
-    apart = int(cable_length / best.noise.length) if best.noise.share > SMOOTH else max_points
+    # Where an average along the cable is declared as `grain`, the kernel does not stand for it.
+    smooth = best.noise.share > SMOOTH and not samples[0].grain
+    apart = int(cable_length / best.noise.length) if smooth else max_points
     if apart < max_points:
         return estimate_noise(everything, cable_length, apart, max_poses)
     noise = replace(best.noise, slow_dof=_slow_dof(found))
