@@ -127,7 +127,8 @@ class _Search:
         """Fits from the most promising places, the best first."""
         middle = PULL_PLACES[len(PULL_PLACES) // 2]
         first = self.start((middle, DECADES))
-        asked = [(share, self.decades_about(first)) for share in PULL_PLACES if share != middle]
+        decades = DECADES if first is None else self.decades_about(first)
+        asked = [(share, decades) for share in PULL_PLACES if share != middle]
         starts = [first, *map_in_order(executor, self.start, asked)]
         places = [middle, *(share for share, _ in asked)]
         ways = [
@@ -137,13 +138,11 @@ class _Search:
         fits = map_in_order(executor, self.fit_from, likely[:TRIED])
         return sorted(fits, key=lambda fit: fit.point.objective)
 
-    def decades_about(self, point: Point | None) -> tuple[float, ...]:
+    def decades_about(self, point: Point) -> tuple[float, ...]:
         """Stiffnesses to start from at other places: at all, what was left had one valley.
 
         Of a simulated cable with a tether, over nine places; the valley moved by a decade at most.
         """
-        if point is None:
-            return DECADES
         p = self.held_at(PULL_PLACES[0]).unknowns.p(point.theta)
         own = self.model.names.index(BENDING_STIFFNESS)
         best = round(float(np.log10(p[own] / self.model.nominal[own])))
@@ -152,7 +151,7 @@ class _Search:
     def start(self, way: tuple[float, Sequence[float]]) -> Point | None:
         """Equilibria near the measured shapes for a load at a share of the length.
 
-        `way` is the share, and the decades about the prior stiffness to start from.
+        `way` is the share, and in a plane the decades about the prior stiffness to start from.
         """
         share, decades = way
         problem = self.held_at(share)

@@ -69,7 +69,8 @@ SEARCH_STD = 0.004
 # of 0.005 N m^2): what is missing is looked for from the measured shapes.
 MISFIT, MISFIT_STD = 0.002, 0.01
 # RMS distance over length from which a search in the plane may have gone astray, because every
-# hanging has a rest curvature of its own. Of 27 sessions 18 left less; no search found more there.
+# hanging has a rest curvature of its own. Of 26 sessions 16 left less; no second search led
+# elsewhere there.
 ASTRAY = 0.001
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4

@@ -100,9 +100,8 @@ def trace_cable(
         shape = edge_shape(raw, direction, usual, guess)
         rough = find_edges(raw, direction, shape)
         sound = raw.inside & _is_usual(rough, usual, diameter)
-        # In space, where the average along the cable is part of the covariance, ends that are
-        # continued from what is beside them look surer than they are: the interval of EI of ten
-        # rendered poses was half as wide with them, and did not hold the truth.
+        # Not in space: there the interval of EI of ten rendered poses was half as wide with it, and
+        # did not hold the truth.
         if not in_space:
             sound &= ~_beside_end(rough, t, sound, diameter)
         if sound.sum() < 8:
