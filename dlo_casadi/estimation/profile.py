@@ -6,16 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from dlo_casadi.composition import BENDING_STIFFNESS, STIFFNESSES
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.gauss_newton import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, SYSTEMATIC_SHARE
+from dlo_casadi.thresholds import IDENTIFIABLE, SYSTEMATIC_SHARE
 
 FloatArray = NDArray[np.floating]
 
+# Probability below the upper end of a 95 % interval.
+BELOW_HIGH_END = 0.975
 # Search for the interval's ends within this factor of the estimate, threefold at most at a time.
 LARGEST_LOG_STEP = float(np.log(1e4))
 FARTHEST_AIM, MOST_REFITS = 3.0, 12
@@ -38,11 +41,12 @@ class Interval:
         return self.high <= IDENTIFIABLE * self.low
 
 
-def threshold(fit: Fit) -> float:
-    """Rise of twice the objective at the ends of the interval.
+def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
+    """Rise of twice the objective at the ends of a parameter's interval.
 
-    (1.96 + b)^2 times the excess of the residual over the noise, where b, for a declared noise, is
-    the length in its metric of a systematic error of SYSTEMATIC_SHARE of it in all points.
+    (t + b)^2 times the excess of the residual over the noise, with Student's t of 95 % for what the
+    sizes of noise and scatter are estimated from, 1.96 where they are declared; b, for a declared
+    noise, is the length in its metric of a systematic error of SYSTEMATIC_SHARE in all points.
     """
     square = 0.0
     for j in fit.problem.used:
@@ -53,7 +57,8 @@ def threshold(fit: Fit) -> float:
         constant[item.on_points] = item.relative_std[item.point_of]
         constant *= SYSTEMATIC_SHARE * fit.noise.std
         square += float(((fit.problem.whitening(j) @ constant) ** 2).sum())
-    return (NORMAL_95 + np.sqrt(square)) ** 2 * fit.inflation**2
+    student = float(stdtrit(fit.variance_degrees(name), BELOW_HIGH_END))
+    return (student + np.sqrt(square)) ** 2 * fit.inflation**2
 
 
 def profile_intervals(fit: Fit) -> dict[str, Interval]:
@@ -73,7 +78,7 @@ def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
     name : str
         The bending stiffness by default.
     """
-    limit = threshold(fit)
+    limit = threshold(fit, name)
     std = fit.std(name) / fit.inflation / fit.value(name)
     first = min(max(np.sqrt(limit) * std, 1e-4), 0.7)
     ends = [_crossing(_Profile(fit, name), limit, direction * first) for direction in (-1, 1)]

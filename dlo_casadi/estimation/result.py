@@ -113,17 +113,56 @@ class Fit:
     @cached_property
     def leverages(self) -> list[FloatArray]:
         """What of each fitted residual (R_j,) the unknowns take up: 0 to 1."""
-        lin, out = self.linearization, []
-        for k, (a, b) in enumerate(zip(lin.by_theta, lin.by_deviation, strict=True)):
-            taken = a
-            if b.shape[1]:
-                block, cross, _ = self.normal.inner[k]
-                taken = a - b @ np.linalg.solve(block, cross)
+        out = []
+        for k, (taken, b) in enumerate(
+            zip(self._taken, self.linearization.by_deviation, strict=True)
+        ):
             own = ((taken @ self.covariance) * taken).sum(axis=1)
             if b.shape[1]:
+                block = self.normal.inner[k][0]
                 own += (b * np.linalg.solve(block, b.T).T).sum(axis=1)
             out.append(own)
         return out
+
+    @property
+    def _taken(self) -> list[FloatArray]:
+        """Whitened residuals (R_j, size) by theta, each pose's own deviations following."""
+        lin, out = self.linearization, []
+        for k, (a, b) in enumerate(zip(lin.by_theta, lin.by_deviation, strict=True)):
+            if b.shape[1]:
+                block, cross, _ = self.normal.inner[k]
+                a = a - b @ np.linalg.solve(block, cross)
+            out.append(a)
+        return out
+
+    def variance_degrees(self, name: str) -> float:
+        """Degrees of freedom with which the variance of a parameter's estimate is known.
+
+            1 / degrees = sum_c (v_c / v)^2 / degrees_c
+
+        of the parts v_c that the noise and the rest curvature of each hanging's own have in it,
+        degrees_c those of their sizes; inf where both are declared.
+
+        References
+        ----------
+        Satterthwaite, Biometrics Bulletin 2 (1946).
+        """
+        problem, rest = self.problem, self.problem.rest_scatter
+        if self.errors_known:
+            return np.inf
+        index = problem.unknowns.names.index(name)
+        column = self.covariance[index]
+        errors, hangings = 0.0, 0.0
+        for k, taken in enumerate(self._taken):
+            by_errors = taken @ column
+            errors += float(by_errors @ by_errors)
+            if rest.std > 0:
+                way = problem.whitening(problem.used[k]) @ self._moved_by_rest[k]
+                sizes = np.tile(rest.sizes, way.shape[1] // len(rest.sizes))
+                hangings += float(((by_errors @ way * sizes) ** 2).sum())
+        known = np.inf if self.noise.known else self.noise.slow_dof
+        parts = ((errors - hangings) ** 2 / known + hangings**2 / rest.dof) / column[index] ** 2
+        return float(1 / parts) if parts > 0 else np.inf
 
     @property
     def degrees_of_freedom(self) -> float:
@@ -178,11 +217,16 @@ class Fit:
         problem = self.problem
         if problem.rest_scatter.std == 0:
             return [np.zeros(len(raw)) for raw in self.linearization.raw]
-        moved = problem.moved_by_rest(self.point.theta, self.point.shapes, self.point.feet)
         sizes = problem.rest_scatter.sizes
         return [
-            ((way * np.tile(sizes, way.shape[1] // len(sizes))) ** 2).sum(axis=1) for way in moved
+            ((way * np.tile(sizes, way.shape[1] // len(sizes))) ** 2).sum(axis=1)
+            for way in self._moved_by_rest
         ]
+
+    @cached_property
+    def _moved_by_rest(self) -> list[FloatArray]:
+        point = self.point
+        return self.problem.moved_by_rest(point.theta, point.shapes, point.feet)
 
     @property
     def _on_points(self) -> list[NDArray[np.bool_]]:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, t
 from test_gauss_newton import CABLE, STD, measured_from
 
 from dlo_casadi.diagnosis.selection import p_with_closed_noise
@@ -12,6 +12,9 @@ from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import Tolerances
+from dlo_casadi.estimation.profile import threshold
+from dlo_casadi.estimation.rest_scatter import RestScatter
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.declared import nuisances
 
@@ -50,6 +53,38 @@ def test_the_residual_of_a_declared_noise_is_tested_against_chi_square(factor, l
     assert factor**2 * found.statistic / found.dof == pytest.approx(
         1, abs=3 * (2 / found.dof) ** 0.5
     )
+
+
+def test_how_well_the_variance_of_a_parameter_is_known():
+    """Satterthwaite: shares are the slopes of the log of the variance, by differences."""
+    fit = fitted(9)
+    problem = fit.problem
+
+    def like(noise=1.0, rest=1.0, rest_dof=7.0):
+        errors = replace(fit.noise, std=np.sqrt(noise) * fit.noise.std, slow_dof=30.0)
+        scatter = RestScatter(np.sqrt(rest) * 0.2, 0.25, rest_dof)
+        other = problem.changed(errors, problem.roughness_std, problem.scatter, scatter)
+        return Fit(other, other.taken_over(fit.point), converged=True)
+
+    def slope(name):
+        more, less = (like(**{name: factor}).covariance[0, 0] for factor in (1.01, 0.99))
+        return np.log(more / less) / np.log(1.01 / 0.99)
+
+    shares = [slope("noise"), slope("rest")]
+    assert min(shares) > 0.05
+    expected = 1 / (shares[0] ** 2 / 30 + shares[1] ** 2 / 7)
+    assert like().variance_degrees("bending_stiffness") == pytest.approx(expected, rel=1e-3)
+    declared = fitted(9, std=STD)
+    assert declared.variance_degrees("bending_stiffness") == np.inf
+    assert threshold(declared) > threshold_of_t(np.inf)
+    assert threshold(fit) == pytest.approx(
+        threshold_of_t(fit.variance_degrees("bending_stiffness")) * fit.inflation**2
+    )
+
+
+def threshold_of_t(degrees):
+    """Square of the quantile that 95 % are within."""
+    return t.ppf(0.975, degrees) ** 2
 
 
 def test_fewer_points_than_unknowns():
