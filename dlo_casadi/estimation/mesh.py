@@ -12,7 +12,7 @@ from dlo_casadi.estimation.hyperparameters import SMOOTH_MODES
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.thresholds import MESH_SHARE
+from dlo_casadi.thresholds import LACKING_SHARE, MESH_SHARE
 
 FloatArray = NDArray[np.floating]
 
@@ -69,8 +69,7 @@ def fine_enough(
 ) -> tuple[Fit, float]:
     """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
 
-    Where an effect is missing, the mesh need not be finer than what is missing, nor than the
-    search for it.
+    Where an effect is missing, the mesh need not be much finer than what is missing.
     """
     while True:
         if fit.noise.source == "misfit":
@@ -78,8 +77,7 @@ def fine_enough(
         if n != fit.model.n:
             fit = refine_mesh(fit, n, modes)
         error = mesh_error(fit)
-        lacking = fit.beyond_noise and error < fit.residual_rms / 2
-        largest = SEARCH_MESH if lacking or not np.isfinite(error) else finest
+        largest = finest if np.isfinite(error) else SEARCH_MESH
         allowed = allowed_mesh_error(fit)
         if error <= allowed or n >= largest:
             return fit, error
@@ -95,8 +93,9 @@ def mesh_error(fit: Fit) -> float:
 
 
 def allowed_mesh_error(fit: Fit) -> float:
-    """Error of the mesh [m] that is far below the noise and whatever else is left."""
-    return MESH_SHARE * max(fit.noise.std, fit.residual_rms)
+    """Error of the mesh [m] that is far below the noise, or below what else is left."""
+    left = LACKING_SHARE if fit.beyond_noise else MESH_SHARE
+    return max(MESH_SHARE * fit.noise.std, left * fit.residual_rms)
 
 
 def _finer(n: int, excess: float, element: str) -> int:

@@ -14,7 +14,7 @@ from dlo_casadi.estimation.mesh import allowed_mesh_error
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.pose import SIGNS
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
-from dlo_casadi.thresholds import EITHER, FIXTURES, MESH_SHARE, UNSEEN
+from dlo_casadi.thresholds import EITHER, FIXTURES, UNSEEN
 
 FloatArray = NDArray[np.floating]
 
@@ -264,8 +264,8 @@ def fit_warnings(fit: Fit, error: float) -> list[str]:
         )
     elif error > allowed_mesh_error(fit):
         lines.append(
-            f"the mesh of {fit.model.n} elements is off by {1e3 * error:.3g} mm, more than "
-            f"{MESH_SHARE:.0%} of the noise: model.n larger?"
+            f"the mesh of {fit.model.n} elements is off by {1e3 * error:.3g} mm, more than the "
+            f"{1e3 * allowed_mesh_error(fit):.2g} mm that noise or misfit hide: model.n larger?"
         )
     return lines
 
