@@ -202,9 +202,12 @@ def test_a_configuration_cannot_be_changed(tmp_path):
             "1.28e-2",
             "1.0e-4",
             4,
-            "times as dense as water: units are SI, diameter and length in m?",
+            "times as dense as water .osmium.*: units are SI, diameter and length in m?",
         ),
+        ("mass: 0.23", "mass: 30", 4, "291 times as dense as water.*did you mean 0.03?"),
         ("1.28e-2", "12.8", 5, "12.8 m is larger than the length 0.8 m.* did you mean 0.0128?"),
+        ("1.28e-2", "1.28", 5, "1.28 m is larger than the length 0.8 m.* did you mean 0.0128?"),
+        ("1.28e-2", "0.7", 5, "0.7 m make 0.23 kg lighter than air.* did you mean 0.007?"),
         # words
         ("held_out", "test", 14, "role: allowed are 'fit' or 'held_out', found 'test'"),
         ("start: pinned", "start: free", 9, "'pinned' or 'clamped', .*only the end can be free"),

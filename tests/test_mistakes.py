@@ -189,6 +189,12 @@ def gravity_with_y_down(folder: Path) -> Session:
     return session
 
 
+def gravity_upwards_on_a_clamped_loop(folder: Path) -> Session:
+    session = Session(folder, ROOT / "configs/white_wire.yaml", 2)
+    session.data["experiment"]["gravity"] = [0.0, 9.81]
+    return session
+
+
 def board_hung_on_its_side(folder: Path) -> Session:
     session = lines(folder, count=3)
     session.points(lambda points: points @ [[0, 1], [-1, 0]])
@@ -307,6 +313,10 @@ MISTAKES: list[tuple[Callable[[Path], Session], list[str]]] = [
     (points_with_rows_of_a_picture, ["with y pointing down", "rows count downwards"]),
     (points_with_y_down_between_ends_of_one_height, ["y pointing up in the points"]),
     (gravity_with_y_down, ["does not hang along gravity (0, 9.81)", "with gravity (0, -9.81)"]),
+    (
+        gravity_upwards_on_a_clamped_loop,
+        ["show no weight", "with gravity (0, -9.81)"],
+    ),
     (board_hung_on_its_side, ["does not hang along gravity", "with gravity (9.81, 0)"]),
     (x_and_y_exchanged, ["with x and y exchanged", "in one frame"]),
     (points_turned_by_90_degrees, ["turned by 90 degrees counter-clockwise", "in one frame"]),

@@ -50,9 +50,12 @@ _THINNEST = 1.0e-6
 _LIGHTEST = 1.0e-10
 # A metre of a submarine power cable has 100 kg.
 _HEAVIEST, _HEAVIEST_PER_METRE = 1000.0, 100.0
-# Osmium, the densest metal [kg/m^3]; some forty times as much only a strip whose thickness is
-# declared as its diameter seems to have: one of 0.9 mm, 0.25 m and 17 g has 1.1e5.
-_DENSEST_METAL, _DENSEST = 2.26e4, 1.0e6
+# From polystyrene foam to osmium, the densest metal.
+_DENSITIES = Range(15.0, 2.26e4, "kg/m^3")
+# A strip whose thickness is declared as its diameter seems denser (0.9 mm, 0.25 m and 17 g: 1.1e5),
+# a tube lighter; but 200 kg/m^3, less than any rope, are 2e5 in grams, and what is lighter than air
+# does not hang.
+_POSSIBLE_DENSITIES = Range(1.2, 2.0e5, "kg/m^3")
 # A carbon fibre has E pi d^4 / 64 = 2.3e11 pi (5e-6)^4 / 64 = 7e-12 N m^2, a steel bar of 0.5 m
 # 6e8 N m^2: the bounds of the fit itself.
 STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
@@ -94,10 +97,8 @@ def implausible_sizes(
         text = f"{length:g} m: units are SI, {hint}{LENGTH}"
         problems.append(Problem(("length",), text))
     elif diameter > length:
-        text = (
-            f"{diameter:g} m is larger than the length {length:g} m: units are SI, "
-            f"did you mean {diameter / 1e3:g}?"
-        )
+        hint = _meant_diameter(length, mass, diameter)
+        text = f"{diameter:g} m is larger than the length {length:g} m: units are SI{hint}"
         problems.append(Problem(("diameter",), text))
     else:
         problems += Range(_THINNEST, length, "m").problems(("diameter",), diameter)
@@ -115,16 +116,43 @@ def implausible_sizes(
             "write gravity: [0, 0]"
         )
         problems.append(Problem(("mass",), text))
-    if not problems and (density := mass / (length * math.pi * diameter**2 / 4)) > _DENSEST:
-        hint = f"did you mean {mass / 1e3:g}? " if density / 1e3 < _DENSEST_METAL else ""
-        text = (
-            f"{mass:g} kg make it {density / 1e3:.3g} times as dense as water: units are SI, {hint}"
-            "diameter and length in m?"
-        )
-        problems.append(Problem(("mass",), text))
+    if not problems:
+        problems += _implausible_density(length, mass, diameter)
     if stiffness is not None:
         problems += STIFFNESS.problems(("bending_stiffness",), stiffness)
     return problems
+
+
+def _implausible_density(length: float, mass: float, diameter: float) -> list[Problem]:
+    """Find a mass [kg] that nothing of such a volume has."""
+    apparent = _density(length, mass, diameter)
+    if apparent > _POSSIBLE_DENSITIES.most:
+        hint = f"did you mean {mass / 1e3:g}? " if apparent / 1e3 in _DENSITIES else ""
+        text = (
+            f"{mass:g} kg make it {apparent / 1e3:.3g} times as dense as water (osmium, the "
+            f"densest metal: {_DENSITIES.most / 1e3:g}): units are SI, {hint}diameter and length "
+            "in m?"
+        )
+        return [Problem(("mass",), text)]
+    if apparent < _POSSIBLE_DENSITIES.least:
+        text = (
+            f"{diameter:g} m make {mass:g} kg lighter than air, {apparent:.2g} kg/m^3: units are "
+            f"SI{_meant_diameter(length, mass, diameter)}, mass in kg?"
+        )
+        return [Problem(("diameter",), text)]
+    return []
+
+
+def _density(length: float, mass: float, diameter: float) -> float:
+    """Mass over volume [kg/m^3] of a round cable: m / (pi d^2 / 4 L)."""
+    return mass / (length * math.pi * diameter * diameter / 4)  # inf where ** would raise
+
+
+def _meant_diameter(length: float, mass: float, diameter: float) -> str:
+    """Question after a diameter of millimetres or centimetres that would be sound in metres."""
+    sound = (d for d in (diameter / 1e3, diameter / 1e2) if _density(length, mass, d) in _DENSITIES)
+    meant = next(sound, None)
+    return "" if meant is None else f", did you mean {meant:g}?"
 
 
 def implausible_gravity(gravity: tuple[float, ...]) -> list[Problem]:

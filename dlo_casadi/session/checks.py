@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.config import Config
-from dlo_casadi.config import Pose as DeclaredPose
 from dlo_casadi.ends import reaction_rows
-from dlo_casadi.errors import EstimationError, MeasurementError
-from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.prediction import Prediction, predict_poses
+from dlo_casadi.errors import MeasurementError
 from dlo_casadi.model import CableModel
-from dlo_casadi.session.declared import declared_model, straight
+from dlo_casadi.session.coarse import coarse_fit, some, tells_weight
 from dlo_casadi.session.hanging import pulled_elsewhere
+from dlo_casadi.session.hanging_in_plane import hangs_elsewhere
 from dlo_casadi.session.headings import wrong_headings
-from dlo_casadi.session.measure import conditions, line_without_end
+from dlo_casadi.session.measure import line_without_end
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.plausibility import (
     Lines,
@@ -36,7 +30,7 @@ from dlo_casadi.session.plausibility_in_space import (
     wrong_orientations,
 )
 from dlo_casadi.session.plausibility_of_readings import Compared, misread
-from dlo_casadi.thresholds import CONTRADICTS, FITS, MUCH_BETTER, OUT_OF_STEP
+from dlo_casadi.thresholds import FITS, OUT_OF_STEP
 
 FloatArray = NDArray[np.floating]
 
@@ -44,20 +38,10 @@ NEVERTHELESS = (
     "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless."
 )
 
-# Elements, poses and stiffnesses (over the declared one) that show which way a cable hangs.
-_MESH, _POSES = 12, 8
-# Coefficients of the rest curvature, and noise over the length, of a fit that shows what forces
-# shapes need: effects that are missing are below it.
-_REST, _FAITHFUL = 4, 2e-3
-_DECADES = (0, -1, 1)
-# Stiffness over weight is known if its relative standard deviation is below this: units are told
-# where forces are five times off.
-_SIZED = 0.5
+# Poses of a fit that shows what forces shapes need.
+_POSES = 8
 # Points of a line between which its length is measured.
 _SPARSE = 60
-# Of the length: no other explanation is looked for once one comes so near.
-_CLEAR = 0.02
-_STIFFNESSES = sorted(10.0 ** np.arange(-2.0, 2.1, 0.5), key=lambda factor: abs(np.log(factor)))
 
 
 def without_implausible(
@@ -138,17 +122,11 @@ def _misread(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]
     declared = {pose.name: pose for pose in config.experiment.poses}
     fitted = [item for item in read if item.role == "fit" and not item.views]
     fitted = [item for item in fitted if declared[item.name].readings]
-    shown = fitted[:: max(1, -(-len(fitted) // _POSES))]
-    if not shown:
+    shown = some(fitted, _POSES)
+    fit = coarse_fit(config, shown, config.experiment.gravity) if shown else None
+    if fit is None:
         return ()
-    measured = [_posed(declared[item.name], item, item.points) for item in shown]
-    model = declared_model(config).model
-    model = replace(model, effects=(), priors={}, n=_MESH, n_rest=_REST)
-    try:
-        noise = _FAITHFUL * config.cable.length
-        fit = fit_model(model, measured, Tolerances(), noise, decades=_DECADES)
-    except EstimationError:
-        return ()
+    model, measured = fit.model, fit.problem.measured
     seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
     rows = reaction_rows(model.node)
     compared = []
@@ -171,7 +149,7 @@ def _misread(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]
                 forces if kind == "moment" else None,
             )
         )
-    return misread(compared, sized=fit.std(BENDING_STIFFNESS) < _SIZED * fit.p[0])
+    return misread(compared, sized=tells_weight(fit))
 
 
 def _axes_of(model: CableModel, frame: FloatArray) -> FloatArray:
@@ -268,84 +246,3 @@ def _sparse(points: FloatArray) -> FloatArray:
     """Every so manieth point, both ends among them: noise makes a dense line longer."""
     kept = np.linspace(0, len(points) - 1, min(len(points), _SPARSE)).round().astype(int)
     return points[kept]
-
-
-def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
-    """Whether the shapes fit only with gravity turned, or the points mirrored.
-
-    Shapes of a straight cable of the declared stiffness, and of others up to a hundred times as
-    soft or stiff, are predicted with gravity as declared and turned by quarters, and laid beside
-    the points; and beside the points mirrored at the height of the start.
-    """
-    declared = {pose.name: pose for pose in config.experiment.poses}
-    shown = read[:: max(1, -(-len(read) // _POSES))]
-    if not shown:
-        return ()
-    measured = [_posed(declared[item.name], item, item.points) for item in shown]
-    model = straight(declared_model(config).model).with_mesh(_MESH)
-    length = config.cable.length
-    own, hanging = np.inf, {}
-    for factor in _STIFFNESSES:
-        hanging[factor] = _predicted(model, factor, measured)
-        own = min(own, _distance(hanging[factor], measured))
-        if own < CONTRADICTS * length:
-            return ()
-    if not np.isfinite(own):
-        return ()  # nothing can be predicted of these poses
-    mirrored = [
-        _posed(pose, item, item.points * [1.0, -1.0] + [0.0, 2 * pose.start[1]])
-        for pose, item in ((declared[item.name], item) for item in shown)
-    ]
-    x, y = model.gravity
-    turned = {
-        f"gravity ({way[0] + 0.0:g}, {way[1] + 0.0:g}) m/s^2": replace(model, gravity=way)
-        for way in ((-x, -y), (y, -x), (-y, x))
-    }
-    what, rms = "", np.inf
-    for factor in _STIFFNESSES:
-        distances = {
-            "y pointing up in the points, which now points down": _distance(
-                hanging[factor], mirrored
-            )
-        }
-        for said, other in turned.items():
-            distances[said] = _distance(_predicted(other, factor, measured), measured)
-        said = min(distances, key=lambda name: distances[name])
-        if distances[said] < rms:
-            what, rms = said, distances[said]
-        if rms < _CLEAR * length:
-            break
-    if rms > MUCH_BETTER * own:
-        return ()
-    return (
-        Suspicion(
-            f"the cable does not hang along gravity ({x:g}, {y:g}) m/s^2: its shapes are "
-            f"{own:.3g} m RMS from those of any stiffness, but {rms:.3g} m with {what}. Try: "
-            "points, start, end and gravity in one frame, x to the right and y up, gravity: "
-            "[0.0, -9.81].",
-            True,
-        ),
-    )
-
-
-def _posed(pose: DeclaredPose, item: PoseInput, points: FloatArray) -> MeasuredPose:
-    """A pose with these points in place of those measured."""
-    return MeasuredPose.of_points(conditions(pose), points, s=item.s)
-
-
-def _predicted(
-    model: CableModel, factor: float, measured: Sequence[MeasuredPose]
-) -> list[Prediction | None]:
-    """Shapes of a cable without rest curvature, so many times as stiff as declared."""
-    p = model.nominal.copy()
-    p[0] *= factor
-    return predict_poses(model, p, np.zeros(model.chain.n_rests), [x.pose for x in measured])
-
-
-def _distance(predictions: Sequence[Prediction | None], measured: Sequence[MeasuredPose]) -> float:
-    """RMS distance [m] of the points from shapes; infinite without one."""
-    gaps = [
-        np.inf if prediction is None else item.distances(prediction.curve)
-        for prediction, item in zip(predictions, measured, strict=True)
-    ]
-    return float(np.sqrt(np.mean(np.concatenate([np.atleast_1d(gap) for gap in gaps]) ** 2)))
