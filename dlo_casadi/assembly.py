@@ -261,12 +261,12 @@ class Assembly:
     # ---- the curve ------------------------------------------------------------------------------
 
     def _stations(self, advance: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (m, n + 1, d, ...) and length ratios (m, n + 1, 1, ...) of element boundaries."""
+        """Places (m, n + 1, d, ...) and rates (m, n + 1, rates, ...) of element boundaries."""
         steps, d = advance[:, self.chain.layout.advancing], self.node.dimension
         places = np.concatenate([start[:, None], steps[:, :, :d]], axis=1).cumsum(axis=1)
-        ratio = steps[:, :, d:]
-        mean = (ratio[:, 1:] + ratio[:, :-1]) / 2
-        return places, np.concatenate([ratio[:, :1], mean, ratio[:, -1:]], axis=1)
+        rates = steps[:, :, d:]
+        mean = (rates[:, 1:] + rates[:, :-1]) / 2
+        return places, np.concatenate([rates[:, :1], mean, rates[:, -1:]], axis=1)
 
     def nodes(self, shapes: Shapes, given: Given) -> FloatArray:
         """True places (m, n + 1, dimension) [m] of the element boundaries."""
@@ -283,12 +283,12 @@ class Assembly:
         self, name: str, advance: FloatArray, shapes: Shapes, given: Given
     ) -> list[FloatArray]:
         m, count = len(shapes.x), self.chain.n + 1
-        places, ratio = self._stations(advance, given.poses[:, : self.node.dimension])
+        places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
         x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
         p, ends = (
             np.broadcast_to(a[:, None], (m, count, a.shape[1])) for a in (given.p, given.poses)
         )
-        return self._mapped(name, count)(places, ratio, x, p, ends)
+        return self._mapped(name, count)(places, rates, x, p, ends)
 
     def curve_slopes(self, shapes: Shapes, given: Given) -> CurveSlopes:
         """`curve` and what its derivatives are made of."""
@@ -378,8 +378,8 @@ class CurveSlopes:
         steps += self.by_others[..., n_p:n_r] @ a.chain.rest_inside(d.rest)
         steps += self.by_others[..., n_r:] @ d.deviation[:, None]
         start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))
-        places, ratio = a._stations(steps, start)
+        places, rates = a._stations(steps, start)
         shape = (len(steps), a.chain.n + 1, 2 * b, steps.shape[3])
         own = d.x[:, a.chain.layout.stations].reshape(shape)
-        moved = self.by_station @ np.concatenate([places, ratio, own], axis=2)
+        moved = self.by_station @ np.concatenate([places, rates, own], axis=2)
         return np.asarray(moved + self.by_p @ d.p[:, None])

@@ -199,12 +199,20 @@ class CableModel(Lagrangian):
 
     @cached_property
     def _advanced(self) -> ca.SX:
-        """True advance of a slot and its length ratio (dimension + 1,)."""
-        return ca.vertcat(self._terms.advance, self._terms.ratio)
+        """True advance of a slot and its `_rates`."""
+        return ca.vertcat(self._terms.advance, self._rates)
+
+    @cached_property
+    def _rates(self) -> ca.SX:
+        """Length ratio of a slot and, in a plane, its turning d phi / ds [1/m]."""
+        if self.in_space:  # no map of the measurement depends on the frame there
+            return self._terms.ratio
+        turning = self._stretch * self.chain.kind.strain(self._plain)
+        return ca.vertcat(self._terms.ratio, turning)
 
     @cached_property
     def slot_curve(self) -> ca.Function:
-        """As `slot` -> advance [m] and length ratio (dimension + 1,)."""
+        """As `slot` -> advance [m], length ratio and, in a plane, turning [1/m]."""
         return self._here("slot_curve", self._slot_arguments, [self._advanced])
 
     @cached_property
@@ -230,7 +238,10 @@ class CableModel(Lagrangian):
         """Arguments, place (and slope) in the measurement of one station, and what moves it."""
         kind = self.chain.kind
         x, delta = self._nodes
-        point, ratio = ca.SX.sym("point", self.node.dimension), ca.SX.sym("ratio")
+        point, rates = (
+            ca.SX.sym("point", self.node.dimension),
+            ca.SX.sym("rates", self._rates.numel()),
+        )
         before, after = (
             self.node.retract(own, step)
             for own, step in zip(
@@ -239,27 +250,31 @@ class CableModel(Lagrangian):
                 strict=True,
             )
         )
-        frame = self.node.middle(before, after)
-        slope = ratio * self.node.tangent(frame)
+        frame = ca.SX.sym("frame", self.node.coordinates)
+        slope = rates[0] * self.node.tangent(frame)
         image = point
         maps = self._filling(MeasurementEffect)
         for effect, local in maps:
             image = effect.observe(image, frame, self._sight, local)
         rows = image
         if kind.smooth:
-            rows = ca.vertcat(image, ca.jtimes(image, point, slope) if maps else slope)
-        arguments = [point, ratio, x, self._p, self._pose]
-        return arguments, rows, ca.vertcat(point, ratio, delta)
+            slope = ca.jtimes(image, point, slope) if maps else slope
+            for turning in ca.vertsplit(rates)[1:]:
+                slope += ca.jtimes(image, frame, turning)
+            rows = ca.vertcat(image, slope)
+        rows = ca.substitute(rows, frame, self.node.middle(before, after))
+        arguments = [point, rates, x, self._p, self._pose]
+        return arguments, rows, ca.vertcat(point, rates, delta)
 
     @cached_property
     def station(self) -> ca.Function:
-        """(point, ratio, x, p, ends) of an element boundary -> its image: place, slope dr/ds."""
+        """(point, rates, x, p, ends) of an element boundary -> its image: place, slope dr/ds."""
         arguments, rows, _ = self._seen
         return self._here("station", arguments, [rows])
 
     @cached_property
     def station_slopes(self) -> ca.Function:
-        """As `station` -> the same, derivatives by (point, ratio, increments) and by p."""
+        """As `station` -> the same, derivatives by (point, rates, increments) and by p."""
         arguments, rows, moving = self._seen
         blocks = [ca.jacobian(rows, symbols) for symbols in (moving, self._p)]
         return self._here("station_slopes", arguments, [rows, *blocks])

@@ -106,7 +106,7 @@ FIXTURES = 0.5
 MESH_SHARE = 0.1
 # Where a model lacks something, the mesh's share of what is left: it adds 3 percent to that,
 # sqrt(1 + 0.25^2), and is refined once the missing effect is in the model. Verdicts, effects and
-# ties of 18 rendered sessions are those of a tenth, in 0.6 of the time.
+# ties of 18 rendered sessions are those of a tenth.
 LACKING_SHARE = 0.25
 
 # ---- contradictions of the configuration -------------------------------------------------------

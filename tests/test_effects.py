@@ -16,6 +16,7 @@ from dlo_casadi.effects import (
     Cable,
     ClampAngle,
     ClampCompliance,
+    EdgeBias,
     Effect,
     EndOffset,
     EndSpring,
@@ -38,6 +39,7 @@ from dlo_casadi.effects import (
     Tether,
     UnknownPull,
 )
+from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
@@ -529,6 +531,20 @@ def test_over_the_start_fixture_a_standoff_error_is_a_scale():
     seen = StandoffError().observe(point, ca.SX(0), sight, {"distance": ca.SX(0.02)})
     scaled = ImageScale().observe(point, ca.SX(0), sight, {"factor": ca.SX(1.5 / 1.48)})
     np.testing.assert_allclose(number(seen), number(scaled), rtol=1e-14)
+
+
+@pytest.mark.parametrize("element", ["arc", "quadratic"])
+def test_the_line_that_a_map_by_direction_shows_converges(element):
+    """Between nodes its slopes count, which turn as the cable does."""
+    p = np.array([CABLE.bending_stiffness, *np.full(8, 2e-3)])
+    s, lines = np.linspace(0.0, CABLE.length, 101), []
+    for n in (10, 20, 40, 160):
+        model = CableModel(CABLE, n, element, effects=(EdgeBias(),))
+        held, rest = Pose((0.0, 0.0), (0.5 * CABLE.length, 0.1)), np.zeros(model.chain.n_rests)
+        (found,) = predict_poses(model, p, rest, [held])
+        lines.append(found.curve.at(s))
+    gaps = [np.abs(line - lines[-1]).max() for line in lines[:-1]]
+    assert np.all(np.log2(np.divide(gaps[:-1], gaps[1:])) > 1.9), gaps
 
 
 def test_measurement_maps():

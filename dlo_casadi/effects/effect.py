@@ -382,6 +382,7 @@ class MeasurementEffect(Effect):
         ----------
         frame : (coordinates,)
             Of the cable at the point, as a node would carry it: in a plane its heading [rad].
+            How a map by it changes along the cable is known in a plane only.
         """
         return point
 
