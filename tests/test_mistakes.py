@@ -246,6 +246,18 @@ def a_smaller_photograph(folder: Path) -> Session:
     return with_reference(folder, lambda picture: picture[::2, ::2])
 
 
+def a_photograph_of_half_the_size(folder: Path) -> Session:
+    session = photographs(folder)
+    session.image(lambda picture: picture[::2, ::2])
+    return session
+
+
+def a_photograph_of_a_board_turned_by_90_degrees(folder: Path) -> Session:
+    session = photographs(folder)
+    session.image(np.rot90)
+    return session
+
+
 def files_one_further(folder: Path) -> Session:
     session = lines(folder)
     session.files(lambda names: names[1:] + names[:1])
@@ -325,6 +337,11 @@ MISTAKES: list[tuple[Callable[[Path], Session], list[str]]] = [
     (photograph_turned_by_180_degrees, ["once the photograph is turned by 180 degrees"]),
     (photograph_turned_by_90_degrees, ["is turned by 90 degrees clockwise"]),
     (a_smaller_photograph, ["outside of the picture", "made smaller since"]),
+    (
+        a_photograph_of_half_the_size,
+        ["(641.3, 358.1) px, is not that of this picture of 640 x 360 px", "cx, cy over 2."],
+    ),
+    (a_photograph_of_a_board_turned_by_90_degrees, ["of 720 x 1280 px", "turned by 90 degrees"]),
     (files_one_further, ["pose_02 shows the ends of pose_03", "1 further", "in step"]),
     (two_files_exchanged, ["2 of 6 files", "pose_04 shows the ends of pose_02", "in step"]),
     (photographs_one_further, ["pose_02 shows the ends of pose_03", "in step"]),

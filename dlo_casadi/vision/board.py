@@ -17,6 +17,8 @@ from dlo_casadi.vision.viewpoint import Viewpoint
 MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
 LEAST_MARKERS = 3  # for the pose of a camera: fewer span no more than a line of the board
 _BEST_CORNER_PX = 0.05  # what sampling and rounding to grey levels leave of a corner at least
+# Of no more than so many times the size a picture is made smaller or larger.
+_RESIZED = 20.0
 CORNERS_THAT_SHARE = 4  # corners that share light, blur and print: those of a marker count as one
 
 
@@ -166,10 +168,12 @@ def _agreeing(
     found = seen
     places = {marker: board.corners(marker) for marker in found}
     plane, errors = _fit(found, places, camera)
+    if camera is not None and (text := _other_picture(found, places, camera, shape)):
+        raise VisionError(text)
     majority = len(found) // 2 + 1
     while max(errors.values()) > MAX_ERROR_PX and len(found) > majority:
         found, plane, errors = _without_worst(found, places, camera)
-    rms = float(np.sqrt(np.mean(np.square(list(errors.values())))))
+    rms = _rms(errors)
     if rms > MAX_ERROR_PX:
         raise VisionError(
             f"the markers {sorted(found)} are {rms:.1f} px RMS off their declared places. "
@@ -195,6 +199,45 @@ def _pose_covariance(at: Array, rms: float, camera: Camera) -> Array:
     free = 2 * len(at) - 6
     scatter = max(rms**2 * len(at) / free, _BEST_CORNER_PX**2)
     return np.asarray(np.linalg.inv(J.T @ J) * scatter * CORNERS_THAT_SHARE)
+
+
+def _rms(errors: Mapping[int, float]) -> float:
+    return float(np.sqrt(np.mean(np.square(list(errors.values())))))
+
+
+def _other_picture(
+    found: dict[int, Array], places: dict[int, Array], camera: Camera, shape: tuple[int, ...]
+) -> str:
+    """Sentence on a matrix of a picture of another size, or turned; empty if it fits as it is.
+
+    A principal point is near the middle of the picture that it was found in.
+    """
+    height, width = shape[:2]
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix
+    size = float(np.sqrt(4 * abs(cx * cy) / (width * height)))
+    scaled = (fx / size, fy / size, cx / size, cy / size) if 1 / _RESIZED < size < _RESIZED else ()
+    turn = "turn it back, as the pictures that it was calibrated with; was its EXIF tag lost?"
+    others = {
+        (
+            f"divided by {size:.3g}",
+            f"pictures of the size that it was calibrated with, or fx, fy, cx, cy over {size:.3g}.",
+        ): scaled,
+        ("turned by 90 degrees", turn): (fy, fx, cy, height - 1 - cx),
+        ("turned by -90 degrees", turn): (fy, fx, width - 1 - cy, cx),
+        ("turned by 180 degrees", turn): (fx, fy, width - 1 - cx, height - 1 - cy),
+    }
+    errors = {}
+    for said, (a, b, u, v) in ((said, numbers) for said, numbers in others.items() if numbers):
+        other = Camera(np.array([[a, 0.0, u], [0.0, b, v], [0.0, 0.0, 1.0]]), camera.distortion)
+        errors[said] = _rms(_fit(found, places, other)[1])
+    own, (how, cure) = _rms(_fit(found, places, camera)[1]), min(errors, key=lambda k: errors[k])
+    if max(errors[how, cure], _BEST_CORNER_PX) > own / 2:
+        return ""
+    return (
+        f"camera.matrix, with its principal point at ({cx:g}, {cy:g}) px, is not that of this "
+        f"picture of {width} x {height} px: the markers are {own:.2g} px RMS off their declared "
+        f"places, but {errors[how, cure]:.2g} px with the matrix {how}. Try: {cure}"
+    )
 
 
 # Mistakes in marker_centers: what was written -> the board's axes, x right and y up.
