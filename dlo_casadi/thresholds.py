@@ -87,6 +87,11 @@ REPEATS = 1.5
 # degree of freedom widens the intervals, and the shapes stay those of one line's noise.
 REPEATS_ARE_NOISE = 2.0
 
+# White errors of points, which no cable makes, that exceed the declared noise by this factor
+# contradict it: three standard errors of the least degrees of freedom, 0.5 = 3 / sqrt(2 x 18). Of
+# ten rendered sessions, most lacking an effect, they came out at 0.97 to 1.02 of the truth.
+SCATTERED, SCATTERED_DEGREES = 1.5, 18
+
 # ---- intervals ---------------------------------------------------------------------------------
 
 # 95 % of a standard normal lies within this many standard deviations.

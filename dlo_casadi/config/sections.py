@@ -295,7 +295,8 @@ class Measurement(Section):
     """How well was measured."""
 
     std: Positive | None = None
-    """Standard deviation of one centre-line coordinate [m]; estimated when absent."""
+    """Standard deviation of one centre-line coordinate [m]; estimated when absent, and, with a
+    warning, where the points scatter more."""
     force_std: Positive | None = None
     """Standard deviation of one component of a force on a fixture [N]; estimated when absent."""
     moment_std: Positive | None = None

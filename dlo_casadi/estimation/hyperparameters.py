@@ -29,7 +29,7 @@ from dlo_casadi.estimation.rest_scatter import (
 )
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
-from dlo_casadi.thresholds import DIFFERENT
+from dlo_casadi.thresholds import DIFFERENT, SCATTERED, SCATTERED_DEGREES
 
 FloatArray = NDArray[np.floating]
 
@@ -75,7 +75,8 @@ def refine(
     Parameters
     ----------
     first : bool
-        Whether it is not known yet if the cable comes back to the same shape.
+        Whether it is not known yet if the cable comes back to the same shape, and if the points
+        scatter as their noise is declared: it is estimated where they scatter more.
 
     References
     ----------
@@ -88,6 +89,8 @@ def refine(
         point = near
     for round_ in range(rounds):
         lin = problem.linearize(point)
+        if first and round_ == 0 and problem.noise.source == "declared":
+            estimate = contradicted(problem, point, lin)
         noise, rest = problem.noise, problem.rest_scatter
         if round_ < 2:
             noise, rest = errors_of(problem, point, lin, modes, estimated=estimate, repeats=repeats)
@@ -111,6 +114,19 @@ def refine(
             # What is missing is no noise: to estimate that once more leads farther astray.
             break
     return problem, point, converged
+
+
+def contradicted(problem: BatchProblem, point: Point, lin: Linearization) -> bool:
+    """Whether the points scatter more than their declared noise lets expect.
+
+    By the white part of what is left beside all that the shapes may do: what a model lacks is
+    smooth along the cable.
+    """
+    samples = _noise_samples(problem, point, lin, SMOOTH_MODES)
+    if not tell_of_noise(samples, SCATTERED_DEGREES):
+        return False
+    found = estimate_noise(samples, problem.unknowns.model.cable.length)
+    return found.white > SCATTERED * problem.noise.std
 
 
 def errors_of(

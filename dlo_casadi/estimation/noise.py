@@ -101,6 +101,11 @@ class NoiseModel:
         return self.before if self.before is not None and self.before.known else self
 
     @property
+    def white(self) -> float:
+        """Standard deviation of the errors that points do not share [m]."""
+        return self.std * float(np.sqrt(1 - self.share))
+
+    @property
     def known(self) -> bool:
         """Whether it does not depend on the model that is fitted."""
         return self.source != "estimated"
@@ -286,7 +291,7 @@ def estimate_noise(
     # Where an average along the cable is declared as `grain`, the kernel does not stand for it.
     smooth = best.noise.share > SMOOTH and not samples[0].grain
     apart = int(cable_length / best.noise.length) if smooth else max_points
-    if apart < max_points:
+    if apart < max_points and tell_of_noise([sample.thinned(apart) for sample in everything]):
         return estimate_noise(everything, cable_length, apart, max_poses)
     noise = replace(best.noise, slow_dof=_slow_dof(found))
     if len(everything) == len(samples):
@@ -294,10 +299,16 @@ def estimate_noise(
     return replace(noise, std=restricted_deviance(replace(noise, std=1.0), everything)[1])
 
 
-def tell_of_noise(samples: list[NoiseSample]) -> bool:
-    """Whether enough of the points is left to `estimate_noise` by what is projected out."""
+def tell_of_noise(samples: list[NoiseSample], least: float = _LEAST_DEGREES) -> bool:
+    """Whether enough of the points is left to `estimate_noise` by what is projected out.
+
+    Parameters
+    ----------
+    least : float
+        Degrees of freedom that are enough.
+    """
     kept = _telling(samples)
-    return bool(kept) and _degrees(kept) >= _LEAST_DEGREES
+    return bool(kept) and _degrees(kept) >= least
 
 
 def _telling(samples: list[NoiseSample]) -> list[NoiseSample]:

@@ -214,9 +214,23 @@ def _errors(shape: PoseShape, length: float, noise: float) -> FloatArray:
     return np.stack([(shape.gap**2).sum(axis=1), expected])
 
 
-def fit_warnings(fit: Fit, error: float) -> list[str]:
-    """What a fit cannot promise; `error` is that of its mesh [m]."""
+def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[str]:
+    """What a fit cannot promise.
+
+    Parameters
+    ----------
+    error : float [m]
+        Of its mesh.
+    declared : float, optional [m]
+        Noise of the points.
+    """
     lines = []
+    if declared is not None and fit.noise.source == "estimated":
+        lines.append(
+            f"the points scatter by {1e3 * fit.noise.white:.2g} mm about any shape that a cable "
+            f"could take, measurement.std declares {1e3 * declared:.2g} mm: the noise is estimated "
+            f"instead, {1e3 * fit.noise.std:.2g} mm. Try: std: {fit.noise.std:.2g}, or no std"
+        )
     spread = limiting_spread(fit)
     if spread is not None:
         lines.append(

@@ -150,7 +150,9 @@ def judged(outcome: Outcome) -> Outcome:
     """An outcome with what is said of its fit, and its verdict if that stands."""
     fit, stages = outcome.fit, outcome.stages
     doubts = doubts_of(stages, outcome.poses, fit, outcome.measurement.std)
-    said = [*fit_warnings(fit, outcome.discretization.error), *worse_than_simpler(stages)]
+    declared = outcome.config.experiment.measurement.std
+    said = fit_warnings(fit, outcome.discretization.error, declared)
+    said += worse_than_simpler(stages)
     if outcome.hidden_weight is not None:
         said.append(weight_warning(outcome.hidden_weight, fit.expected_error))
     return replace(

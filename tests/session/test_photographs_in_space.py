@@ -96,15 +96,15 @@ def test_the_steps_of_the_camera_in_every_photograph(config):
 
 
 def test_a_camera_of_another_picture_size_is_told(config):
-    """Half the focal length: a photograph in which the markers do not fit says so."""
+    """A matrix for half the width and height: named, with what to multiply."""
     pose = config.experiment.poses[0]
     only = pose.model_copy(update={"files": pose.files[1:2]})
     camera = Camera(matrix=((540.0, 0.0, 321.0), (0.0, 540.0, 237.0), (0.0, 0.0, 1.0)))
     measurement = config.experiment.measurement.model_copy(update={"camera": camera})
     experiment = config.experiment.model_copy(update={"poses": (only,), "measurement": measurement})
     (item,) = read_inputs(replace(config, experiment=experiment), lambda *_: None)
-    assert item.problem.startswith("pose_01_b: the markers [0, 1, 3] are 8.9 px RMS off")
-    assert "camera.matrix of this picture size?" in item.problem
+    assert item.problem.startswith("pose_01_b: camera.matrix, with its principal point at (321, 237)")
+    assert "is not that of this picture of 1280 x 960 px" in item.problem
     assert not item.readable
 
 
