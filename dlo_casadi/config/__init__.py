@@ -15,26 +15,16 @@ from dlo_casadi.config.limits import (
     implausible_sizes,
 )
 from dlo_casadi.config.load import load_config
-from dlo_casadi.config.problems import Place, show
-from dlo_casadi.config.sections import (
-    Board,
-    Boundary,
-    Cable,
-    Camera,
-    Centerlines,
-    Config,
+from dlo_casadi.config.measuring import Board, Camera, Centerlines, Images, Reference, Tolerances
+from dlo_casadi.config.options import (
     DeclaredEffect,
     DiagnosisOptions,
     EffectParameter,
     EstimationOptions,
-    Experiment,
-    Images,
     ModelOptions,
-    Pose,
-    Reference,
-    SkippedPose,
-    Tolerances,
 )
+from dlo_casadi.config.problems import Place, show
+from dlo_casadi.config.sections import Boundary, Cable, Config, Experiment, Pose, SkippedPose
 
 __all__ = [
     "MESH",

@@ -11,7 +11,8 @@ from dlo_casadi.effects import EFFECTS, Cable, Setup
 from dlo_casadi.parameters import Parameter
 
 if TYPE_CHECKING:
-    from dlo_casadi.config.sections import Config, DeclaredEffect, File
+    from dlo_casadi.config.options import DeclaredEffect
+    from dlo_casadi.config.sections import Config, File
 
 
 def declared_setup(config: Config | File) -> Setup:

@@ -18,7 +18,8 @@ from dlo_casadi.config.problems import (
     kind_of,
     show,
 )
-from dlo_casadi.config.sections import File, Section
+from dlo_casadi.config.sections import File
+from dlo_casadi.config.values import Section
 
 _NUMBER = r"[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?"
 

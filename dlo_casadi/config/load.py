@@ -14,16 +14,9 @@ from dlo_casadi.config.declared_effects import wrong_effects
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.explain import explain
 from dlo_casadi.config.limits import implausible_quaternion, impossible_values
+from dlo_casadi.config.measuring import Tolerances
 from dlo_casadi.config.problems import Problem, kind_of, show
-from dlo_casadi.config.sections import (
-    Cable,
-    Config,
-    Experiment,
-    File,
-    Pose,
-    SkippedPose,
-    Tolerances,
-)
+from dlo_casadi.config.sections import Cable, Config, Experiment, File, Pose, SkippedPose
 from dlo_casadi.effects import UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.rod.chain import ELEMENTS

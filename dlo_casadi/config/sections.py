@@ -1,113 +1,29 @@
-"""The checked objects: one class for each section of a configuration. All units are SI."""
+"""The checked objects: one class for each section of a configuration. All units are SI.
+
+How was measured is in `measuring`, how the fit goes about it in `options`.
+"""
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from dlo_casadi.config.limits import (
-    COORDINATE,
-    MARKER,
-    MESH,
-    REST_COEFFICIENTS,
-    STIFFNESS,
-    implausible_camera,
-    implausible_pixels,
-    implausible_sizes,
-)
-from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, did_you_mean, show
+from dlo_casadi.config.limits import STIFFNESS, implausible_sizes
+from dlo_casadi.config.measuring import Centerlines, Images, Tolerances
+from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
+from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, show
+from dlo_casadi.config.values import Moment, Number, Place, Positive, Quaternion, Section, optional
 from dlo_casadi.ends import REACTIONS
 from dlo_casadi.errors import well_formed
-from dlo_casadi.thresholds import SIGNIFICANCE
-
-
-def _optional(section: type[Section]) -> BeforeValidator:
-    """Let a section be empty: `model:` with nothing behind it."""
-    return BeforeValidator(_empty_section, json_schema_input_type=section | None)
-
-
-def _pair(value: object) -> object:
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        raise ValueError(f"two numbers [x, y] belong here, found {show(value)}")
-    return value
-
-
-def _place(value: object) -> object:
-    if not isinstance(value, list | tuple) or len(value) not in (2, 3):
-        raise ValueError(
-            f"two numbers [x, y] belong here, in space three [x, y, z], found {show(value)}"
-        )
-    return value
-
-
-def _moment(value: object) -> object:
-    if isinstance(value, list | tuple):
-        if len(value) == 3:
-            return value
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        return (value,)
-    raise ValueError(f"one number belongs here, in space three [mx, my, mz], found {show(value)}")
-
-
-def _quaternion(value: object) -> object:
-    if not isinstance(value, list | tuple) or len(value) != 4:
-        raise ValueError(f"a quaternion [qx, qy, qz, qw] belongs here, found {show(value)}")
-    return value
-
-
-def _empty_section(value: object) -> object:
-    """Read `model:` with nothing behind it as an empty section."""
-    return {} if value is None else value
-
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
 # a foam, to five times, which no metal of cables reaches.
 DENSITY = 2200.0
-
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
-NonNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
-Count = Annotated[int, Field(strict=True)]
-Switch = Annotated[bool, Field(strict=True)]
-Vector = Annotated[
-    tuple[Number, Number], BeforeValidator(_pair, json_schema_input_type=tuple[Number, Number])
-]
-Row = tuple[Number, Number, Number]
-Place = Annotated[
-    tuple[Number, ...],
-    BeforeValidator(
-        _place, json_schema_input_type=tuple[Number, Number] | tuple[Number, Number, Number]
-    ),
-]
-Moment = Annotated[
-    tuple[Number, ...],
-    BeforeValidator(_moment, json_schema_input_type=Number | tuple[Number, Number, Number]),
-]
-Quaternion = Annotated[
-    tuple[Number, ...],
-    BeforeValidator(_quaternion, json_schema_input_type=tuple[Number, Number, Number, Number]),
-]
-
-
-class Section(BaseModel):
-    """A frozen mapping of the file: unknown keys are errors, the docstring of a key is its help."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
 class Cable(Section):
@@ -187,174 +103,8 @@ class Boundary(Section):
     """End of the cable: pinned, clamped or free."""
 
 
-class Camera(Section):
-    """A pinhole camera with lens distortion, in OpenCV's convention."""
-
-    matrix: tuple[Row, Row, Row]
-    """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel]."""
-    distortion: tuple[Number, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """OpenCV's 4, 5, 8, 12 or 14 coefficients k1, k2, p1, p2, k3, k4, ...; [] for none."""
-
-    @model_validator(mode="after")
-    def _plausible(self) -> Camera:
-        (fx, skew, _), (below, fy, _), last = self.matrix
-        if fx <= 0.0 or fy <= 0.0 or skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
-            text = "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
-            raise Contradiction(Problem(("matrix",), text))
-        if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
-            text = (
-                f"found {len(self.distortion)} numbers; OpenCV knows 4, 5 "
-                "[k1, k2, p1, p2, k3], 8, 12 or 14"
-            )
-            raise Contradiction(Problem(("distortion",), text))
-        if problems := implausible_camera(self.matrix, self.distortion):
-            raise Contradiction(*problems)
-        return self
-
-
-ARUCO_DICTIONARIES = (
-    *(f"DICT_{k}X{k}_{count}" for k in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
-    "DICT_ARUCO_ORIGINAL",
-    "DICT_ARUCO_MIP_36h12",
-    *(f"DICT_APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
-)
 """Names of OpenCV's predefined marker dictionaries."""
-
-_FAMILIES = {"ORIGINAL": 1024, "36h12": 250, "16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587}
 """Markers of the dictionaries whose name does not tell."""
-
-
-class Board(Section):
-    """A plane board with ArUco markers; it defines the frame in which everything is measured."""
-
-    dictionary: str
-    """OpenCV's name of the marker dictionary, such as DICT_4X4_50."""
-    marker_size: Positive
-    """Side of the black square of a marker [m]."""
-    standoff: NonNegative = 0.0
-    """Distance of the cable's axis in front of the board [m]; other than 0 needs a camera, or
-    photographs from several directions that show it."""
-    marker_centers: Annotated[
-        dict[Annotated[int, Field(ge=0)], Vector],
-        Field(min_length=1, max_length=max(_FAMILIES.values())),
-    ]
-    """Centre of each marker by its id: {0: [x, y], 1: [x, y], ...} [m]."""
-
-    @model_validator(mode="after")
-    def _plausible(self) -> Board:
-        sizes = MARKER.problems(("marker_size",), self.marker_size)
-        sizes += COORDINATE.problems(("standoff",), self.standoff)
-        for i, center in self.marker_centers.items():
-            for value in center:
-                sizes += COORDINATE.problems(("marker_centers", i), value)
-        if sizes:
-            raise Contradiction(*sizes)
-        if self.dictionary not in ARUCO_DICTIONARIES:
-            hint = did_you_mean(self.dictionary, ARUCO_DICTIONARIES)
-            text = f"OpenCV has no dictionary {self.dictionary!r}{hint}"
-            raise Contradiction(Problem(("dictionary",), text))
-        size = self.dictionary.rsplit("_", 1)[1]
-        count = int(size) if size.isdigit() else _FAMILIES[size]
-        too_large = [i for i in self.marker_centers if i >= count]
-        if too_large:
-            text = f"{self.dictionary} has no marker {too_large[0]:g}: its ids end at {count - 1}"
-            raise Contradiction(Problem(("marker_centers",), text))
-        for (i, a), (j, b) in itertools.combinations(self.marker_centers.items(), 2):
-            if math.dist(a, b) < self.marker_size:
-                text = (
-                    f"markers {i} and {j} are {math.dist(a, b):g} m apart, closer than their "
-                    f"size of {self.marker_size:g} m: all in metres?"
-                )
-                raise Contradiction(Problem(("marker_centers",), text))
-        return self
-
-
-class Reference(Section):
-    """Two known points in the photograph: scale, rotation and origin of a similarity transform."""
-
-    pixels: tuple[Vector, Vector]
-    """The two points in the photograph [[u, v], [u, v]], u to the right, v down [pixel]."""
-    points: tuple[Vector, Vector]
-    """The same two points in the board frame [[x, y], [x, y]] [m]."""
-
-    @model_validator(mode="after")
-    def _distinct(self) -> Reference:
-        for name, (a, b) in (("pixels", self.pixels), ("points", self.points)):
-            if a == b:
-                raise Contradiction(Problem((name,), f"the two points are the same: {list(a)}"))
-        if problems := implausible_pixels(("pixels",), [x for pair in self.pixels for x in pair]):
-            raise Contradiction(*problems)
-        for k, point in enumerate(self.points):
-            for value in point:
-                if problems := COORDINATE.problems(("points", k), value):
-                    raise Contradiction(*problems)
-        return self
-
-
-class Measurement(Section):
-    """How well was measured."""
-
-    std: Positive | None = None
-    """Standard deviation of one centre-line coordinate [m]; estimated when absent, and, with a
-    warning, where the points scatter more."""
-    force_std: Positive | None = None
-    """Standard deviation of one component of a force on a fixture [N]; estimated when absent."""
-    moment_std: Positive | None = None
-    """Standard deviation of one component of a moment on a fixture [N m]; estimated when absent."""
-
-
-class Images(Measurement):
-    """Photographs of the cable, with a board or two known points."""
-
-    kind: Literal["images"] = "images"
-    """images."""
-    camera: Camera | None = None
-    """The camera. Without it, it is found from the session's photographs where it is needed (in
-    space, or with a standoff); else the board's plane is mapped by a homography."""
-    board: Board | None = None
-    """The board with its markers; or give reference."""
-    reference: Reference | None = None
-    """Two known points; or give board."""
-
-    @model_validator(mode="after")
-    def _one_frame(self) -> Images:
-        if (self.board is None) == (self.reference is None):
-            found = "neither" if self.board is None else "both"
-            text = f"kind: images needs either a board or a reference, found {found}"
-            raise Contradiction(Problem((), text))
-        return self
-
-
-class Centerlines(Measurement):
-    """Centre-lines that were measured elsewhere, one CSV file a pose."""
-
-    kind: Literal["centerlines"] = "centerlines"
-    """centerlines."""
-
-
-class Tolerances(Section):
-    """How well the declared values are known: one standard deviation each."""
-
-    length: Positive = 5.0e-4
-    """Of the cable's length [m]."""
-    end: Positive = 2.0e-4
-    """Of a coordinate of a fixture [m]."""
-    heading: Positive = 1.0e-2
-    """Of a clamp's heading in a plane [rad]."""
-    rotation: Positive = 5.0e-3
-    """Of a clamp's orientation in space, about each of its axes [rad]."""
-    roll: Positive = 1.0
-    """Of the roll of a cable in its end clamp, about itself [rad]."""
-    scale: Positive = 3.0e-4
-    """Of the scale of the measurement, relative."""
-    camera_rotation: Positive = 2.0e-3
-    """Of the frame of a measurement in space against the fixtures, about each axis [rad]."""
-    camera_translation: Positive = 1.0e-3
-    """Of the frame of a measurement in space against the fixtures, along each axis [m]."""
-    force_bias: Positive = 0.02
-    """Of a constant offset of a sensor's force, each component [N]."""
-    moment_bias: Positive = 2.0e-3
-    """Of a constant offset of a sensor's moment, each component [N m]."""
 
 
 # pose_01_a -> pose_01: a digit, and letters after it.
@@ -472,7 +222,7 @@ class Experiment(Section):
     """How the two ends are held: {start: pinned | clamped, end: pinned | clamped | free}."""
     measurement: Annotated[Images | Centerlines, Field(discriminator="kind")]
     """What the files of the poses are: kind: images or kind: centerlines."""
-    tolerances: Annotated[Tolerances, _optional(Tolerances)] = Tolerances()
+    tolerances: Annotated[Tolerances, optional(Tolerances)] = Tolerances()
     """How well the declared values are known."""
     poses: tuple[Pose, ...]
     """The poses, in the order in which they were taken."""
@@ -481,88 +231,6 @@ class Experiment(Section):
     def in_space(self) -> bool:
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
-
-
-class EffectParameter(Section):
-    """The declared value of an effect's parameter: an initial guess, or kept when fixed."""
-
-    value: Number
-    """Value in the parameter's own unit."""
-    fixed: Switch = False
-    """Whether the value is kept; otherwise it is where the fit starts."""
-
-
-def _as_parameter(value: object) -> object:
-    return {"value": value} if not isinstance(value, Mapping | EffectParameter) else value
-
-
-def _as_effect(value: object) -> object:
-    return {"name": value} if isinstance(value, str) else value
-
-
-class DeclaredEffect(Section):
-    """An effect that is part of the model from the start."""
-
-    name: str
-    """Name of the effect, such as lumped_mass."""
-    parameters: dict[
-        str,
-        Annotated[
-            EffectParameter,
-            BeforeValidator(_as_parameter, json_schema_input_type=float | EffectParameter),
-        ],
-    ] = {}
-    """Initial guess of each parameter by its name; {value: ..., fixed: true} keeps a value."""
-
-
-class ModelOptions(Section):
-    """The declared model."""
-
-    n: Annotated[Count, Field(ge=MESH.least, le=MESH.most)] | None = None
-    """Number of elements; chosen from the data when absent."""
-    element: Literal["quadratic", "arc", "link"] = "quadratic"
-    """quadratic (curvature changes in an element: fourth order), arc (it is constant: second
-    order, five times cheaper) or link (straight, as in the paper; in a plane only)."""
-    effects: tuple[
-        Annotated[
-            DeclaredEffect,
-            BeforeValidator(_as_effect, json_schema_input_type=str | DeclaredEffect),
-        ],
-        ...,
-    ] = ()
-    """Effects beside bending and weight."""
-
-
-class EstimationOptions(Section):
-    """How the parameters are estimated."""
-
-    algorithm1: Switch = True
-    """Whether the paper's loop runs as a baseline."""
-    algorithm1_n: Annotated[int, Field(strict=True, ge=2, le=200)] = 10
-    """Number of links in the paper's loop."""
-    algorithm1_inner: Literal["ipopt", "cobyla"] = "ipopt"
-    """Its inner minimisation: ipopt, or cobyla as in the paper (about 1 s a pose)."""
-    robust: Switch = False
-    """Whether outlying points weigh less."""
-    plausibility: Switch = True
-    """Whether contradictions of the configuration stop the fit, or leave out a single pose."""
-    rest_curvature_coefficients: (
-        Annotated[Count, Field(ge=REST_COEFFICIENTS.least, le=REST_COEFFICIENTS.most)] | None
-    ) = None
-    """Number of coefficients of the rest curvature, 0 for a straight one; chosen from the data."""
-
-
-class DiagnosisOptions(Section):
-    """The search for missing effects."""
-
-    enabled: Switch = True
-    """Whether missing effects are searched for."""
-    exclude: tuple[str, ...] = ()
-    """Names of effects that are not tried."""
-    significance: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)] = SIGNIFICANCE
-    """Largest p-value with which an effect is added."""
-    max_effects: Annotated[int, Field(strict=True, ge=0)] = 4
-    """Largest number of effects that are added."""
 
 
 class SkippedPose(NamedTuple):
@@ -619,9 +287,9 @@ class File(Section):
     """The cable: length, mass, diameter, youngs_modulus or bending_stiffness."""
     experiment: Experiment
     """The experiment: gravity, boundary, measurement, poses."""
-    model: Annotated[ModelOptions, _optional(ModelOptions)] = ModelOptions()
+    model: Annotated[ModelOptions, optional(ModelOptions)] = ModelOptions()
     """The declared model."""
-    estimation: Annotated[EstimationOptions, _optional(EstimationOptions)] = EstimationOptions()
+    estimation: Annotated[EstimationOptions, optional(EstimationOptions)] = EstimationOptions()
     """How the parameters are estimated."""
-    diagnosis: Annotated[DiagnosisOptions, _optional(DiagnosisOptions)] = DiagnosisOptions()
+    diagnosis: Annotated[DiagnosisOptions, optional(DiagnosisOptions)] = DiagnosisOptions()
     """The search for missing effects."""

@@ -1,0 +1,181 @@
+"""How was measured: camera, board or reference, noise and tolerances."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from dlo_casadi.config.limits import COORDINATE, MARKER, implausible_camera, implausible_pixels
+from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean
+from dlo_casadi.config.values import NonNegative, Number, Positive, Row, Section, Vector
+
+
+class Camera(Section):
+    """A pinhole camera with lens distortion, in OpenCV's convention."""
+
+    matrix: tuple[Row, Row, Row]
+    """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel]."""
+    distortion: tuple[Number, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """OpenCV's 4, 5, 8, 12 or 14 coefficients k1, k2, p1, p2, k3, k4, ...; [] for none."""
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Camera:
+        (fx, skew, _), (below, fy, _), last = self.matrix
+        if fx <= 0.0 or fy <= 0.0 or skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
+            text = "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
+            raise Contradiction(Problem(("matrix",), text))
+        if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
+            text = (
+                f"found {len(self.distortion)} numbers; OpenCV knows 4, 5 "
+                "[k1, k2, p1, p2, k3], 8, 12 or 14"
+            )
+            raise Contradiction(Problem(("distortion",), text))
+        if problems := implausible_camera(self.matrix, self.distortion):
+            raise Contradiction(*problems)
+        return self
+
+
+ARUCO_DICTIONARIES = (
+    *(f"DICT_{k}X{k}_{count}" for k in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_ARUCO_MIP_36h12",
+    *(f"DICT_APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
+)
+
+_FAMILIES = {"ORIGINAL": 1024, "36h12": 250, "16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587}
+
+
+class Board(Section):
+    """A plane board with ArUco markers; it defines the frame in which everything is measured."""
+
+    dictionary: str
+    """OpenCV's name of the marker dictionary, such as DICT_4X4_50."""
+    marker_size: Positive
+    """Side of the black square of a marker [m]."""
+    standoff: NonNegative = 0.0
+    """Distance of the cable's axis in front of the board [m]; other than 0 needs a camera, or
+    photographs from several directions that show it."""
+    marker_centers: Annotated[
+        dict[Annotated[int, Field(ge=0)], Vector],
+        Field(min_length=1, max_length=max(_FAMILIES.values())),
+    ]
+    """Centre of each marker by its id: {0: [x, y], 1: [x, y], ...} [m]."""
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Board:
+        sizes = MARKER.problems(("marker_size",), self.marker_size)
+        sizes += COORDINATE.problems(("standoff",), self.standoff)
+        for i, center in self.marker_centers.items():
+            for value in center:
+                sizes += COORDINATE.problems(("marker_centers", i), value)
+        if sizes:
+            raise Contradiction(*sizes)
+        if self.dictionary not in ARUCO_DICTIONARIES:
+            hint = did_you_mean(self.dictionary, ARUCO_DICTIONARIES)
+            text = f"OpenCV has no dictionary {self.dictionary!r}{hint}"
+            raise Contradiction(Problem(("dictionary",), text))
+        size = self.dictionary.rsplit("_", 1)[1]
+        count = int(size) if size.isdigit() else _FAMILIES[size]
+        too_large = [i for i in self.marker_centers if i >= count]
+        if too_large:
+            text = f"{self.dictionary} has no marker {too_large[0]:g}: its ids end at {count - 1}"
+            raise Contradiction(Problem(("marker_centers",), text))
+        for (i, a), (j, b) in itertools.combinations(self.marker_centers.items(), 2):
+            if math.dist(a, b) < self.marker_size:
+                text = (
+                    f"markers {i} and {j} are {math.dist(a, b):g} m apart, closer than their "
+                    f"size of {self.marker_size:g} m: all in metres?"
+                )
+                raise Contradiction(Problem(("marker_centers",), text))
+        return self
+
+
+class Reference(Section):
+    """Two known points in the photograph: scale, rotation and origin of a similarity transform."""
+
+    pixels: tuple[Vector, Vector]
+    """The two points in the photograph [[u, v], [u, v]], u to the right, v down [pixel]."""
+    points: tuple[Vector, Vector]
+    """The same two points in the board frame [[x, y], [x, y]] [m]."""
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Reference:
+        for name, (a, b) in (("pixels", self.pixels), ("points", self.points)):
+            if a == b:
+                raise Contradiction(Problem((name,), f"the two points are the same: {list(a)}"))
+        if problems := implausible_pixels(("pixels",), [x for pair in self.pixels for x in pair]):
+            raise Contradiction(*problems)
+        for k, point in enumerate(self.points):
+            for value in point:
+                if problems := COORDINATE.problems(("points", k), value):
+                    raise Contradiction(*problems)
+        return self
+
+
+class Measurement(Section):
+    """How well was measured."""
+
+    std: Positive | None = None
+    """Standard deviation of one centre-line coordinate [m]; estimated when absent, and, with a
+    warning, where the points scatter more."""
+    force_std: Positive | None = None
+    """Standard deviation of one component of a force on a fixture [N]; estimated when absent."""
+    moment_std: Positive | None = None
+    """Standard deviation of one component of a moment on a fixture [N m]; estimated when absent."""
+
+
+class Images(Measurement):
+    """Photographs of the cable, with a board or two known points."""
+
+    kind: Literal["images"] = "images"
+    """images."""
+    camera: Camera | None = None
+    """The camera. Without it, it is found from the session's photographs where it is needed (in
+    space, or with a standoff); else the board's plane is mapped by a homography."""
+    board: Board | None = None
+    """The board with its markers; or give reference."""
+    reference: Reference | None = None
+    """Two known points; or give board."""
+
+    @model_validator(mode="after")
+    def _one_frame(self) -> Images:
+        if (self.board is None) == (self.reference is None):
+            found = "neither" if self.board is None else "both"
+            text = f"kind: images needs either a board or a reference, found {found}"
+            raise Contradiction(Problem((), text))
+        return self
+
+
+class Centerlines(Measurement):
+    """Centre-lines that were measured elsewhere, one CSV file a pose."""
+
+    kind: Literal["centerlines"] = "centerlines"
+    """centerlines."""
+
+
+class Tolerances(Section):
+    """How well the declared values are known: one standard deviation each."""
+
+    length: Positive = 5.0e-4
+    """Of the cable's length [m]."""
+    end: Positive = 2.0e-4
+    """Of a coordinate of a fixture [m]."""
+    heading: Positive = 1.0e-2
+    """Of a clamp's heading in a plane [rad]."""
+    rotation: Positive = 5.0e-3
+    """Of a clamp's orientation in space, about each of its axes [rad]."""
+    roll: Positive = 1.0
+    """Of the roll of a cable in its end clamp, about itself [rad]."""
+    scale: Positive = 3.0e-4
+    """Of the scale of the measurement, relative."""
+    camera_rotation: Positive = 2.0e-3
+    """Of the frame of a measurement in space against the fixtures, about each axis [rad]."""
+    camera_translation: Positive = 1.0e-3
+    """Of the frame of a measurement in space against the fixtures, along each axis [m]."""
+    force_bias: Positive = 0.02
+    """Of a constant offset of a sensor's force, each component [N]."""
+    moment_bias: Positive = 2.0e-3
+    """Of a constant offset of a sensor's moment, each component [N m]."""
