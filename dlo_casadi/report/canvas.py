@@ -108,6 +108,6 @@ def label_of(stage: Stage, outcome: Outcome) -> str:
     return STAGE_LABELS[stage.name]
 
 
-def millimetres(value: float) -> str:
-    """A length [m] as text in mm, with three digits."""
-    return f"{1e3 * value:.3g} mm"
+def millimetres(value: float | None) -> str:
+    """A length [m] as text in mm, with three digits; a dash for none."""
+    return "-" if value is None else f"{1e3 * value:.3g} mm"

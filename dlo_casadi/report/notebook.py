@@ -15,13 +15,9 @@ from dlo_casadi.report.figures_room import draw_marks, frame_room
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.room import seen
 from dlo_casadi.report.scene import scene_of
-from dlo_casadi.report.terminal import (
-    ON_BRANCH,
-    describe,
-    predicted_share,
-    prediction_rows,
-    verdict_lines,
-)
+from dlo_casadi.report.terminal import prediction_rows
+from dlo_casadi.report.text_findings import ON_BRANCH, predicted_share, verdict_lines
+from dlo_casadi.report.text_parameters import describe
 from dlo_casadi.session.outcome import Outcome
 
 FloatArray = NDArray[np.floating]

@@ -17,7 +17,7 @@ from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.page_pictures import pictures, scene_pictures
 from dlo_casadi.report.page_views import view_pictures_of
 from dlo_casadi.report.room import VIEWS
-from dlo_casadi.report.terminal import vector
+from dlo_casadi.report.text_parameters import vector
 from dlo_casadi.session.outcome import Outcome
 
 # By which a page is known as written by this package.

@@ -24,7 +24,7 @@ from dlo_casadi.report.canvas import before_after, label_of
 from dlo_casadi.report.geometry import directions, residual_along, residual_range, rest_about
 from dlo_casadi.report.page_boards import next_pose_chart, pull_chart
 from dlo_casadi.report.page_canvas import AFTER, BEFORE, FAINT, HELD_OUT, INK, empty_chart, hover
-from dlo_casadi.report.terminal import cross_validated
+from dlo_casadi.report.text_findings import cross_validated
 from dlo_casadi.session.outcome import Outcome, Stage
 from dlo_casadi.thresholds import NORMAL_95
 

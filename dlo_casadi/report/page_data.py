@@ -9,21 +9,23 @@ from dlo_casadi.config import Config
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.report.canvas import before_after, label_of, millimetres
 from dlo_casadi.report.json_report import all_warnings
-from dlo_casadi.report.terminal import (
+from dlo_casadi.report.text_findings import (
     CANDIDATE_ORDER,
     ON_BRANCH,
     cross_validated,
+    p_value_note,
+    predicted_share,
+    reading_text,
+    separation_text,
+    timing_rows,
+    verdict_lines,
+)
+from dlo_casadi.report.text_parameters import (
     describe,
     fixed_rows,
     footnotes,
     nuisance_rows,
-    p_value_note,
-    predicted_share,
-    reading_text,
     rest_rows,
-    separation_text,
-    timing_rows,
-    verdict_lines,
 )
 from dlo_casadi.session.outcome import Outcome, ParameterEstimate
 from dlo_casadi.thresholds import NORMAL_95

@@ -22,7 +22,7 @@ from dlo_casadi.report.geometry import beside
 from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds, flat, in_room
 from dlo_casadi.report.room import Mark, Room, around
 from dlo_casadi.report.scene import next_marks, pull_marks, scene_of
-from dlo_casadi.report.terminal import branch_text
+from dlo_casadi.report.text_findings import branch_text
 from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape
 
 FloatArray = NDArray[np.floating]

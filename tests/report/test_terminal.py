@@ -11,14 +11,9 @@ from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.page_data import page_data, stage_rows
 from dlo_casadi.report.page_pictures import pictures
-from dlo_casadi.report.terminal import (
-    describe,
-    plus_minus,
-    print_summary,
-    separation_text,
-    structure_lines,
-    unidentified,
-)
+from dlo_casadi.report.terminal import print_summary
+from dlo_casadi.report.text_findings import separation_text, structure_lines
+from dlo_casadi.report.text_parameters import describe, plus_minus, unidentified
 from dlo_casadi.session.outcome import BranchShape, ParameterEstimate
 
 

@@ -1,0 +1,225 @@
+"""Errors, verdict, what is left and what it took, in words."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from dlo_casadi.diagnosis.structure import LARGEST_SCORE
+from dlo_casadi.report.canvas import millimetres
+from dlo_casadi.report.text_parameters import plus_minus, vector
+from dlo_casadi.session.outcome import BranchShape, Outcome, Stage, StageName
+from dlo_casadi.thresholds import APART, NOTABLE
+
+# The errors of a stage, of which some poses were measured in another equilibrium.
+ON_BRANCH = "on the measured branch"
+
+
+def predicted_share(outcome: Outcome, stage: Stage) -> str:
+    """How many of the held-out poses a stage has predicted, where it is not all of them."""
+    held_out = outcome.held_out(stage)
+    if not held_out.missing or not stage.shapes:
+        return ""
+    return f" ({held_out.predicted} of {held_out.declared})"
+
+
+def branch_text(found: BranchShape) -> str:
+    """Error of a pose in the equilibrium in which it was measured, and how to choose that one."""
+    return f"{ON_BRANCH} {millimetres(found.rmse)} ({found.chosen_by or 'no branch chooses it'})"
+
+
+def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
+    """Cross-validated errors [m] of the stages for which the diagnosis has computed them."""
+    if not outcome.effects:
+        searched = outcome.diagnosis
+        known = searched is not None and searched.validation_after.complete
+        return {"batch": searched.validation_after.rmse} if known else {}
+    return {
+        "batch": outcome.effects[0]["rmse_cross_validated_before"],
+        "closed": outcome.effects[-1]["rmse_cross_validated_after"],
+    }
+
+
+def verdict_lines(outcome: Outcome) -> list[str]:
+    """What the diagnosis has led to, in sentences."""
+    if outcome.doubts:
+        head, *others = (f"{text[:1].upper()}{text[1:]}." for text in outcome.doubts)
+        word = "the fit has failed" if outcome.fit.failed else "unexplained"
+        lines = [f"Verdict: {word}. {head}", *(f"  {text}" for text in others)]
+    elif outcome.verdict is not None:
+        lines = [_verdict(outcome)]
+    else:
+        lines = ["Diagnosis: switched off; nothing was looked for in the residual."]
+    lines += structure_lines(outcome)
+    for effect in outcome.effects:
+        lines += _effect_lines(effect)
+    load = outcome.unexplained
+    if load is not None:
+        force, (low, high) = load["force"], load["interval_95"]
+        lines.append(
+            f"  Without naming a cause: pulled by {vector(force, '.3g', 'N')} on average "
+            f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
+        )
+        experiment = outcome.config.experiment
+        if experiment.boundary.end == "free" and np.dot(force, experiment.gravity) < 0:
+            lines.append(
+                "  Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or "
+                "another stiffness may stand behind it."
+            )
+    if outcome.next_pose is not None:
+        lines.append(
+            f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "
+            f"{vector(outcome.next_pose['end'], '.3f', 'm')}; {separation_text(outcome.next_pose)}"
+        )
+        lines.append(f"  {reading_text(outcome.next_pose['reading'])}")
+    return lines
+
+
+# Nobody measures a pose more often.
+MOST_REPEATS = 20
+
+
+def separation_text(proposal: dict[str, Any]) -> str:
+    """How far rivals differ in a proposed pose, and how often it has to be measured."""
+    z = proposal["expected_difference_std"]
+    text = (
+        f"they differ there by {millimetres(proposal['expected_difference_m'])} RMS, {z:.2g} "
+        "standard deviations of the noise of one whole line: "
+    )
+    repeats = math.ceil(min((APART / max(z, 1e-9)) ** 2, 1e9))
+    if repeats <= 1:
+        return text + "one measurement suffices."
+    if repeats <= MOST_REPEATS:
+        return text + f"measure it {repeats} times."
+    return text + f"even {MOST_REPEATS} measurements would not tell them apart."
+
+
+def reading_text(proposal: dict[str, Any]) -> str:
+    """What a reading of force or moment in the proposed pose would tell of rivals."""
+    unit = "N m" if proposal["name"].endswith("moment") else "N"
+    text = (
+        f"A reading of {proposal['name']} there differs by {proposal['difference']:.2g} {unit}, "
+        f"{proposal['separation']:.2g} standard deviations of one: "
+    )
+    if proposal["times"] is None or proposal["times"] > MOST_REPEATS:
+        return text + "it would not tell them apart."
+    times = proposal["times"]
+    return text + ("one suffices." if times == 1 else f"read it {times} times.")
+
+
+# What the residual may depend on, by the key of its normal score.
+DEPENDENCES = {
+    "runs_z": "runs along the cable",
+    "order_z": "the order of the poses",
+    "span_z": "the distance of the ends",
+    "position_z": "the place in the {plane}",
+}
+
+
+def structure_lines(outcome: Outcome) -> list[str]:
+    """What the declared model's residual depends on, where it is not noise."""
+    if outcome.structure is None or outcome.verdict == "complete":
+        return []
+    before = outcome.structure["before"]
+    plane = "picture" if outcome.measurement.kind == "images" else "plane"
+    found = [
+        f"{text.format(plane=plane)} ({_score(key, before[key])})"
+        for key, text in DEPENDENCES.items()
+        if abs(before[key]) > NOTABLE
+    ]
+    if not found:
+        return []
+    return [f"  The declared model's residual depends on {', '.join(found)}."]
+
+
+def _score(key: str, value: float) -> str:
+    """A normal score; where its test ends, only that it lies beyond."""
+    if key != "runs_z" and abs(value) >= 0.999 * LARGEST_SCORE:
+        return "z > 7" if value > 0 else "z < -7"
+    return f"z = {value:+.1f}"
+
+
+def _verdict(outcome: Outcome) -> str:
+    names = " and ".join(effect["name"] for effect in outcome.effects)
+    if outcome.verdict == "unexplained":
+        after = outcome.structure["after"] if outcome.structure else None
+        if names and after and after["p_value"] >= outcome.config.diagnosis.significance:
+            error = outcome.effects[-1]["rmse_cross_validated_after"]
+            return (
+                f"Verdict: unexplained. With {names} every pose is fitted, but one that is left "
+                f"out is predicted {millimetres(error)} off "
+                f"(noise {millimetres(outcome.measurement.std)})."
+            )
+        found = f" even with {names}" if names else ""
+        return f"Verdict: unexplained. The residual is not noise{found}."
+    if outcome.effects:
+        return f"Verdict: the declared model lacked {names}; with it the residual is noise."
+    return "Verdict: complete. The declared model explains the shapes down to their noise."
+
+
+def _effect_lines(effect: dict[str, Any]) -> list[str]:
+    values = ", ".join(_quantity(name, row) for name, row in effect["parameters"].items())
+    line = f"  {effect['name']}: {values}"
+    if effect["p_value"] is not None:
+        # Below the smallest double it is zero.
+        p_value = effect["p_value"]
+        line += f" (p = {p_value:.1g})" if p_value > 0 else " (p < 1e-307)"
+    lines = [line]
+    rivals = effect["indistinguishable_from"]
+    if rivals:
+        lines.append(f"    These data cannot tell it from {' or '.join(rivals)}.")
+    return lines
+
+
+def _quantity(name: str, row: dict[str, Any]) -> str:
+    if row["value"] is None:
+        return f"{name} unbounded"
+    return f"{name} {plus_minus(row['value'], row['std'] or 0.0)} {row['unit']}".strip()
+
+
+# How candidates are ordered; the score alone does not tell how well a refit does.
+CANDIDATE_ORDER = "first those that a refit confirms, by BIC, then other refits, the rest by score"
+
+
+def p_value_note(outcome: Outcome) -> str:
+    """What the p-values of candidates and of added effects are."""
+    note = "p-value: score test in the declared model, corrected for the number of effects tried."
+    if outcome.effects and outcome.measurement.std_source == "estimated":
+        note += (
+            " The p of an added effect is the larger of that before it was added and that under "
+            "the noise left once it is in the model."
+        )
+    return note
+
+
+# Parts of the run in the order in which they are done.
+TIMED = {
+    "vision": "photographs to centre-lines",
+    "algorithm1": "Algorithm 1",
+    "batch": "batch estimate",
+    "diagnosis": "diagnosis",
+}
+# Parts that take less [s] were left out.
+_NO_TIME = 1e-3
+
+
+def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
+    """Part of the run, seconds and remark; the total comes last."""
+    timing = outcome.timing
+    photographs = sum((pose.image is not None) + len(pose.views) for pose in outcome.poses)
+    rest = timing["total"] - sum(timing.get(name, 0.0) for name in TIMED)
+    rows = []
+    for name, label in TIMED.items():
+        if timing.get(name, 0.0) < _NO_TIME:  # in space IPOPT, and the paper's loop, do not run
+            continue
+        remark = ""
+        if name == "vision" and photographs:
+            remark = f"{timing[name] / photographs:.2f} s a photograph ({photographs})"
+        elif name == "vision":
+            label = "centre-lines"
+        rows.append((label, f"{timing[name]:.2f}", remark))
+    rows.append(("other fits and predictions", f"{max(rest, 0.0):.2f}", ""))
+    rows.append(("total", f"{timing['total']:.2f}", ""))
+    return rows
