@@ -331,6 +331,7 @@ def test_unknown_effects_are_named_with_their_line(tmp_path, options, line, mess
             "1e.308 kg for 0.8 m: units are SI, at most 80 kg is possible",
         ),
         ("1.28e-2", "1e-300", 5, "1e-300 m: 1e-06 to 0.8 m is possible"),
+        ("1.28e-2", "1e300", 5, "1e.300 m is larger than the length 0.8 m"),
         (YOUNG, "bending_stiffness: 1e-300", 6, "1e-300 N m.2: 1e-12 to 1e.09 N m.2 is possible"),
         (YOUNG, "bending_stiffness: 1e308", 6, "1e.308 N m.2: 1e-12 to 1e.09 N m.2 is possible"),
         (YOUNG, "youngs_modulus: 1e300", 6, "is possible for EI = E pi d.4 / 64"),

@@ -28,12 +28,15 @@ class Counter:
     quiet : bool
     size : int
         How many of them a task holds.
+    count : int, optional
+        All of them: the last task may hold fewer.
     """
 
     console: Console
     noun: str
     quiet: bool = False
     size: int = 1
+    count: int | None = None
     _bar: Progress | None = None
     _task: TaskID | None = None
     _spoken: float = 0.0
@@ -75,6 +78,8 @@ class Counter:
 
     def _text(self, tally: Tally) -> str:
         done, total = self.size * tally.done, self.size * (tally.total or tally.done)
+        if self.count is not None:
+            done, total = min(done, self.count), self.count
         text = f"{done:,} of {total:,} {self.noun}".replace(",", " ")
         if tally.failed:
             text += f", {tally.failed} lost"

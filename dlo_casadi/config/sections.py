@@ -136,14 +136,15 @@ class Cable(Section):
         if self.bending_stiffness is not None:
             return self.bending_stiffness
         assert self.youngs_modulus is not None  # checked when the object was made
-        return self.youngs_modulus * math.pi * self.diameter**4 / 64.0
+        square = self.diameter * self.diameter  # infinite of an absurd one, where ** raises
+        return self.youngs_modulus * math.pi * square * square / 64.0
 
     @property
     def prior_mass(self) -> float:
         """Mass [kg] as declared, or that of a solid round rod of DENSITY."""
         if self.mass is not None:
             return self.mass
-        return DENSITY * math.pi / 4.0 * self.diameter**2 * self.length
+        return DENSITY * math.pi / 4.0 * self.diameter * self.diameter * self.length
 
     @property
     def prior_torsional_stiffness(self) -> float:

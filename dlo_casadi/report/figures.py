@@ -132,6 +132,11 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
             Line2D([], [], color=color, ls=style, label=label_of(stage, outcome))
             for stage, color, style in lines
         ]
+        boundary = outcome.config.experiment.boundary
+        if standing and "clamped" in (boundary.start, boundary.end):
+            handles += [
+                Line2D([], [], **STYLES[f"axis-{name}"], label=f"clamp's {name}") for name in "xyz"
+            ]
         if standing or outcome.measurement.readings:
             handles.append(Line2D([], [], color=FORCE, label="force on the ends"))
         if outcome.measurement.readings:
@@ -205,10 +210,10 @@ def _draw_in_room(
     declared = next(item for item in outcome.config.experiment.poses if item.name == pose.name)
     shape = lines[-1][0].shapes.get(pose.name) if lines else None
     under, over = around(room, declared, pose.points, shape)
+    frame_room(axes, room)
     draw_marks(axes, under)
     _draw_pose(axes, pose, lines, factor, lambda points: seen(room.points(points)))
     draw_marks(axes, over)
-    frame_room(axes, room)
 
 
 def _draw_pose(
@@ -310,7 +315,7 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
         handles = [Line2D([], [], color=BLUE, label="fit pose")]
         if outcome.measurement.poses_held_out:
             handles.append(Line2D([], [], color=_HELD_OUT, label="held-out pose"))
-        handles.append(Line2D([], [], color="#EDEDED", lw=8, label="95 % of the noise lies within"))
+        handles.append(_noise_band())
         drawing.legend(handles=handles, loc="outside lower center", ncols=3)
         drawing.suptitle(
             f"{outcome.config.cable.name}: measured minus predicted, noise "
@@ -320,6 +325,10 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
 
 
 # ---- readings ----------------------------------------------------------------------------------
+
+
+def _noise_band() -> Line2D:
+    return Line2D([], [], color="#EDEDED", lw=8, label="95 % of the noise lies within")
 
 
 def draw_readings(path: Path, outcome: Outcome) -> None:
@@ -353,7 +362,8 @@ def draw_readings(path: Path, outcome: Outcome) -> None:
             handles.append(
                 Line2D([], [], color=_HELD_OUT, marker="o", ls="none", label="held-out pose")
             )
-        drawing.legend(handles=handles, loc="outside lower center", ncols=2)
+        handles.append(_noise_band())
+        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
         drawing.suptitle(
             f"{outcome.config.cable.name}: readings, measured minus predicted "
             f"({label_of(stage, outcome)})",
@@ -383,9 +393,9 @@ def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
             about = direction and f" k_{direction}"
             axes.set(
                 xlim=(0, outcome.config.cable.length),
-                xlabel="arc length from the start s [m]",
                 ylabel=f"rest curvature{about} [1/m]",
             )
+        grid[-1, 0].set_xlabel("arc length from the start s [m]")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         drawing.legend(handles, labels, loc="outside lower center", ncols=3)
         straight = outcome.config.cable.rest_shape == "straight"

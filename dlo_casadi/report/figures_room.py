@@ -53,4 +53,5 @@ def frame_room(axes: Axes, room: Room) -> None:
     width, height = room.window / 2
     axes.set(xlim=(-width, width), ylim=(-height, height), xticks=[], yticks=[])
     axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
     axes.set_aspect("equal")

@@ -85,10 +85,15 @@ def build(solver: Path, folder: Path) -> Path:
     return folder / "cable_planner"
 
 
+def _dense(points: FloatArray) -> FloatArray:
+    """Many points of a spline through the nodes of a cable."""
+    spline = CubicSpline(np.linspace(0, 1, len(points)), points)
+    return np.asarray(spline(np.linspace(0, 1, 20 * len(points))))
+
+
 def clearance(points: FloatArray, radius: float, scene: Scene) -> float:
     """Smallest distance of a cable's surface from obstacles [m]: of a spline through its nodes."""
-    spline = CubicSpline(np.linspace(0, 1, len(points)), points)
-    places = spline(np.linspace(0, 1, 20 * len(points)))
+    places = _dense(points)
     least = np.inf
     for obstacle in obstacles_of(scene, points.shape[1]):
         a, b = (np.array(end) for end in obstacle.ends)
@@ -138,14 +143,16 @@ def draw(shapes: FloatArray, scene: Scene, path: Path) -> None:
             axes.plot(*line, color="0.75")
     shown = np.linspace(0, len(shapes) - 1, 18).round().astype(int)
     for k, i in enumerate(shown):
-        axes.plot(*shapes[i].T, color=plt.get_cmap("viridis")(1 - k / (len(shown) - 1)), lw=1.5)
+        axes.plot(
+            *_dense(shapes[i]).T, color=plt.get_cmap("viridis")(1 - k / (len(shown) - 1)), lw=1.5
+        )
     axes.plot(*shapes[:, -1].T, "k--", lw=1.0, label="way of the gripper")
     axes.plot(*([x] for x in scene["start"][0][:d]), "ko", mfc="w", label="start")
     axes.plot(*([x] for x in scene["goal"][0][:d]), "k*", ms=12, label="goal")
     axes.set_aspect("equal")
     for name in "xyz"[:d]:
         getattr(axes, f"set_{name}label")(f"{name} [m]")
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=3)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
@@ -177,7 +184,10 @@ def plan(
     command = [str(program), str(scene_file), branch, str(tries), "1"]
     run = subprocess.run(command, capture_output=True, text=True)
     if run.returncode:
-        raise DloError(f"the planner found no path: {run.stderr}")
+        raise DloError(
+            f"the planner found no path: {run.stderr.strip()}\n"
+            f"  Try: start, goal and limits in {scene_file} that this cable can take, or --scene"
+        )
     (output / "shapes.txt").write_text(run.stdout)
     rows = np.loadtxt(output / "shapes.txt")
     points, numbers = rows[:, : -len(LIMITS)], rows[:, -len(LIMITS) :]
