@@ -28,12 +28,8 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import StateEffect
 from dlo_casadi.estimation.fit import carried_shapes
-from dlo_casadi.estimation.gauss_newton import (
-    NO_INFORMATION,
-    BatchProblem,
-    Linearization,
-    Point,
-)
+from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
+from dlo_casadi.estimation.linearization import Linearization, Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Point
+from dlo_casadi.estimation.gauss_newton import BatchProblem
+from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.sensors import ObservedChange
 from dlo_casadi.ipopt import stats_of
 from dlo_casadi.whole_pose import PoseSymbols, balance, curve, readings, rest_after

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.composition import END_ROLL, STIFFNESSES
 from dlo_casadi.errors import EquilibriumError, EstimationError
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
+from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.hyperparameters import (
     SCATTER_FLOOR,
     SMOOTH_MODES,
@@ -19,6 +19,7 @@ from dlo_casadi.estimation.hyperparameters import (
     first_reading_noise,
     refine,
 )
+from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
@@ -31,6 +32,7 @@ from dlo_casadi.estimation.start import (
     measured_shapes,
     turned_either_way,
 )
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 from dlo_casadi.solve import continued, solve_equilibrium

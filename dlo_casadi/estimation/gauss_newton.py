@@ -14,7 +14,7 @@ Schur complement.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,15 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.assembly import Directions, Shapes
+from dlo_casadi.estimation.linearization import Linearization, Normal, Point, Values
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.rod.band import Vector
-from dlo_casadi.rod.node import Node
 
 FloatArray = NDArray[np.floating]
 
@@ -46,101 +47,6 @@ CONVERGED = 1e-4
 CREEPING = 4
 # Steps that may follow one uphill before it is taken back, and how far up it may lead.
 WATCHED, WORSE = 2, 3.0
-
-
-@dataclass(frozen=True)
-class Tolerances:
-    """How well the declared values are known, one standard deviation."""
-
-    length: float = 5e-4
-    end: float = 2e-4
-    heading: float = 1e-2
-    scale: float = 3e-4
-    rotation: float = 5e-3
-    roll: float = 1.0
-    camera_rotation: float = 2e-3
-    camera_translation: float = 1e-3
-    force_bias: float = 0.02
-    moment_bias: float = 2e-3
-
-    def deviation(self, node: type[Node]) -> FloatArray:
-        """Standard deviations of a pose's deviations, see `deviation_names`; pulls are free."""
-        turn = self.heading if node.increment == 1 else self.rotation
-        sizes = (self.end, turn, np.inf)
-        counts = (node.dimension, 2 * node.increment, node.dimension)
-        return np.repeat(sizes, counts)
-
-
-@dataclass(frozen=True)
-class Values:
-    """Unknowns and shapes, in equilibrium or not.
-
-    Parameters
-    ----------
-    theta : (size,)
-    shapes : Shapes
-    feet : list of (K_j,) [m]
-        Arc lengths at which the fitted poses' points are compared.
-    """
-
-    theta: FloatArray
-    shapes: Shapes
-    feet: list[FloatArray]
-
-
-@dataclass(frozen=True)
-class Point(Values):
-    """Everything at one value of the unknowns.
-
-    Parameters
-    ----------
-    objective : float
-        Half the sum of squares, priors included.
-    data : float
-        Sum of squares of the whitened residuals alone.
-    residuals : list of (R_j,)
-        These, whitened, of the fitted poses.
-    """
-
-    objective: float
-    data: float
-    residuals: list[FloatArray]
-
-
-@dataclass(frozen=True)
-class Linearization:
-    """Residuals and Jacobians of the data at a point.
-
-    Parameters
-    ----------
-    residuals : list of (R_j,)
-        Whitened residuals of the sensors, measured minus model.
-    by_theta : list of (R_j, size)
-        Derivative of the residuals.
-    by_deviation : list of (R_j, n_deviations)
-    raw : list of (R_j,)
-        Residuals, not whitened.
-    raw_directions : list of (R_j, size + n_deviations)
-        Their derivatives, not whitened.
-    shapes : Directions
-        Derivatives of the equilibria, by the unknowns and by each pose's deviations.
-    """
-
-    residuals: list[FloatArray]
-    by_theta: list[FloatArray]
-    by_deviation: list[FloatArray]
-    raw: list[FloatArray]
-    raw_directions: list[FloatArray]
-    shapes: Directions
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Normal equations with the deviations eliminated: hessian @ step = -gradient."""
-
-    hessian: FloatArray
-    gradient: FloatArray
-    inner: list[tuple[FloatArray, FloatArray, FloatArray]]
 
 
 class BatchProblem:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Linearization, Point
+from dlo_casadi.estimation.gauss_newton import BatchProblem
+from dlo_casadi.estimation.linearization import Linearization, Point
 from dlo_casadi.estimation.noise import (
     NoiseModel,
     NoiseSample,

@@ -10,13 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
-from dlo_casadi.estimation.gauss_newton import (
-    NO_INFORMATION,
-    BatchProblem,
-    Linearization,
-    Normal,
-    Point,
-)
+from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
+from dlo_casadi.estimation.linearization import Linearization, Normal, Point
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.model import CableModel
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from dlo_casadi.assembly import Directions, Shapes
 from dlo_casadi.estimation.chords import line_nodes
-from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem, Point, Values
+from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
+from dlo_casadi.estimation.linearization import Point, Values
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed, ObservedChange
 from dlo_casadi.estimation.sweep import Sweep

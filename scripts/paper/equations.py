@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from dlo_casadi import CableModel, solve_equilibrium
 from dlo_casadi.estimation.algorithm1 import gravity_slopes, run_algorithm1
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.profile import (
     Interval,
     profile_interval,
@@ -19,6 +18,7 @@ from dlo_casadi.estimation.profile import (
     threshold,
 )
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.parallel import map_in_order
 from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from dlo_casadi.session.stages import rest_curvature_of

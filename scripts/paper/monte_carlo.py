@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from dlo_casadi import CableModel, DloError
 from dlo_casadi.assembly import DEVIATIONS, Shapes
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Tolerances
+from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.hyperparameters import settle
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
@@ -28,6 +28,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.parallel import generator_of, map_as_completed
 from dlo_casadi.report.canvas import BLACK, BLUE

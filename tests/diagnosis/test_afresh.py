@@ -11,9 +11,9 @@ from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.confirm import screened_afresh
 from dlo_casadi.effects import BendingAnisotropy, Cable
 from dlo_casadi.estimation.fit import fit_model, fitted_closely
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose

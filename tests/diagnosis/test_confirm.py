@@ -12,9 +12,9 @@ from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.search import _drop
 from dlo_casadi.effects import Cable, LumpedMass, UnknownPull
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 

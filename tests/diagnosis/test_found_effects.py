@@ -15,9 +15,9 @@ from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.pull import Pull
 from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.declared import nuisances

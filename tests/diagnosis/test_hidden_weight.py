@@ -8,9 +8,9 @@ from dlo_casadi.diagnosis.equivalents import equivalents
 from dlo_casadi.diagnosis.hidden_weight import hidden_weight
 from dlo_casadi.effects import EFFECTS, Cable, LumpedMass
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.remarks import weight_warning

@@ -7,10 +7,10 @@ import pytest
 
 from dlo_casadi.diagnosis.next_pose import _separation, next_reading
 from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.pose import Pose
 from dlo_casadi.rod.node import Heading
 

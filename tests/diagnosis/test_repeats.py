@@ -11,9 +11,9 @@ from dlo_casadi.diagnosis.repeatability import limiting_spread
 from dlo_casadi.diagnosis.selection import improving
 from dlo_casadi.effects import Cable
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 

@@ -11,10 +11,10 @@ from dlo_casadi.diagnosis.selection import p_with_closed_noise
 from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.profile import threshold
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.declared import nuisances
 from dlo_casadi.session.remarks import fit_warnings

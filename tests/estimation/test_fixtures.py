@@ -7,10 +7,10 @@ import pytest
 
 from dlo_casadi.effects import Cable
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.remarks import fit_warnings

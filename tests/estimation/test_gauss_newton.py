@@ -23,11 +23,13 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Point, Tolerances
+from dlo_casadi.estimation.gauss_newton import BatchProblem
+from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose

@@ -10,11 +10,11 @@ from dlo_casadi.effects import Cable, SensorBias, Setup, StartSpring
 from dlo_casadi.ends import REACTIONS, reaction_rows
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sensors import Observed
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.solve import solve_equilibrium

@@ -5,11 +5,12 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.composition import END_ROLL, STIFFNESSES
 from dlo_casadi.effects import Cable
-from dlo_casadi.estimation.gauss_newton import BatchProblem, Tolerances
+from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way, twists
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose

@@ -10,9 +10,9 @@ import numpy as np
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import Cable
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.session import run_session

@@ -8,13 +8,13 @@ import pytest
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import Cable
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import Tolerances
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import (
     measured_branches,
     predict_poses,
     predicted_shapes,
 )
+from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.outcome import PoseInput
