@@ -19,7 +19,8 @@ from dlo_casadi.session.outcome import Outcome, Stage, StageName
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 BLACK, GREY = "#000000", "#6B6B6B"
 ORANGE, SKY, GREEN = "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
+BLUE, VERMILLION = "#0072B2", "#D55E00"
+HELD_OUT = "#CC79A7"  # poses that no fit saw
 
 STAGE_LABELS: dict[StageName, str] = {
     "initial": "initial guess",

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dlo_casadi.report.canvas import BLACK, BLUE, PURPLE, label_of, styled
+from dlo_casadi.report.canvas import BLACK, BLUE, HELD_OUT, label_of, styled
 from dlo_casadi.report.figures_room import draw_marks, frame_room
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.room import seen
@@ -59,7 +59,7 @@ def outcome_figure(outcome: Outcome) -> Figure:
             return points if room is None else seen(room.points(points))
 
         for pose in outcome.poses:
-            color = PURPLE if pose.role == "held_out" else BLUE
+            color = HELD_OUT if pose.role == "held_out" else BLUE
             shape = stage.shapes.get(pose.name)
             if shape is not None:
                 axes.plot(*place(shape.curve).T, color=color, lw=1.4)
@@ -69,7 +69,7 @@ def outcome_figure(outcome: Outcome) -> Figure:
         axes.plot([], [], ".", color=BLACK, label="measured")
         axes.plot([], [], color=BLUE, label=label_of(stage, outcome))
         if any(pose.role == "held_out" for pose in outcome.poses):
-            axes.plot([], [], color=PURPLE, label="held out of the fit")
+            axes.plot([], [], color=HELD_OUT, label="held out of the fit")
         if room is not None:
             frame_room(axes, room)
         else:

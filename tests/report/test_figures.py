@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dlo_casadi.report import figures, overlay
+from dlo_casadi.report import figures, figures_poses, overlay
 from dlo_casadi.report.canvas import before_after, label_of
 from dlo_casadi.report.drawing import draw_prediction
 from dlo_casadi.report.geometry import magnified
@@ -91,7 +91,7 @@ def test_nothing_is_drawn_of_what_is_missing(outcome, tmp_path):
     lost = replace(outcome.poses[0], points=np.zeros((0, 2)), problem="no cable")
     empty = replace(outcome.stages[0], rmse_fit=None, rmse_held_out=None, shapes={})
     half = replace(outcome, poses=(lost, *outcome.poses[1:3]), stages=(empty, *outcome.stages[1:]))
-    figures.draw_poses(tmp_path, half)
+    figures_poses.draw_poses(tmp_path, half)
     figures.draw_residuals(tmp_path / "residuals.png", half)
     figures.draw_errors(tmp_path / "errors.png", half)
 
@@ -107,8 +107,8 @@ def test_stages_without_any_prediction_have_no_residuals(outcome, tmp_path):
 
 
 def test_many_poses_take_several_pages(outcome, tmp_path, monkeypatch):
-    monkeypatch.setattr(figures, "_POSES_A_PAGE", 8)
-    figures.draw_poses(tmp_path, outcome)
+    monkeypatch.setattr(figures_poses, "_POSES_A_PAGE", 8)
+    figures_poses.draw_poses(tmp_path, outcome)
 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["poses_1.png", "poses_2.png"]
 
@@ -117,7 +117,7 @@ def test_many_poses_take_several_pages(outcome, tmp_path, monkeypatch):
     ("count", "grid"), [(1, (1, 1)), (4, (1, 4)), (6, (2, 3)), (12, (3, 4)), (18, (3, 6))]
 )
 def test_poses_fill_a_grid(count, grid):
-    assert figures._arranged(count) == grid
+    assert figures_poses._arranged(count) == grid
 
 
 def test_magnified_deviations_are_multiples_of_the_true_ones(outcome):
@@ -193,6 +193,6 @@ def test_readings_are_drawn_beside_predicted_ones(outcome, tmp_path):
     """Residuals over their noise, and arrows of one scale at the ends."""
     shown = with_readings(outcome)
     figures.draw_readings(tmp_path / "readings.png", shown)
-    figures.draw_poses(tmp_path, shown)
+    figures_poses.draw_poses(tmp_path, shown)
     assert imread(tmp_path / "readings.png").shape[2] == 4
     assert (tmp_path / "poses.png").is_file()
