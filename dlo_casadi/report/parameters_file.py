@@ -1,13 +1,12 @@
 """parameters.yaml: a fitted cable, complete enough to compute with (schema "dlo-parameters/1").
 
-Prediction, code generation and comparisons of cables read nothing else.
+Prediction, code generation and comparisons of cables read nothing else. Its text is made in
+`parameters_text`.
 """
 
 from __future__ import annotations
 
 import difflib
-import hashlib
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -18,14 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dlo_casadi.composition import STIFFNESSES
 from dlo_casadi.config import (
     MESH,
     REST_COEFFICIENTS,
-    Config,
     Place,
     Range,
-    dump_yaml,
     implausible_gravity,
     implausible_sizes,
     read_document,
@@ -35,25 +31,20 @@ from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.band import Uncertainty
 from dlo_casadi.estimation.rest_scatter import RestScatter
-from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model import CableModel
 from dlo_casadi.parameters import Parameter
-from dlo_casadi.report.json_report import finite
+from dlo_casadi.report.parameters_text import SCHEMA, final_rest, parameters_dict, parameters_hash
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.session.outcome import Outcome
 
 FloatArray = NDArray[np.floating]
-
-SCHEMA = "dlo-parameters/1"
 FILE = "parameters.yaml"
 # A value at a bound may miss it by so much of the bound, or of the parameter's scale: rounding of
 # value = nominal + scale x, or exp(x), some 1e-14; and what solvers leave of a bound.
 _ROUNDING = 1e-9
 # Folders of results that a message lists.
 _LISTED = 5
-# What a prediction depends on beside the values of the parameters.
-_MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
 
 
 @dataclass(frozen=True)
@@ -143,163 +134,6 @@ class Parameters(NamedTuple):
     def document(self) -> dict[str, Any]:
         """The whole file."""
         return self.metadata.document
-
-
-# ---- writing -----------------------------------------------------------------------------------
-
-
-def parameters_text(outcome: Outcome) -> str:
-    """The text of parameters.yaml: equal results, equal bytes."""
-    head = (
-        f"# {outcome.config.cable.name}: parameters fitted by dlo_casadi. SI units: m, kg, s, N, "
-        "rad.\n# null: a bound or an end of an interval that does not exist. fitted: false: as "
-        "declared.\n"
-    )
-    return head + dump_yaml(parameters_dict(outcome))
-
-
-def parameters_dict(outcome: Outcome) -> dict[str, Any]:
-    """Everything that parameters.yaml holds, as plain data."""
-    config = outcome.config
-    document = fit_dict(outcome.fit)
-    for name in STIFFNESSES:
-        stiffness = outcome.stages[-1].parameters.get(name)
-        if stiffness is not None:
-            document["parameters"][name] |= {
-                "interval_95": finite(stiffness.interval_95),
-                "identifiable": stiffness.identifiable,
-            }
-    if config.cable.youngs_modulus is not None:
-        document["cable"]["youngs_modulus"] = config.cable.youngs_modulus
-    document["fixtures"] = shared_fixtures(config)
-    document["model_hash"] = parameters_hash(document)
-    document["config"] = config.name
-    document["config_hash"] = _file_hash(config.path)
-    document["versions"] = dict(outcome.versions)
-    return document
-
-
-def fit_dict(fit: Fit) -> dict[str, Any]:
-    """What a fit alone tells: the model, its parameters, covariance and state."""
-    model = fit.model
-    names, covariance = fit.named_covariance
-    uncertainty = Uncertainty.of(fit)
-    document: dict[str, Any] = {
-        "schema": SCHEMA,
-        "cable": {
-            "name": model.cable.name,
-            "length": model.cable.length,
-            "mass": model.cable.mass,
-            "diameter": model.cable.diameter,
-            "bending_stiffness": model.cable.bending_stiffness,
-            **({"torsional_stiffness": model.cable.torsional_stiffness} if model.in_space else {}),
-            "rest_shape": "straight" if model.cable.straight else "curved",
-        },
-        "boundary": {"start": model.start, "end": model.end},
-        "gravity": list(model.gravity),
-        "element": model.element,
-        "n": model.n,
-        "n_rest": model.n_rest,
-        "effects": [_effect_row(effect) for effect in model.effects],
-        "parameters": {
-            q.name: {
-                "value": float(value),
-                "std": fit.std(q.name),
-                "unit": q.unit,
-                "lower": q.lower,
-                "upper": q.upper,
-                "fitted": q.name in names,
-                # Standard deviation of the prior of what is known within a tolerance.
-                "tolerance": model.priors.get(q.name),
-            }
-            for q, value in zip(model.parameters, fit.p, strict=True)
-        },
-        "rest_curvature": {
-            "coefficients": _by_name(fit.coefficients, model.node.curvatures),
-            "unit": "1/m",
-            "basis": "cubic B-splines on clamped uniform knots over [0, length]",
-        },
-        "state": {
-            "rest_curvature": _by_name(final_rest(fit), model.node.strains),
-            "unit": "1/m",
-            "of": "cells, last pose done",
-        },
-        "covariance": {"names": list(names), "values": covariance},
-        "scatter": {
-            "fixtures": dict(uncertainty.scatter),
-            "rest_curvature_std": uncertainty.rest_scatter.std,
-            "rest_curvature_smoothness": uncertainty.rest_scatter.smoothness,
-        },
-    }
-    plain: dict[str, Any] = finite(document)
-    return plain
-
-
-def parameters_hash(document: Mapping[str, Any]) -> str:
-    """SHA-256 of what determines predictions; bounds and standard deviations do not.
-
-    It stands in the file as `model_hash`. A generated solver has its own: `codegen.solver_hash`.
-    """
-    content = {key: document[key] for key in _MODEL_KEYS}
-    content["values"] = {key: row["value"] for key, row in document["parameters"].items()}
-    content["coefficients"] = document["rest_curvature"]["coefficients"]
-    text = json.dumps(_as_floats(content), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def final_rest(fit: Fit) -> FloatArray:
-    """Rest curvature (n_rests,) [1/m] that the session's last pose leaves behind."""
-    if not fit.model.has_state:
-        return fit.rest
-    return fit.problem.sweep.rest_after_last(fit.point.shapes, fit.p, fit.rest)
-
-
-def _by_name(values: FloatArray, names: Sequence[str]) -> Any:
-    """Curvatures as they are in a plane; in space components of the strain by their names."""
-    if len(names) == 1:
-        return values
-    return dict(zip(names, values.reshape(len(names), -1), strict=True))
-
-
-def _effect_row(effect: Effect) -> dict[str, Any]:
-    """Name and label of an effect, and what else it was made with."""
-    if known_effect(effect.name) is not type(effect):
-        raise DloError(f"the effect {effect.name!r} cannot be written to parameters.yaml")
-    options = {
-        item.name: getattr(effect, item.name) for item in fields(effect) if item.name != "label"
-    }
-    return {"name": effect.name, "label": effect.label, **options}
-
-
-def shared_fixtures(config: Config) -> dict[str, Any]:
-    """What all poses share of their start and of the directions of clamps."""
-    shared: dict[str, Any] = {}
-    direction = "orientation" if config.experiment.in_space else "heading"
-    for key in ("start", f"start_{direction}", f"end_{direction}"):
-        values = {getattr(pose, key) for pose in config.experiment.poses}
-        shared[key] = finite(values.pop()) if len(values) == 1 else None
-    return shared
-
-
-def _file_hash(path: Path) -> str | None:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        return None
-
-
-def _as_floats(data: Any) -> Any:
-    """Every number as a float: 1 and 1.0 are the same model."""
-    if isinstance(data, Mapping):
-        return {str(key): _as_floats(value) for key, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [_as_floats(value) for value in data]
-    if isinstance(data, int) and not isinstance(data, bool):
-        return float(data)
-    return data
-
-
-# ---- reading -----------------------------------------------------------------------------------
 
 
 def load_parameters(path: str | Path) -> Parameters:

@@ -16,7 +16,7 @@ from dlo_casadi.report.figures import write_figures
 from dlo_casadi.report.json_report import report_text
 from dlo_casadi.report.page import GENERATOR, report_page
 from dlo_casadi.report.page_failure import write_failure_page
-from dlo_casadi.report.parameters_file import parameters_text
+from dlo_casadi.report.parameters_text import parameters_text
 from dlo_casadi.session.outcome import Outcome
 
 # What a run writes; nothing else in the folder is ever touched.

@@ -22,7 +22,7 @@ from dlo_casadi.model import CableModel
 from dlo_casadi.parallel import open_executor
 from dlo_casadi.pose import Pose
 from dlo_casadi.prediction import predict
-from dlo_casadi.report.parameters_file import parameters_text
+from dlo_casadi.report.parameters_text import parameters_text
 from dlo_casadi.session import run_session
 from dlo_casadi.shape_table import Grid, Plan, PoseList, shape_table, solve
 from dlo_casadi.solve import solve_equilibrium

@@ -16,13 +16,8 @@ from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.prediction import predict
-from dlo_casadi.report.parameters_file import (
-    final_rest,
-    fit_dict,
-    load_parameters,
-    parameters_hash,
-    parameters_text,
-)
+from dlo_casadi.report.parameters_file import load_parameters
+from dlo_casadi.report.parameters_text import final_rest, fit_dict, parameters_hash, parameters_text
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import solved_by_ipopt
 from dlo_casadi.session.measure import read_poses
