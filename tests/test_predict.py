@@ -15,7 +15,8 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.prediction import predict
-from dlo_casadi.report import parameters_file
+from dlo_casadi.report.parameters_file import load_parameters
+from dlo_casadi.report.parameters_text import fit_dict, parameters_hash, shared_fixtures
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import read_poses
 
@@ -30,9 +31,9 @@ def results(path, folder, n=20):
     declared = declared_model(config)
     model = declared.model.with_mesh(n)
     fit = fit_model(model, measured[:4], declared.tolerances, 3e-4, decades=(0,))
-    document = parameters_file.fit_dict(fit)
-    document["fixtures"] = parameters_file.shared_fixtures(config)
-    document["model_hash"] = parameters_file.parameters_hash(document)
+    document = fit_dict(fit)
+    document["fixtures"] = shared_fixtures(config)
+    document["model_hash"] = parameters_hash(document)
     folder.mkdir(parents=True)
     (folder / "parameters.yaml").write_text(dump_yaml(document))
     return folder / "parameters.yaml"
@@ -77,7 +78,7 @@ def test_reactions_carry_the_weight(pinned):
 def test_the_reaction_is_the_slope_of_the_energy(pinned):
     """-lam = dV/d(end), by central differences of step h: error of order h^2."""
     h, end = 1e-4, np.array([0.3, -0.1])
-    cable = parameters_file.load_parameters(pinned)
+    cable = load_parameters(pinned)
     slope = [
         (
             predict(cable, end + step).equilibrium.energy
@@ -208,7 +209,7 @@ def test_a_cable_in_space_leaves_its_grippers_along_their_axes(loom):
 
 def test_the_reaction_in_space_is_the_slope_of_the_energy(loom):
     """-lam = dV/d(end), by central differences of step h: error of order h^2."""
-    h, cable = 1e-4, parameters_file.load_parameters(loom)
+    h, cable = 1e-4, load_parameters(loom)
 
     def energy(step):
         moved = np.add(IN_SPACE["end"], step)
