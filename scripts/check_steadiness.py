@@ -100,8 +100,10 @@ def variants(
     if "poses" in changes:
         fitted = [k for k, pose in enumerate(experiment.poses) if pose.role == "fit"]
         for k in fitted[:: -(-len(fitted) // poses)]:
-            left = [pose for i, pose in enumerate(experiment.poses) if i != k]
-            yield f"without {experiment.poses[k].name}", changed(poses=tuple(left))
+            # It was held all the same: what it leaves behind is there in the poses after it.
+            out = list(experiment.poses)
+            out[k] = out[k].model_copy(update={"role": "held_out"})
+            yield f"without {out[k].name}", changed(poses=tuple(out))
 
 
 def run(config: Config) -> Row:

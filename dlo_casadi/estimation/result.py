@@ -14,6 +14,7 @@ from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
 from dlo_casadi.estimation.linearization import Linearization, Normal, Point
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.model import CableModel
+from dlo_casadi.thresholds import LEAST_NOISE_DEGREES
 
 FloatArray = NDArray[np.floating]
 
@@ -136,7 +137,7 @@ class Fit:
             1 / degrees = sum_c (v_c / v)^2 / degrees_c
 
         of the parts v_c that the noise and the rest curvature of each hanging's own have in it,
-        degrees_c those of their sizes; inf where both are declared.
+        degrees_c those of their sizes; at least LEAST_NOISE_DEGREES, inf where both are declared.
 
         References
         ----------
@@ -157,7 +158,7 @@ class Fit:
                 hangings += float(((by_errors @ way * sizes) ** 2).sum())
         known = np.inf if self.noise.known else self.noise.slow_dof
         parts = ((errors - hangings) ** 2 / known + hangings**2 / rest.dof) / column[index] ** 2
-        return float(1 / parts) if parts > 0 else np.inf
+        return max(LEAST_NOISE_DEGREES, 1 / parts) if parts > 0 else np.inf
 
     @property
     def degrees_of_freedom(self) -> float:
