@@ -2,7 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 from dlo_casadi.session.outcome import Outcome
+
+
+def asked(doc: str) -> tuple[Path, Path, list[str]]:
+    """Folder of sessions, folder of truths, and names, as asked for on the command line."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    parser.add_argument("sessions", type=Path, help="folders with a session.yaml")
+    parser.add_argument("truths", type=Path, help="folders of the same names with a truth.yaml")
+    parser.add_argument("names", nargs="*", help="sessions; all by default")
+    given = parser.parse_args()
+    found = sorted(path.parent.name for path in given.sessions.glob("*/session.yaml"))
+    if lost := set(given.names) - set(found) or ({"session.yaml"} if not found else set()):
+        parser.error(f"no {', '.join(sorted(lost))} in {given.sessions}")
+    return given.sessions, given.truths, given.names or found
 
 
 def stiffness_cell(outcome: Outcome, name: str, exact: float) -> tuple[str, bool]:

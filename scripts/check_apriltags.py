@@ -12,6 +12,7 @@ Exit code 1 if an interval is told that the shape cannot bear: here, any.
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from pathlib import Path
@@ -88,8 +89,10 @@ def session(wire: str, tags: FloatArray) -> tuple[dict[str, Any], float]:
 
 def main() -> int:
     """Fit each shape, print what it tells."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("tags", type=Path, help="tags.csv")
     told = 0
-    for (wire, test), tags in shapes(Path(sys.argv[1])).items():
+    for (wire, test), tags in shapes(parser.parse_args().tags).items():
         document, scatter = session(wire, tags)
         with TemporaryDirectory() as folder:
             header = "x_m,y_m,z_m"

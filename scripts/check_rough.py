@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
-from beside_truth import stiffness_cell
+from beside_truth import asked, stiffness_cell
 
 from dlo_casadi.config import load_config
 from dlo_casadi.session import run_session
@@ -84,8 +83,7 @@ def row(outcome: Outcome, truth: dict[str, Any]) -> tuple[list[str], bool]:
 
 def main() -> int:
     """Print the table; 1 if anything in it is not as it should be."""
-    sessions, truths = Path(sys.argv[1]), Path(sys.argv[2])
-    names = sys.argv[3:] or sorted(path.parent.name for path in sessions.glob("*/session.yaml"))
+    sessions, truths, names = asked(__doc__)
     print(
         "session | verdict | effect | EI [N m^2] | held out [mm] | two hangings [mm] | noise [mm] "
         "| in 90 % band |"

@@ -23,7 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
-from beside_truth import stiffness_cell
+from beside_truth import asked, stiffness_cell
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
@@ -117,8 +117,7 @@ def by_role(outcome: Outcome, squares: dict[str, float]) -> list[float]:
 
 def main() -> int:
     """Print the table; 1 if anything in it is not as it should be."""
-    sessions, truths = Path(sys.argv[1]), Path(sys.argv[2])
-    names = sys.argv[3:] or sorted(path.parent.name for path in sessions.glob("*/session.yaml"))
+    sessions, truths, names = asked(__doc__)
     print(
         "session | verdict | effects | EI [N m^2] | GJ [N m^2] | fit, held out [mm] | "
         "off the truth (were all parameters true) [mm] | noise | s |"

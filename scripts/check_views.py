@@ -10,8 +10,8 @@ the same photographs, beside the declared one.
 
 from __future__ import annotations
 
+import argparse
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -41,8 +41,11 @@ def compare(line: vision.SpaceLine, truth: np.ndarray) -> str:
 
 def main() -> None:
     """Print the table."""
-    path = Path(sys.argv[1])
-    truth = np.load(sys.argv[2]) if len(sys.argv) > 2 else {}
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("session", type=Path, help="a session.yaml with photographs")
+    parser.add_argument("truth", type=Path, nargs="?", help="points along the true curves, .npz")
+    given = parser.parse_args()
+    path, truth = given.session, np.load(given.truth) if given.truth else {}
     document = yaml.safe_load(path.read_text())
     cable, experiment = document["cable"], document["experiment"]
     declared = experiment["measurement"]
