@@ -97,8 +97,8 @@ def variants(
         if "mesh" in changes:
             n = max(2 * round(factor * base.n / 2), 4)
             yield f"{n} elements", replace(config, model=config.model.model_copy(update={"n": n}))
-    if "poses" in changes:
-        fitted = [k for k, pose in enumerate(experiment.poses) if pose.role == "fit"]
+    fitted = [k for k, pose in enumerate(experiment.poses) if pose.role == "fit"]
+    if "poses" in changes and len(fitted) > 1:
         for k in fitted[:: -(-len(fitted) // poses)]:
             # It was held all the same: what it leaves behind is there in the poses after it.
             out = list(experiment.poses)

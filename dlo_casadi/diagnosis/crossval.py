@@ -77,8 +77,8 @@ class CrossValidation:
 
     def clearly_worse_than(self, other: CrossValidation) -> bool:
         """Whether the mean paired difference of the folds exceeds its standard error clearly."""
-        if not self.complete:
-            return True
+        if not (self.complete and other.complete):
+            return not self.complete
         gap = self._excess_over(other)
         if len(gap) < 2:
             return bool(gap.sum() > 0)
@@ -90,8 +90,8 @@ class CrossValidation:
 
         One-sided paired t test over the folds; 1 where there is but one.
         """
-        if not self.complete:
-            return 0.0
+        if not (self.complete and other.complete):
+            return float(self.complete)
         gap = self._excess_over(other)
         if len(gap) < 2:
             return 1.0

@@ -11,11 +11,13 @@ from scipy.special import ndtri
 
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.estimation.repeats import different_poses, repeatability_across
 from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
+from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
 
@@ -37,12 +39,16 @@ class Uncertainty:
     scatter : mapping of str to float
         Standard deviation of where each fixture is, pose by pose, by the deviation's name.
     rest_scatter : RestScatter
+    hanging : float [m]
+        Standard deviation of a coordinate, root mean square along the cable, of what differs
+        between hangings of a pose that was taken again and again; 0 where none was.
     """
 
     names: tuple[str, ...]
     covariance: FloatArray
     scatter: Mapping[str, float]
     rest_scatter: RestScatter
+    hanging: float = 0.0
 
     @classmethod
     def of(cls, fit: Fit) -> Uncertainty:
@@ -50,7 +56,21 @@ class Uncertainty:
         names, covariance = fit.named_covariance
         used = [fit.model.deviation_names[k] for k in fit.problem.sweep.used_deviations]
         scatter = dict(zip(used, map(float, fit.problem.deviation_std), strict=True))
-        return cls(names, covariance, scatter, fit.problem.rest_scatter)
+        return cls(names, covariance, scatter, fit.problem.rest_scatter, _hanging(fit))
+
+
+def _hanging(fit: Fit) -> float:
+    """How far hangings of a pose differ beyond the noise of their points, see `Uncertainty`.
+
+    From the mean of the others, so that what few of them leave unknown of that mean is in it.
+    Where many poses differ, the rest curvature of each hanging's own tells it.
+    """
+    length = fit.model.cable.length
+    if different_poses(fit.problem.history, length) >= DIFFERENT:
+        return 0.0
+    across = repeatability_across(fit.problem.history, length) or 0.0
+    noise = 0.0 if fit.noise.source == "repeats" else fit.noise.std
+    return float(np.sqrt(max(across**2 - noise**2, 0.0)))
 
 
 def spread_across(
@@ -65,8 +85,8 @@ def spread_across(
     """Standard deviation (K, d - 1) [m] across the cable of the next hanging, at places s [m].
 
     First order: the fitted parameters' covariance, the fixtures' scatter and the rest curvature
-    of each hanging's own, carried to the shape by the equilibrium. The noise of a measurement
-    comes on top.
+    of each hanging's own, carried to the shape by the equilibrium; what repeats of one pose differ
+    by, the same all along. The noise of a measurement comes on top.
     """
     sweep = Sweep(model, [pose])
     shapes, size = found.shapes, len(uncertainty.names)
@@ -95,4 +115,5 @@ def spread_across(
         hanging = sweep.observe(shapes, p, rest, sweep.by_rest(shapes, p, rest, modes))
         sizes = np.tile(uncertainty.rest_scatter.sizes, modes.shape[1] // MODES)
         variance += ((across(hanging.slopes[0]) * sizes) ** 2).sum(axis=2)
+    variance += uncertainty.hanging**2
     return np.sqrt(np.maximum(variance, 0.0))

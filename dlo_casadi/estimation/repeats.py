@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,14 +31,32 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
 
     The floor of any prediction of the next one; None where no pose was taken twice.
     """
-    grid = np.linspace(_BESIDE_FIXTURES, 1 - _BESIDE_FIXTURES, 97) * length
+    squares = [(gaps**2).sum(axis=2).mean(axis=1) for gaps, _ in _gaps(measured, length)]
+    return float(np.sqrt(np.concatenate(squares).mean())) if squares else None
+
+
+def repeatability_across(measured: Sequence[MeasuredPose], length: float) -> float | None:
+    """RMS of a coordinate [m] across the cable of what `repeatability` is the distance of."""
     squares = []
+    for gaps, tangents in _gaps(measured, length):
+        across = (gaps**2).sum(axis=2) - (gaps * tangents).sum(axis=2) ** 2
+        squares.append(across.mean(axis=1) / (gaps.shape[2] - 1))
+    return float(np.sqrt(np.concatenate(squares).mean())) if squares else None
+
+
+def _gaps(
+    measured: Sequence[MeasuredPose], length: float
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Of each repeated pose: gaps (m, K, d) from the mean of the others, its tangents (K, d)."""
+    grid = np.linspace(_BESIDE_FIXTURES, 1 - _BESIDE_FIXTURES, 97) * length
     for group in _groups(measured, length):
         curves = np.array([_line(item, grid, length) for item in group])
+        mean = curves.mean(axis=0)
+        slopes = np.gradient(mean, axis=0)
         # From the mean of the others it is m / (m - 1) times as far as from the mean of all.
-        gaps = (curves - curves.mean(axis=0)) * len(group) / (len(group) - 1)
-        squares += list((gaps**2).sum(axis=2).mean(axis=1))
-    return float(np.sqrt(np.mean(squares))) if squares else None
+        gaps = (curves - mean) * len(group) / (len(group) - 1)
+        # Beyond the points of a line its end stands still.
+        yield gaps, slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-300)
 
 
 def different_poses(measured: Sequence[MeasuredPose], length: float) -> int:

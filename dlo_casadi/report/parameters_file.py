@@ -275,12 +275,13 @@ def _metadata(document: dict[str, Any], source: Path) -> Metadata:
         float(scatter.get("rest_curvature_std", 0.0)),
         float(scatter.get("rest_curvature_smoothness", RestScatter().smoothness)),
     )
+    hanging = float(scatter.get("hanging", 0.0))
     fixtures = {name: float(std or 0.0) for name, std in scatter.get("fixtures", {}).items()}
     return Metadata(
         path=source,
         names=names,
         covariance=covariance,
-        uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter),
+        uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter, hanging),
         std={name: float(row.get("std") or 0.0) for name, row in rows.items()},
         coefficients=_stacked(
             document["rest_curvature"]["coefficients"], Frame.curvatures, "rest_curvature"

@@ -431,11 +431,13 @@ class Outcome:
         None without held-out points.
         """
         stage, inside = self.stages[-1], []
+        # How hangings of one pose differ is in the band.
+        noise = 0.0 if self.fit.noise.source == "repeats" else self.measurement.std
         for pose in self.poses:
             shape = stage.shapes.get(pose.name)
             if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:
                 continue
-            std = shape.expected(self.fit.model.cable.length, self.measurement.std)
+            std = shape.expected(self.fit.model.cable.length, noise)
             score = ((shape.residual / std) ** 2).reshape((len(std), -1)).sum(axis=1)
             inside.append(score <= chdtri(std.size // len(std), 1 - COVERED))
         return float(np.concatenate(inside).mean()) if inside else None

@@ -10,7 +10,12 @@ from dlo_casadi.config import load_config
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
-from dlo_casadi.estimation.repeats import different_poses, repeatability, with_repeats
+from dlo_casadi.estimation.repeats import (
+    different_poses,
+    repeatability,
+    repeatability_across,
+    with_repeats,
+)
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
@@ -44,6 +49,8 @@ def test_repeats_tell_size_and_correlation():
     assert found.length == pytest.approx(truth.length, rel=0.3)
     # From the mean of the others: sqrt(1 + 1 / 15).
     assert repeatability(measured, LENGTH) == pytest.approx(truth.std * 1.033, rel=0.3)
+    # Nothing differs along the line.
+    assert repeatability_across(measured, LENGTH) == pytest.approx(truth.std * 1.033, rel=0.3)
 
     # The same elsewhere, and nearly the same: ends 0.5 mm apart, of a cable of 1 m.
     moved = []
