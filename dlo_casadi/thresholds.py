@@ -18,7 +18,7 @@ COLLINEAR = 1e-7
 # many of them count as one.
 SCANS_PER_TEST = 3
 # An estimate of the noise counts as having at least so many degrees of freedom: up to there F has
-# no variance.
+# no variance. Student's t is 2.8 then, so that of less known noise intervals are too short.
 LEAST_NOISE_DEGREES = 4.0
 # Directions of the residual that keep less than this share of the noise's variance are the fit's
 # own. Measured, a share of 0.001 or of 0.2 moves p in a complete session by less than 0.03.

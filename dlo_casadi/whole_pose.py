@@ -105,16 +105,16 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     c, d = chain.kind.node.coordinates, chain.kind.node.dimension
     arguments = _slot_arguments(model, s)
     steps = [model.slot_curve(*arguments[j]) for j in layout.advancing]
-    ratios = [step[d] for step in steps]
-    ratios = [
-        ratios[0],
-        *((a + b) / 2 for a, b in pairwise(ratios)),
-        ratios[-1],
+    rates = [step[d:] for step in steps]
+    rates = [
+        rates[0],
+        *((a + b) / 2 for a, b in pairwise(rates)),
+        rates[-1],
     ]
     point, rows = s.pose[:d], []
     for i, (first, last) in enumerate(layout.stations):
         both = ca.vertcat(s.x[first * c : (first + 1) * c], s.x[last * c : (last + 1) * c])
-        rows.append(model.station(point, ratios[i], both, s.p, s.pose))
+        rows.append(model.station(point, rates[i], both, s.p, s.pose))
         if i < chain.n:
             point = point + steps[i][:d]
     return ca.vertcat(*rows)

@@ -41,8 +41,11 @@ def floor(measured, k: int, length: float) -> float:
 def main() -> None:
     """Leave each trial out, print the errors of the stages."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", choices=[*WIRES, []], metavar="wire")
-    for name in parser.parse_args().names or WIRES:
+    parser.add_argument("names", nargs="*", help=", ".join(WIRES))
+    names = parser.parse_args().names or WIRES
+    if lost := set(names) - set(WIRES):
+        parser.error(f"no {', '.join(sorted(lost))}: try {', '.join(WIRES)}")
+    for name in names:
         config = load_config(ROOT / "configs" / f"{name}.yaml")
         _, measured = read_poses(config, lambda *_: None)
         table, inside = [], []
@@ -62,13 +65,15 @@ def main() -> None:
             cells = "  ".join(
                 f"{key} {1e3 * value:6.2f}" for key, value in row.items() if value is not None
             )
-            inside.append(100 * (outcome.inside_band or 0.0))
+            inside.append(100 * (outcome.inside_band or np.nan))
             band = f"{inside[-1]:.0f} % in their band"
             print(f"{name} trial {k} left out [mm]: {cells}  effects {effects}  {band}", flush=True)
         for key in ("floor", "stiffness_only", "batch", "closed"):
             values = [row[key] for row in table if row[key] is not None]
             print(f"{name} mean {key}: {1e3 * np.mean(values):.2f} mm", flush=True)
-        print(f"{name}: {np.mean(inside):.0f} % of left-out points in their 90 % band", flush=True)
+        print(
+            f"{name}: {np.nanmean(inside):.0f} % of left-out points in their 90 % band", flush=True
+        )
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from dlo_casadi.effects import (
     AxialStretch,
     Cable,
     ClampAngle,
+    EdgeBias,
     EndSpring,
     ImageScale,
     LumpedMass,
@@ -22,7 +23,7 @@ from dlo_casadi.whole_pose import PoseSymbols, balance, curve, potential, rest_a
 CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
 # Start, end [m], headings [rad], no camera.
 ENDS = np.array([0.1, 0.2, 0.9, 0.1, 0.2, -0.3, 0.0, 0.0, 0.0])
-EFFECTS = (AxialStretch(), LumpedMass(), RestCurvatureDrift(), ImageScale())
+EFFECTS = (AxialStretch(), LumpedMass(), RestCurvatureDrift(), ImageScale(), EdgeBias())
 ALL = pytest.mark.parametrize("element", ELEMENTS)
 BOUNDARIES = pytest.mark.parametrize(
     "boundary", [("pinned", "pinned"), ("clamped", "clamped"), ("clamped", "free")]
@@ -32,7 +33,8 @@ BOUNDARIES = pytest.mark.parametrize(
 def model_of(element: str, boundary: tuple[str, str]) -> tuple[CableModel, np.ndarray]:
     own = ClampAngle() if boundary[1] == "clamped" else EndSpring()
     model = CableModel(CABLE, 4, element, *boundary, effects=(*EFFECTS, own))
-    return model, np.array([0.02, 0.02, 0.1, 0.5, 0.2, 1.1, 0.3, 0.1])
+    bias = 0.01 * np.arange(1, 9)
+    return model, np.array([0.02, 0.02, 0.1, 0.5, 0.2, 1.1, *bias, 0.3, 0.1])
 
 
 @ALL

@@ -90,8 +90,8 @@ class CrossValidation:
 
         One-sided paired t test over the folds; 1 where there is but one.
         """
-        if not (self.complete and other.complete):
-            return float(self.complete)
+        if not self.complete:
+            return 0.0
         gap = self._excess_over(other)
         if len(gap) < 2:
             return 1.0

@@ -20,8 +20,8 @@ from dlo_casadi.effects import Load
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.profile import student_95
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.thresholds import NORMAL_95
 
 # Weights that are tried in turn, over the cable's own: until one does not fit.
 WEIGHTS = 0.05 * 1.6 ** np.arange(9)
@@ -129,7 +129,7 @@ def _with_weights(fit: Fit, weight: Candidate, place: float) -> Iterator[Fit]:
 
 def _interval(fit: Fit) -> tuple[float, float]:
     value = fit.value(BENDING_STIFFNESS)
-    half = NORMAL_95 * fit.std(BENDING_STIFFNESS) / value
+    half = student_95(fit, BENDING_STIFFNESS) * fit.std(BENDING_STIFFNESS) / value
     return float(value * np.exp(-half)), float(value * np.exp(half))
 
 

@@ -11,7 +11,7 @@ from scipy.special import ndtri
 
 from dlo_casadi.equilibrium import Equilibrium
 from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.repeats import different_poses, repeatability_across
+from dlo_casadi.estimation.repeats import different_poses, hanging_std
 from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
@@ -62,15 +62,14 @@ class Uncertainty:
 def _hanging(fit: Fit) -> float:
     """How far hangings of a pose differ beyond the noise of their points, see `Uncertainty`.
 
-    From the mean of the others, so that what few of them leave unknown of that mean is in it.
-    Where many poses differ, the rest curvature of each hanging's own tells it.
+    Fixtures that hold them differently are in it. Where many poses differ, the rest curvature of
+    each hanging's own tells it.
     """
     length = fit.model.cable.length
     if different_poses(fit.problem.history, length) >= DIFFERENT:
         return 0.0
-    across = repeatability_across(fit.problem.history, length) or 0.0
-    noise = 0.0 if fit.noise.source == "repeats" else fit.noise.std
-    return float(np.sqrt(max(across**2 - noise**2, 0.0)))
+    noise = fit.noise.of_points
+    return hanging_std(fit.problem.history, length, noise.beside_hangings)
 
 
 def spread_across(

@@ -221,6 +221,7 @@ def fit_model(
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every hanging had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
+        noise = fit.noise if std is not None and fit.noise.source == "estimated" else noise
         loose = problem.changed(noise, ROUGHNESS_START, scatter, first)
         near = _found(loose, theta, decades)
         try:

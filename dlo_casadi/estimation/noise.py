@@ -101,6 +101,11 @@ class NoiseModel:
         return self.before if self.before is not None and self.before.known else self
 
     @property
+    def beside_hangings(self) -> float:
+        """Standard deviation [m] beside what hangings of a pose differ by, where that tells it."""
+        return 0.0 if self.source == "repeats" else self.std
+
+    @property
     def white(self) -> float:
         """Standard deviation of the errors that points do not share [m]."""
         return self.std * float(np.sqrt(1 - self.share))

@@ -41,6 +41,11 @@ class Interval:
         return self.high <= IDENTIFIABLE * self.low
 
 
+def student_95(fit: Fit, name: str) -> float:
+    """Standard deviations of a parameter to either end of its 95 % interval."""
+    return float(stdtrit(fit.variance_degrees(name), BELOW_HIGH_END))
+
+
 def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
     """Rise of twice the objective at the ends of a parameter's interval.
 
@@ -57,8 +62,7 @@ def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
         constant[item.on_points] = item.relative_std[item.point_of]
         constant *= SYSTEMATIC_SHARE * fit.noise.std
         square += float(((fit.problem.whitening(j) @ constant) ** 2).sum())
-    student = float(stdtrit(fit.variance_degrees(name), BELOW_HIGH_END))
-    return (student + np.sqrt(square)) ** 2 * fit.inflation**2
+    return (student_95(fit, name) + np.sqrt(square)) ** 2 * fit.inflation**2
 
 
 def profile_intervals(fit: Fit) -> dict[str, Interval]:

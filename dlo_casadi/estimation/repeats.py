@@ -35,13 +35,18 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
     return float(np.sqrt(np.concatenate(squares).mean())) if squares else None
 
 
-def repeatability_across(measured: Sequence[MeasuredPose], length: float) -> float | None:
-    """RMS of a coordinate [m] across the cable of what `repeatability` is the distance of."""
+def hanging_std(measured: Sequence[MeasuredPose], length: float, noise: float) -> float:
+    """RMS of a coordinate [m] across the cable of what hangings of one pose differ by.
+
+    From the mean of the others, as `repeatability`, less the noise of points [m] in both; 0 where
+    no pose was taken twice.
+    """
     squares = []
     for gaps, tangents in _gaps(measured, length):
         across = (gaps**2).sum(axis=2) - (gaps * tangents).sum(axis=2) ** 2
-        squares.append(across.mean(axis=1) / (gaps.shape[2] - 1))
-    return float(np.sqrt(np.concatenate(squares).mean())) if squares else None
+        of_points = noise**2 * len(gaps) / (len(gaps) - 1)
+        squares.append(across.mean(axis=1) / (gaps.shape[2] - 1) - of_points)
+    return float(np.sqrt(max(np.concatenate(squares).mean(), 0.0))) if squares else 0.0
 
 
 def _gaps(
@@ -102,7 +107,12 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     if not tell_of_noise(samples):
         return noise
     found = estimate_noise(samples, length)
-    return replace(found, source="repeats") if found.std > REPEATS_ARE_NOISE * noise.std else noise
+    if found.std <= REPEATS_ARE_NOISE * noise.std:
+        return noise
+    # Of m distances from their mean m - 1 are free.
+    groups = _groups(measured, length)
+    free = 1 - len(groups) / sum(map(len, groups))
+    return replace(found, source="repeats", slow_dof=free * found.slow_dof)
 
 
 def _groups(measured: Sequence[MeasuredPose], length: float) -> list[list[MeasuredPose]]:

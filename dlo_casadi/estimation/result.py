@@ -138,14 +138,13 @@ class Fit:
 
         of the parts v_c that the noise and the rest curvature of each hanging's own have in it,
         degrees_c those of their sizes; at least LEAST_NOISE_DEGREES, inf where both are declared.
+        The fixtures' scatter counts as known.
 
         References
         ----------
         Satterthwaite, Biometrics Bulletin 2 (1946).
         """
         problem, rest = self.problem, self.problem.rest_scatter
-        if self.errors_known:
-            return np.inf
         index = problem.unknowns.names.index(name)
         column = self.covariance[index]
         errors, hangings = 0.0, 0.0
@@ -156,8 +155,9 @@ class Fit:
                 way = problem.whitening(problem.used[k]) @ self._moved_by_rest[k]
                 sizes = np.tile(rest.sizes, way.shape[1] // len(rest.sizes))
                 hangings += float(((by_errors @ way * sizes) ** 2).sum())
-        known = np.inf if self.noise.known else self.noise.slow_dof
-        parts = ((errors - hangings) ** 2 / known + hangings**2 / rest.dof) / column[index] ** 2
+        parts = ((errors - hangings) ** 2 / self.noise.slow_dof + hangings**2 / rest.dof) / column[
+            index
+        ] ** 2
         return max(LEAST_NOISE_DEGREES, 1 / parts) if parts > 0 else np.inf
 
     @property

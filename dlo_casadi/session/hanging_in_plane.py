@@ -97,7 +97,7 @@ def upside_down(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, .
     other = coarse_fit(config, shown, (-x, -y))
     if other is None or not tells_weight(other):
         return ()
-    if 2 * (own.point.objective - other.point.objective) < BIC_APART:
+    if 2 * (other.log_evidence - own.log_evidence) < BIC_APART:
         return ()
     return (
         Suspicion(

@@ -431,8 +431,7 @@ class Outcome:
         None without held-out points.
         """
         stage, inside = self.stages[-1], []
-        # How hangings of one pose differ is in the band.
-        noise = 0.0 if self.fit.noise.source == "repeats" else self.measurement.std
+        noise = self.fit.noise.of_points.beside_hangings
         for pose in self.poses:
             shape = stage.shapes.get(pose.name)
             if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:

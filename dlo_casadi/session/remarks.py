@@ -150,21 +150,15 @@ def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
     return lines
 
 
-def doubts_of(
-    stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit, noise: float
-) -> tuple[str, ...]:
+def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> tuple[str, ...]:
     """Why the numbers of the last stage do not hold, whatever its residual looks like.
 
     Its fit has not converged; or poses are predicted, from their ends alone, worse than UNSEEN
     times what noise, fixtures, parameters and the cable's scatter let expect. Where a cable may
     fall to either side, a pose on the other one is what its scatter lets expect. A pose whose
     equilibrium has no name but the way that led there tells of the model what it tells there.
-
-    Parameters
-    ----------
-    noise : float [m]
     """
-    lines, stage = [], stages[-1]
+    lines, stage, noise = [], stages[-1], fit.noise.of_points.beside_hangings
     if fit.failed:
         lines.append(
             f"the fit of stage {stage.name} has not converged: its numbers are where it stopped, "
@@ -225,11 +219,12 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
         Noise of the points.
     """
     lines = []
-    if declared is not None and fit.noise.source == "estimated":
+    points = fit.noise.of_points
+    if declared is not None and points.source == "estimated":
         lines.append(
-            f"the points scatter by {1e3 * fit.noise.white:.2g} mm about any shape that a cable "
-            f"could take, measurement.std declares {1e3 * declared:.2g} mm: the noise is estimated "
-            f"instead, {1e3 * fit.noise.std:.2g} mm. Try: std: {fit.noise.std:.2g}, or no std"
+            f"the points scatter more about any shape that a cable could take than measurement.std "
+            f"declares, {1e3 * declared:.2g} mm: their noise is estimated instead, "
+            f"{1e3 * points.std:.2g} mm. Try: std: {points.std:.2g}, or no std"
         )
     spread = limiting_spread(fit)
     if spread is not None:

@@ -149,7 +149,7 @@ def fit_session(
 def judged(outcome: Outcome) -> Outcome:
     """An outcome with what is said of its fit, and its verdict if that stands."""
     fit, stages = outcome.fit, outcome.stages
-    doubts = doubts_of(stages, outcome.poses, fit, outcome.measurement.std)
+    doubts = doubts_of(stages, outcome.poses, fit)
     declared = outcome.config.experiment.measurement.std
     said = fit_warnings(fit, outcome.discretization.error, declared)
     said += worse_than_simpler(stages)

@@ -1,6 +1,7 @@
 """Centre-lines of a few points, as somebody clicks them: the noise is still estimated."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from dlo_casadi.session.remarks import fit_warnings
 EI = 0.09  # N m^2
 
 
+@cache
 def fitted(points, poses=8, std=None):
     """Fit of poses, with what lies within the tolerances as nuisances."""
     truth = CableModel(CABLE, 16, n_rest=5)
@@ -65,7 +67,7 @@ def test_a_declared_noise_that_the_points_contradict(points, source):
     assert len(said) == (source == "estimated")
     if said:
         assert fit.noise.std == pytest.approx(STD, rel=0.3)
-        assert "measurement.std declares 0.1 mm" in said[0]
+        assert "measurement.std declares, 0.1 mm" in said[0]
         assert fitted(points, std=STD).noise.source == "declared"
 
 

@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
+from dlo_casadi.estimation.band import Uncertainty, spread_across
 from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
 from dlo_casadi.estimation.repeats import (
     different_poses,
+    hanging_std,
     repeatability,
-    repeatability_across,
     with_repeats,
 )
 from dlo_casadi.pose import Pose
+from dlo_casadi.report.parameters_text import fit_dict
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -49,8 +51,9 @@ def test_repeats_tell_size_and_correlation():
     assert found.length == pytest.approx(truth.length, rel=0.3)
     # From the mean of the others: sqrt(1 + 1 / 15).
     assert repeatability(measured, LENGTH) == pytest.approx(truth.std * 1.033, rel=0.3)
-    # Nothing differs along the line.
-    assert repeatability_across(measured, LENGTH) == pytest.approx(truth.std * 1.033, rel=0.3)
+    # Nothing differs along the line, nor beyond the noise.
+    assert hanging_std(measured, LENGTH, 0.0) == pytest.approx(truth.std * 1.033, rel=0.3)
+    assert hanging_std(measured, LENGTH, truth.std) < truth.std / 2
 
     # The same elsewhere, and nearly the same: ends 0.5 mm apart, of a cable of 1 m.
     moved = []
@@ -96,6 +99,15 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     assert others == [None] * 5
     floor = repeatability([replace(item, held_out=False) for item in measured], 1.5)
     assert rms_distance(predictions, measured, held_out=True) < 1.5 * floor
+    # The band is as wide as hangings differ, of which a distance in a plane has up to two parts.
+    uncertainty = Uncertainty.of(fit)
+    assert floor / 2 < uncertainty.hanging < floor
+    (found,) = (item.equilibrium for item in predictions[left_out : left_out + 1])
+    at = (poses[left_out], found, uncertainty, np.array([0.4, 0.7]))
+    assert np.all(spread_across(fit.model, fit.p, fit.rest, *at) > uncertainty.hanging)
+    assert fit_dict(fit)["scatter"]["hanging"] == uncertainty.hanging
+    # Noise that repeats tell is no declared one.
+    assert np.isfinite(fit.variance_degrees("bending_stiffness"))
 
 
 def test_repeats_of_a_point_each_tell_of_no_noise():
