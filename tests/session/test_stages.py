@@ -103,7 +103,7 @@ def judged(poses, fit):
         PoseInput(item.pose.name, "held_out" if item.held_out else "fit", item.points)
         for item in poses
     ]
-    return stage, doubts_of([stage], shown, fit, fit.noise.std)
+    return stage, doubts_of([stage], shown, fit)
 
 
 @pytest.mark.parametrize("held_out", [(), (0,)])
