@@ -50,6 +50,7 @@ from dlo_casadi.pose import Pose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import conditions
+from dlo_casadi.session.stages import fit_stage
 
 ROOT = Path(__file__).resolve().parent.parent
 SESSIONS = ("short_clean", "held_headings", "weightless_fit", "thin")
@@ -234,12 +235,13 @@ def main() -> None:
                 alarms = sum(bool(row["added"]) and not row["right"] for row in rows.values())
                 unexplained = sum(row["verdict"] == "unexplained" for row in rows.values())
                 both = [np.mean([row[k] for row in rows.values()]) for k in ("inside", "torsion")]
+                band = np.mean(np.concatenate([row["in_band"] for row in rows.values()]))
                 fit, diagnosis = np.median(seconds, axis=0)
                 print(
                     f"{len(rows)} sets: {alarms} with a wrong effect, {unexplained} unexplained, "
                     f"EI in its interval in {100 * both[0]:.1f} %"
                     + (f", GJ in {100 * both[1]:.1f} %" if kind in ("space", "hidden") else "")
-                    + "; "
+                    + f", {100 * band:.1f} % of points left out in their band; "
                     f"median {fit:.1f} s for the fit, {diagnosis:.1f} s for the diagnosis",
                     flush=True,
                 )
@@ -287,10 +289,21 @@ def run_one(index: int, seed: int, kind: str) -> dict:
         "added": [item.candidate.name for item in diagnosis.added],
         "n": fit.model.n,
         "inside": within(intervals["bending_stiffness"], stiffness),
+        "in_band": in_band(diagnosis.after, measured),
         "torsion": within(intervals.get("torsional_stiffness"), torsion),
         "fit_seconds": fitted - begin,
         "diagnosis_seconds": time.perf_counter() - fitted,
     }
+
+
+def in_band(fit, measured) -> list[bool]:
+    """Of each point left out, whether it lies in the 90 % band of its pose."""
+    shapes, inside = fit_stage("batch", fit, measured, {}, ()).shapes, []
+    for item in measured:
+        shape = shapes.get(item.pose.name)
+        if item.held_out and shape is not None:
+            inside += list(shape.inside_band(fit.model.cable.length, fit.noise.of_points.std))
+    return inside
 
 
 def within(interval, true) -> bool:

@@ -11,8 +11,10 @@ from dlo_casadi.effects import EFFECTS, NUISANCES
 PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-CHAIN = ["errors", "thresholds", "parameters", "rod", "rest", "ends", "effects", "assembly"]
+CHAIN = ["errors", "thresholds", "parameters", "rod", "rest", "ends", "tolerances"]
 CHAIN += [
+    "effects",
+    "assembly",
     "composition",
     "lagrangian",
     "model",
@@ -29,8 +31,8 @@ PARALLEL = {"executors", "parallel"}
 # layer -> what it may import beside itself. A new module gets its line here.
 MAY_IMPORT: dict[str, set[str]] = {
     **{layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)},
-    "assembly": {*CHAIN[:7], "model"},  # the model only for its type
-    "config": {"errors", "thresholds", "parameters", "rod", "ends", "effects"},
+    "assembly": {*CHAIN[: CHAIN.index("assembly")], "model"},  # the model only for its type
+    "config": {"errors", "thresholds", "parameters", "rod", "ends", "tolerances", "effects"},
     "durable": {"errors"},
     "measurements": {"errors", "config", "durable"},
     "vision": {"errors", "durable"},

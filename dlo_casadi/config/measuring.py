@@ -11,6 +11,9 @@ from pydantic import Field, model_validator
 from dlo_casadi.config.limits import COORDINATE, MARKER, implausible_camera, implausible_pixels
 from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean
 from dlo_casadi.config.values import NonNegative, Number, Positive, Row, Section, Vector
+from dlo_casadi.tolerances import Tolerances as Known
+
+_STANDARD = Known()
 
 
 class Camera(Section):
@@ -159,23 +162,23 @@ class Centerlines(Measurement):
 class Tolerances(Section):
     """How well the declared values are known: one standard deviation each."""
 
-    length: Positive = 5.0e-4
+    length: Positive = _STANDARD.length
     """Of the cable's length [m]."""
-    end: Positive = 2.0e-4
+    end: Positive = _STANDARD.end
     """Of a coordinate of a fixture [m]."""
-    heading: Positive = 1.0e-2
+    heading: Positive = _STANDARD.heading
     """Of a clamp's heading in a plane [rad]."""
-    rotation: Positive = 5.0e-3
+    rotation: Positive = _STANDARD.rotation
     """Of a clamp's orientation in space, about each of its axes [rad]."""
-    roll: Positive = 1.0
+    roll: Positive = _STANDARD.roll
     """Of the roll of a cable in its end clamp, about itself [rad]."""
-    scale: Positive = 3.0e-4
+    scale: Positive = _STANDARD.scale
     """Of the scale of the measurement, relative."""
-    camera_rotation: Positive = 2.0e-3
+    camera_rotation: Positive = _STANDARD.camera_rotation
     """Of the frame of a measurement in space against the fixtures, about each axis [rad]."""
-    camera_translation: Positive = 1.0e-3
+    camera_translation: Positive = _STANDARD.camera_translation
     """Of the frame of a measurement in space against the fixtures, along each axis [m]."""
-    force_bias: Positive = 0.02
+    force_bias: Positive = _STANDARD.force_bias
     """Of a constant offset of a sensor's force, each component [N]."""
-    moment_bias: Positive = 2.0e-3
+    moment_bias: Positive = _STANDARD.moment_bias
     """Of a constant offset of a sensor's moment, each component [N m]."""

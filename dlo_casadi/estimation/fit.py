@@ -32,11 +32,11 @@ from dlo_casadi.estimation.start import (
     measured_shapes,
     turned_either_way,
 )
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 from dlo_casadi.solve import continued, solve_equilibrium
 from dlo_casadi.thresholds import DIFFERENT
+from dlo_casadi.tolerances import Tolerances
 
 FloatArray = NDArray[np.floating]
 

@@ -28,9 +28,9 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
 from dlo_casadi.estimation.sensors import Observed
 from dlo_casadi.estimation.sweep import Sweep
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.rod.band import Vector
+from dlo_casadi.tolerances import Tolerances
 
 FloatArray = NDArray[np.floating]
 

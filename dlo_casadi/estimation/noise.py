@@ -102,7 +102,7 @@ class NoiseModel:
 
     @property
     def beside_hangings(self) -> float:
-        """Standard deviation [m] beside what hangings of a pose differ by, where that tells it."""
+        """Standard deviation of points [m] beside how hangings differ; 0 where that told it all."""
         return 0.0 if self.source == "repeats" else self.std
 
     @property

@@ -86,9 +86,9 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     spread = repeatability(measured, length)
     if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise
-    samples = []
+    samples, groups = [], _groups(measured, length)
     nodes = np.linspace(0.0, length, _NODES)
-    for group in _groups(measured, length):
+    for group in groups:
         lines = [_line(other, nodes, length) for other in group]
         mean = NodeCurve(length, np.mean(lines, axis=0), None)
         for item in group:
@@ -110,7 +110,6 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     if found.std <= REPEATS_ARE_NOISE * noise.std:
         return noise
     # Of m distances from their mean m - 1 are free.
-    groups = _groups(measured, length)
     free = 1 - len(groups) / sum(map(len, groups))
     return replace(found, source="repeats", slow_dof=free * found.slow_dof)
 

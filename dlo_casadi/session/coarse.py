@@ -14,10 +14,10 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import conditions
 from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.tolerances import Tolerances
 
 FloatArray = NDArray[np.floating]
 

@@ -146,6 +146,12 @@ class PoseShape:
         std = np.stack([np.interp(self.s, places, column) for column in spread.T], axis=1)
         return np.hypot(std, noise).reshape(self.residual.shape)
 
+    def inside_band(self, length: float, noise: float) -> NDArray[np.bool_]:
+        """Whether each measured point (K,) lies in its 90 % band, noise included."""
+        score = (self.residual / self.expected(length, noise)) ** 2
+        by_point = score.reshape((len(score), -1))
+        return by_point.sum(axis=1) <= float(chdtri(by_point.shape[1], 1 - COVERED))
+
 
 @dataclass(frozen=True)
 class ReadingErrors:
@@ -436,9 +442,7 @@ class Outcome:
             shape = stage.shapes.get(pose.name)
             if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:
                 continue
-            std = shape.expected(self.fit.model.cable.length, noise)
-            score = ((shape.residual / std) ** 2).reshape((len(std), -1)).sum(axis=1)
-            inside.append(score <= chdtri(std.size // len(std), 1 - COVERED))
+            inside.append(shape.inside_band(self.fit.model.cable.length, noise))
         return float(np.concatenate(inside).mean()) if inside else None
 
     def held_out(self, stage: Stage) -> HeldOut:

@@ -18,11 +18,11 @@ from dlo_casadi.estimation.profile import (
     threshold,
 )
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.parallel import map_in_order
 from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from dlo_casadi.session.stages import rest_curvature_of
 from dlo_casadi.thresholds import NORMAL_95
+from dlo_casadi.tolerances import Tolerances
 from paper import branches, chords, published
 from paper.content import Claim, Part, Section, Table, drawing, number
 from paper.fits import FIRST, REST_COEFFICIENTS

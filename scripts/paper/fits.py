@@ -18,10 +18,10 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.parallel import map_in_order
 from dlo_casadi.session.fitting import solved_by_ipopt
 from dlo_casadi.session.stages import rest_curvature_of
+from dlo_casadi.tolerances import Tolerances
 from paper import published
 from paper.replica import PLACES, Replica
 

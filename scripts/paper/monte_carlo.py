@@ -28,13 +28,13 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.parallel import generator_of, map_as_completed
 from dlo_casadi.report.canvas import BLACK, BLUE
 from dlo_casadi.session.declared import nuisances
 from dlo_casadi.session.stages import rest_curvature_of
 from dlo_casadi.thresholds import NORMAL_95
+from dlo_casadi.tolerances import Tolerances
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing, number, rms
 from paper.fits import REST_COEFFICIENTS

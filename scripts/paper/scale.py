@@ -26,8 +26,8 @@ from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
+from dlo_casadi.tolerances import Tolerances
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing
 from paper.fits import REST_COEFFICIENTS

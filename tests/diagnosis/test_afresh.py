@@ -13,10 +13,10 @@ from dlo_casadi.effects import BendingAnisotropy, Cable
 from dlo_casadi.estimation.fit import fit_model, fitted_closely
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
+from dlo_casadi.tolerances import Tolerances
 
 TRUE = Cable(1.0, 0.08, 0.007, bending_stiffness=0.018, torsional_stiffness=0.007)
 DECLARED = replace(TRUE, bending_stiffness=0.011, torsional_stiffness=0.007)

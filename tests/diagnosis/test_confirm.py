@@ -14,9 +14,9 @@ from dlo_casadi.effects import Cable, LumpedMass, UnknownPull
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
+from dlo_casadi.tolerances import Tolerances
 
 NOISE = 3e-4
 PLAIN = CableModel(Cable(0.5, 0.03, 0.006, 0.01), 12, n_rest=5)

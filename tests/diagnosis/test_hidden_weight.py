@@ -10,10 +10,10 @@ from dlo_casadi.effects import EFFECTS, Cable, LumpedMass
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.remarks import weight_warning
+from dlo_casadi.tolerances import Tolerances
 
 EI, MASS = 0.06, 0.35
 MODEL = CableModel(Cable(0.65, 0.4, 0.015, 0.03), 10, start="clamped", end="free", n_rest=3)

@@ -10,9 +10,9 @@ from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.pose import Pose
 from dlo_casadi.rod.node import Heading
+from dlo_casadi.tolerances import Tolerances
 
 LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4
 

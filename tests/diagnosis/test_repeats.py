@@ -13,9 +13,9 @@ from dlo_casadi.effects import Cable
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
+from dlo_casadi.tolerances import Tolerances
 
 MODEL = CableModel(Cable(0.8, 0.03, 0.006, 0.02), 12, start="clamped", end="clamped", n_rest=5)
 NOISE = 3e-4

@@ -14,10 +14,10 @@ from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.tolerances import Tolerances
 
 CABLE = Cable(0.8, 0.2, 0.012, 0.04)
 IN_SPACE = replace(CABLE, torsional_stiffness=0.02)

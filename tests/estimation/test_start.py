@@ -10,10 +10,10 @@ from dlo_casadi.estimation.noise import NoiseModel
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way, twists
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
+from dlo_casadi.tolerances import Tolerances
 
 CABLE = Cable(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03)
 HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}

@@ -12,12 +12,12 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.stiffness import fit_stiffness
-from dlo_casadi.estimation.tolerances import Tolerances
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.session.remarks import branch_warnings
 from dlo_casadi.session.stages import initial_stage
 from dlo_casadi.solve import continued, solve_equilibrium
+from dlo_casadi.tolerances import Tolerances
 
 EI, STD = 0.028, 1e-3
 MODEL = CableModel(Cable(0.5, 0.3, 0.012, EI), 12, start="clamped", end="free", n_rest=5)
