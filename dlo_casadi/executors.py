@@ -7,7 +7,7 @@ Each is a `concurrent.futures.Executor`; `parallel.py` uses no more than that an
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 
 from dlo_casadi.durable import make_folder
 from dlo_casadi.errors import DloError
-from dlo_casadi.workers import THREADS, begin_worker, environment, software
+from dlo_casadi.workers import THREADS, begin_worker, environment, signals_held, software
 
 # How long a scheduler may take to answer, and to have a worker [s].
 PATIENCE = 30.0
@@ -44,17 +44,29 @@ class Pool(Executor):
 
     Parameters
     ----------
-    workers : int
+    others : int
+        Processes that are started.
     logs : Path, optional
         Folder in which each process keeps a log of its own; a crash leaves its stack there.
+    here : bool
+        Whether the process that submits tasks is meant to do some of them, too.
+    libraries : sequence of str
+        Modules that a worker imports before it is asked for anything.
     """
 
     losses: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
-    def __init__(self, workers: int, logs: Path | None = None) -> None:
-        self.workers = workers
-        self.capacity = 2 * workers
-        self.logs = logs
+    def __init__(
+        self,
+        others: int,
+        logs: Path | None = None,
+        here: bool = False,
+        libraries: Sequence[str] = (),
+    ) -> None:
+        self.others, self.here = others, here
+        self.workers = others + here
+        self.capacity = 2 * others
+        self.logs, self.libraries = logs, tuple(libraries)
         self._others = set(multiprocessing.active_children())
         # A worker inherits it, and loads its libraries after that.
         self._environment = ExitStack()
@@ -63,21 +75,22 @@ class Pool(Executor):
 
     def _start(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(
-            self.workers,
+            self.others,
             # A forked copy of a process with threads and solvers in it may hang.
             mp_context=multiprocessing.get_context("spawn"),
             initializer=begin_worker,
-            initargs=(None if self.logs is None else str(self.logs),),
+            initargs=(None if self.logs is None else str(self.logs), self.libraries),
         )
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit to the pool, to a new one if a worker of the last was killed."""
-        try:
-            return self._inner.submit(fn, *args, **kwargs)
-        except BrokenExecutor:
-            self._inner.shutdown()
-            self._inner = self._start()
-            return self._inner.submit(fn, *args, **kwargs)
+        with signals_held():  # the first task starts the processes
+            try:
+                return self._inner.submit(fn, *args, **kwargs)
+            except BrokenExecutor:
+                self._inner.shutdown()
+                self._inner = self._start()
+                return self._inner.submit(fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers; with `wait=False` those in the middle of a task, too."""
@@ -183,7 +196,12 @@ AnyExecutor = InProcess | Pool | Cluster
 
 @contextmanager
 def open_executor(
-    jobs: int = 1, scheduler: str | None = None, logs: Path | None = None
+    jobs: int = 1,
+    scheduler: str | None = None,
+    logs: Path | None = None,
+    *,
+    here: bool = False,
+    libraries: Sequence[str] = (),
 ) -> Iterator[AnyExecutor]:
     """Open the executor that a command's `--jobs` and `--scheduler` ask for.
 
@@ -201,6 +219,11 @@ def open_executor(
         Address of a Dask scheduler, instead.
     logs : Path, optional
         Folder of the workers' logs, made if it is missing.
+    here : bool
+        Whether this process is one of the `jobs`: for few tasks, none of which can crash. Else it
+        waits for the others, and outlives them.
+    libraries : sequence of str
+        Modules that other processes import before they are asked for anything.
 
     Raises
     ------
@@ -221,7 +244,7 @@ def open_executor(
     if scheduler is not None:
         executor = Cluster(scheduler, logs)
     else:
-        executor = InProcess() if jobs == 1 else Pool(jobs, logs)
+        executor = InProcess() if jobs == 1 else Pool(jobs - here, logs, here, libraries)
     try:
         yield executor
     except BaseException:

@@ -22,6 +22,7 @@ __all__ = [
     "Finished",
     "LostTaskError",
     "Tally",
+    "begin",
     "generator_of",
     "map_as_completed",
     "map_in_order",
@@ -140,10 +141,13 @@ def map_as_completed(
     again: list[_Task[Item]] = []
     suspects: list[_Task[Item]] = []
     under_way: dict[Future[Any], _Task[Item]] = {}
+    here, workers, taken = getattr(executor, "here", False), getattr(executor, "workers", 1), 0
 
     def room() -> int:
         # Asked anew each time: workers of a cluster come and go.
         most = in_flight or int(getattr(executor, "capacity", 2))
+        if here and total is not None:
+            most = min(most, (total - taken) * (workers - 1) // workers)
         return max(0, most - len(under_way))
 
     def submit(task: _Task[Item]) -> None:
@@ -156,11 +160,24 @@ def map_as_completed(
                 submit(again.pop())
             for index, item in islice(waiting, room()):
                 submit(_Task(index, item))
+                taken += 1
+            own = list(islice(waiting, int(here)))
+            for index, item in own:
+                taken += 1
+                ended = Finished(index, item, *_run(function, item, index, None))
+                tally.add(ended)
+                if progress is not None:
+                    progress(tally.now())
+                yield ended
             if not under_way:
+                if own:
+                    continue
                 if not suspects:
                     return
                 submit(suspects.pop())
-            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+            # Who has just done a task goes on with the next, and does not wait for the others.
+            patience = 0.0 if own else None
+            for future in wait(under_way, patience, FIRST_COMPLETED).done:
                 task = under_way.pop(future)
                 if future.cancelled():
                     raise LostTaskError("the executor was shut down with tasks under way")
@@ -205,6 +222,24 @@ def map_in_order(
     """
     ended = list(map_as_completed(executor, function, items, **options))
     return [item.value for item in sorted(ended, key=lambda item: item.index)]
+
+
+def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Callable[[], Result]:
+    """Begin one call; what is returned waits for its result, or raises what it raised.
+
+    It is made here and at once where the executor has no process of its own, and made here again
+    where its worker is killed.
+    """
+    losses = getattr(executor, "losses", (BrokenExecutor,))
+    future = executor.submit(function, *args)
+
+    def result() -> Result:
+        try:
+            return future.result()
+        except losses:
+            return function(*args)
+
+    return result
 
 
 def generator_of(seed: int, index: int) -> np.random.Generator:

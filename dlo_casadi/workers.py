@@ -11,9 +11,11 @@ import platform
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from importlib import import_module
 from importlib.metadata import version
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -26,6 +28,9 @@ THREADS = dict.fromkeys(
     ),
     "1",
 )
+
+# By which a command is interrupted.
+HELD = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
@@ -59,9 +64,28 @@ def one_thread() -> Iterator[None]:
         yield
 
 
-def begin_worker(logs: str | None) -> None:
-    """Leave interrupts to the parent, end with it, and keep the stack of a crash."""
+@contextmanager
+def signals_held() -> Iterator[None]:
+    """Hold interrupts back while processes are started, and in them until `begin_worker`.
+
+    A process that is interrupted half way in its start, or whose parent is, prints its stack.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # which lets go of the signals when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, HELD)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def begin_worker(logs: str | None, libraries: Sequence[str] = ()) -> None:
+    """Leave interrupts to the parent, end with it, keep the stack of a crash; import libraries."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, HELD)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
@@ -71,6 +95,8 @@ def begin_worker(logs: str | None) -> None:
         # What libraries print would tear the progress of the parent.
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
+    for name in libraries:
+        import_module(name)
 
 
 def _end_with(sentinel: int) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -177,17 +178,23 @@ def test_an_interrupted_fit_keeps_the_earlier_results(config, tmp_path, capsys, 
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
+@pytest.mark.parametrize("begun", ["read the poses", "fit the declared model"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_interrupts_a_running_fit(config, tmp_path, number):
+def test_a_signal_interrupts_a_running_fit(config, tmp_path, number, begun):
+    """Also while another process is just being started."""
     (tmp_path / "report.json").write_text('{"schema": "dlo-report/1"}')
     command = [sys.executable, "-u", str(ROOT / "scripts" / "fit.py"), str(config)]
-    command += ["--output", str(tmp_path)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
-        assert running.stderr.readline().startswith("read the poses")
-        running.send_signal(number)
+    command += ["--output", str(tmp_path), "--jobs", "2"]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as running:
+        while not running.stderr.readline().startswith(begun):
+            assert running.poll() is None
+        os.killpg(running.pid, number)  # as a terminal does
         said = running.stderr.read()
         assert running.wait(timeout=60) == 130
 
+    assert "Traceback" not in said
     assert said.strip().splitlines()[-1] == "interrupted; earlier results are as they were"
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 

@@ -48,7 +48,7 @@ READ = {"config", "measurements", "vision", "workers"}
 MAY_IMPORT["session"] = MECHANICS | READ | {"estimation", "diagnosis"} | PARALLEL
 # A report reads results and solves nothing.
 STATED = set(CHAIN[: CHAIN.index("whole_pose")])
-MAY_IMPORT["report"] = STATED | READ | {"durable", "estimation", "diagnosis", "session"}
+MAY_IMPORT["report"] = STATED | READ | {"durable", "estimation", "diagnosis", "session"} | PARALLEL
 MAY_IMPORT["shape_table"] = MECHANICS | {"codegen", "durable", "parallel"}
 MAY_IMPORT["fleet"] = {"errors", "config", "durable", "workers", "session", "report"} | PARALLEL
 MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}

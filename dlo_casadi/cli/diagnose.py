@@ -10,9 +10,15 @@ from pathlib import Path
 from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import add_jobs, command, configuration, console, print_json
+from dlo_casadi.cli.options import (
+    add_jobs_of_one,
+    command,
+    configuration,
+    console,
+    jobs_of_one,
+    print_json,
+)
 from dlo_casadi.cli.watch import Watch
-from dlo_casadi.parallel import open_executor
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import candidate_table, print_summary
 from dlo_casadi.report.writer import ResultsFolder
@@ -35,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     )
     parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
     parser.add_argument("--output", type=Path, metavar="DIR", help="write the results there")
-    add_jobs(parser)
+    add_jobs_of_one(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     chosen = parser.parse_args(argv)
@@ -47,12 +53,12 @@ def main(argv: Sequence[str]) -> int:
     with (
         results as folder,
         Watch(Console(stderr=True), chosen.quiet) as watch,
-        open_executor(chosen.jobs) as executor,
+        jobs_of_one(chosen.jobs) as executor,
     ):
         watch.warn(config.warnings)
         outcome = run_session(config, watch, executor)
         if folder is not None:
-            folder.write(outcome)
+            folder.write(outcome, executor)
     if chosen.json:
         report = report_dict(outcome)
         print_json({key: report[key] for key in KEYS})

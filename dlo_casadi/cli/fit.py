@@ -9,9 +9,15 @@ from pathlib import Path
 from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import add_jobs, command, configuration, console, print_json
+from dlo_casadi.cli.options import (
+    add_jobs_of_one,
+    command,
+    configuration,
+    console,
+    jobs_of_one,
+    print_json,
+)
 from dlo_casadi.cli.watch import Watch
-from dlo_casadi.parallel import open_executor
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.report.writer import ResultsFolder
@@ -40,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
         metavar="DIR",
         help="folder of the results; default results/<config name>/",
     )
-    add_jobs(parser)
+    add_jobs_of_one(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print report.json instead of tables")
     parser.add_argument(
@@ -56,12 +62,12 @@ def main(argv: Sequence[str]) -> int:
     with (
         ResultsFolder(output, config) as folder,
         Watch(Console(stderr=True), chosen.quiet) as watch,
-        open_executor(chosen.jobs) as executor,
+        jobs_of_one(chosen.jobs) as executor,
     ):
         watch.warn(config.warnings)
         outcome = run_session(config, watch, executor)
         watch.step("write the results", 0, 1)
-        folder.write(outcome)
+        folder.write(outcome, executor)
         watch.step("write the results", 1, 1)
     if chosen.json:
         print_json(report_dict(outcome))

@@ -6,6 +6,9 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ from rich.console import Console
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
+from dlo_casadi.parallel import open_executor
 
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
@@ -36,11 +40,23 @@ def command(name: str, description: str, examples: str, codes: str = "") -> argp
     )
 
 
-def add_jobs(parser: argparse.ArgumentParser) -> None:
+def add_jobs(parser: argparse.ArgumentParser, default: int = 1) -> None:
     """Add `--jobs`."""
-    parser.add_argument(
-        "--jobs", type=int, default=1, metavar="N", help="number of processes; default 1"
-    )
+    text = "number of processes; default %(default)s"
+    parser.add_argument("--jobs", type=int, default=default, metavar="N", help=text)
+
+
+def add_jobs_of_one(parser: argparse.ArgumentParser) -> None:
+    """Add `--jobs` of a single session: two where there are two processors, more save nothing."""
+    add_jobs(parser, min(2, os.cpu_count() or 1))
+
+
+@contextmanager
+def jobs_of_one(jobs: int) -> Iterator[Executor]:
+    """Open where a single session is fitted and drawn."""
+    libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
+    with open_executor(jobs, here=True, libraries=libraries) as executor:
+        yield executor
 
 
 def configuration(path: Path) -> Config:

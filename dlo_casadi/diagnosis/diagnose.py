@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from dlo_casadi.diagnosis.crossval import CrossValidation
@@ -39,10 +39,6 @@ class Diagnosis:
         Whether structure is left, or poses that were left out are not predicted.
     pull : Pull or None
         Where that is so: the load that assumes no cause; None where none fits.
-    proposal : NextPose or None
-        What separates an effect from its best rival.
-    proposal_for : tuple of str
-        Names of those two; empty where there is no rival.
     weight : HiddenWeight or None
         That the fit would not notice.
     """
@@ -57,8 +53,6 @@ class Diagnosis:
     ranked: tuple[Ranked, ...] = ()
     unexplained: bool = False
     pull: Pull | None = None
-    proposal: NextPose | None = None
-    proposal_for: tuple[str, ...] = field(default_factory=tuple)
     weight: HiddenWeight | None = None
 
     @property
@@ -129,7 +123,6 @@ def diagnose(
         )
         for item in found.added
     )
-    proposal, names = _proposal(found.fit, added)
     return Diagnosis(
         before=fit,
         after=found.fit,
@@ -141,18 +134,15 @@ def diagnose(
         ranked=found.ranked,
         unexplained=found.unexplained,
         pull=pull if found.unexplained else None,
-        proposal=proposal,
-        proposal_for=names,
         weight=None if found.unexplained else hidden_weight(found.fit, exclude),
     )
 
 
-def _proposal(
-    current: Fit, added: Sequence[AddedEffect]
-) -> tuple[NextPose | None, tuple[str, ...]]:
-    """Pose that separates an added effect from its closest rival."""
-    for item in added:
+def pose_that_tells(diagnosis: Diagnosis) -> tuple[NextPose, tuple[str, str]] | None:
+    """Pose that separates an added effect from its closest rival, and their names."""
+    for item in diagnosis.added:
         if item.rivals:
             rival = item.rivals[0]
-            return next_pose(current, rival.fit), (item.candidate.name, rival.candidate.name)
-    return None, ()
+            found = next_pose(diagnosis.after, rival.fit)
+            return None if found is None else (found, (item.candidate.name, rival.candidate.name))
+    return None

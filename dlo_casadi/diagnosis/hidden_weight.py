@@ -22,6 +22,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import student_95
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.executors import InProcess
 
 # Weights that are tried in turn, over the cable's own: until one does not fit.
 WEIGHTS = 0.05 * 1.6 ** np.arange(9)
@@ -91,9 +92,9 @@ def hidden_weight(fit: Fit, exclude: Sequence[str] = ()) -> HiddenWeight | None:
 def _place(fit: Fit, weight: Candidate) -> float:
     """Arc length [m] at which a weight makes the stiffness most uncertain."""
     _, position = weight.frees
-    screen, variances = Screen(fit, [weight]), []
-    for scan in range(len(weight.scans)):
-        hessian, _, names = screen.normal([weight], scan)
+    variances = []
+    for normal in Screen(fit, [weight]).normals(InProcess()):
+        hessian, names = normal.hessian, normal.names
         kept = [k for k, name in enumerate(names) if name != position]
         covariance = np.linalg.pinv(hessian[np.ix_(kept, kept)], hermitian=True)
         own = kept.index(names.index(BENDING_STIFFNESS))

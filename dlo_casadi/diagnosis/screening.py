@@ -17,7 +17,8 @@ function theorem, exact from CasADi.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +34,9 @@ from dlo_casadi.estimation.linearization import Linearization, Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel
+from dlo_casadi.parallel import begin
 from dlo_casadi.thresholds import COLLINEAR, SCANS_PER_TEST
 
 FloatArray = NDArray[np.floating]
@@ -70,15 +73,6 @@ def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
 
 
 @dataclass(frozen=True)
-class _Linearized:
-    """A fit's model with candidates at their nominal values, linearised at the fit."""
-
-    problem: BatchProblem
-    point: Point
-    lin: Linearization
-
-
-@dataclass(frozen=True)
 class _Moving:
     """Candidates that are scanned along the cable together, alone in the fit's model.
 
@@ -100,9 +94,10 @@ class _Moving:
         names = tuple(name for candidate in candidates for name in candidate.screened)
         return cls(problem, carried_shapes(problem, fit), names)
 
-    def by_names(self, fit: Fit, p: FloatArray) -> list[FloatArray]:
-        """Whitened derivatives (R_j, names) of each pose's residuals, at p."""
+    def by_names(self, fit: Fit, scan: Mapping[str, float]) -> list[FloatArray]:
+        """Whitened derivatives (R_j, names) of each pose's residuals, at a scan."""
         problem, unknowns = self.problem, self.problem.unknowns
+        p = _at(scan, unknowns.model, fit)
         theta = unknowns.pack(p, fit.coefficients)
         rest = unknowns.rest(theta)
         columns = [unknowns.names.index(name) for name in self.names]
@@ -124,6 +119,53 @@ def with_springs(sweep: Sweep, shapes: Shapes, p: FloatArray, rest: FloatArray) 
     return sweep.solve(shapes, p, rest)[0] if sweep.model.n_springs else shapes
 
 
+def _at(scan: Mapping[str, float], model: CableModel, fit: Fit) -> FloatArray:
+    """Parameters of a model that holds a fit's, at a scan."""
+    p = fit.values_in(model)
+    for name, value in scan.items():
+        p[model.names.index(name)] = value
+    return p
+
+
+def _scan(active: Sequence[Candidate], k: int) -> dict[str, float]:
+    """Values of the k-th scan of some candidates."""
+    return {name: value for c in active for name, value in c.scans[k].items()}
+
+
+def _derivatives(
+    fit: Fit, listed: Sequence[Candidate], scans: Sequence[int]
+) -> list[dict[tuple[str, ...], list[FloatArray]]]:
+    """For each of the scans beyond the first: derivatives by candidates, by their names."""
+    moving: dict[tuple[str, ...], _Moving] = {}
+    out = []
+    for k in scans:
+        found = {}
+        # What a pose leaves behind acts through all later ones, at a cost.
+        for state in (False, True):
+            active = [
+                c for c in listed if k < len(c.scans) and isinstance(c.effect, StateEffect) == state
+            ]
+            key = tuple(candidate.name for candidate in active)
+            if not key:
+                continue
+            if key not in moving:
+                moving[key] = _Moving.of(fit, active)
+            found[moving[key].names] = moving[key].by_names(fit, _scan(active, k))
+        out.append(found)
+    return out
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of the model with all candidates, those `active` at their scan `k`."""
+
+    active: list[Candidate]
+    k: int
+    hessian: FloatArray
+    gradient: FloatArray
+    names: tuple[str, ...]
+
+
 class Screen:
     """All candidates in one model, evaluated at a fit."""
 
@@ -131,100 +173,69 @@ class Screen:
         self.fit = fit
         self.listed = list(listed)
         self.model = extended(fit, listed)
-        # Nuisances that are candidates enter twice: with their prior, and free.
-        self.free = fit.free_in(self.model)
         self.p = fit.values_in(self.model)
-        self.carried = {
-            name
-            for c in self.listed
-            if isinstance(c.effect, StateEffect)
-            for scan in c.scans
-            for name in scan
-        }
-        self.sweep: Sweep | None = None
-        self.shapes: Shapes | None = None
-        self.still: _Linearized | None = None
-        self.moving: dict[tuple[str, ...], _Moving] = {}
 
-    def normal(
-        self, active: Sequence[Candidate], k: int
-    ) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
-        """Normal equations of the extended model with the active candidates at their scan k."""
-        scan = {name: value for c in active for name, value in c.scans[k].items()}
-        p = self.p.copy()
-        for name, value in scan.items():
-            p[self.model.names.index(name)] = value
-        if self.still is None:
-            self.still = self._linearized(p)
-        else:
-            moved = [c for c in active if len(c.scans) > 1]
-            # What a pose leaves behind acts through all later ones, at a cost.
-            for state in (False, True):
-                self._move([c for c in moved if isinstance(c.effect, StateEffect) == state], p)
-        still = self.still
-        normal = still.problem.normal_equations(still.point, still.lin)
-        return normal.hessian, normal.gradient, still.problem.unknowns.names
+    def normals(self, executor: Executor) -> Iterator[Normal]:
+        """Normal equations at each scan.
 
-    def _move(self, candidates: Sequence[Candidate], p: FloatArray) -> None:
-        """Take the derivatives by the candidates' parameters again, at p."""
-        if not candidates:
-            return
-        assert self.still is not None
-        key = tuple(candidate.name for candidate in candidates)
-        if key not in self.moving:
-            self.moving[key] = _Moving.of(self.fit, candidates)
-        moving = self.moving[key]
-        own = p[[self.model.names.index(name) for name in moving.problem.unknowns.model.names]]
-        columns = [self.still.problem.unknowns.names.index(name) for name in moving.names]
-        found = moving.by_names(self.fit, own)
-        for by_theta, moved in zip(self.still.lin.by_theta, found, strict=True):
-            by_theta[:, columns] = moved
+        The scans are dealt out in as many parts as there are workers, for what a part needs is
+        made once.
+        """
+        n_scans = max(len(candidate.scans) for candidate in self.listed)
+        workers = getattr(executor, "workers", 1)
+        parts = [range(1 + i, n_scans, workers) for i in range(workers)]
+        begun = [begin(executor, _derivatives, self.fit, self.listed, part) for part in parts[1:]]
+        problem, point, lin = self._linearized()
+        names = problem.unknowns.names
+        normal = problem.normal_equations(point, lin)
+        yield Normal(self.listed, 0, normal.hessian, normal.gradient, names)
+        moved = [_derivatives(self.fit, self.listed, parts[0]), *(found() for found in begun)]
+        for k in range(1, n_scans):
+            part, at = (k - 1) % workers, (k - 1) // workers
+            for own, found in moved[part][at].items():
+                columns = [names.index(name) for name in own]
+                for by_theta, change in zip(lin.by_theta, found, strict=True):
+                    by_theta[:, columns] = change
+            normal = problem.normal_equations(point, lin)
+            active = [c for c in self.listed if k < len(c.scans)]
+            yield Normal(active, k, normal.hessian, normal.gradient, names)
 
-    def _linearized(self, p: FloatArray) -> _Linearized:
+    def _linearized(self) -> tuple[BatchProblem, Point, Linearization]:
+        """The fit's model with candidates at their nominal values, linearised at the fit."""
         problem = self.fit.problem
-        unknowns = Unknowns(self.model, self.free, p, problem.unknowns.rest_free)
-        larger = problem.of(unknowns, sweep=self.sweep)
-        self.sweep = larger.sweep
+        p = _at(_scan(self.listed, 0), self.model, self.fit)
+        # Nuisances that are candidates enter twice: with their prior, and free.
+        free = self.fit.free_in(self.model)
+        unknowns = Unknowns(self.model, free, p, problem.unknowns.rest_free)
+        larger = problem.of(unknowns)
         larger.share_metric(problem)
-        if self.shapes is None:
-            self.shapes = carried_shapes(larger, self.fit)
         theta = unknowns.pack(p, self.fit.coefficients)
-        rest = unknowns.rest(theta)
-        self.shapes = with_springs(larger.sweep, self.shapes, p, rest)
-        point = replace(self.fit.point, theta=theta, shapes=self.shapes)
-        return _Linearized(larger, point, larger.linearize(point))
+        shapes = carried_shapes(larger, self.fit)
+        shapes = with_springs(larger.sweep, shapes, p, unknowns.rest(theta))
+        point = replace(self.fit.point, theta=theta, shapes=shapes)
+        return larger, point, larger.linearize(point)
 
-    def run(self, noise_dof: float) -> list[Screened]:
+    def run(self, noise_dof: float, executor: Executor | None = None) -> list[Screened]:
         """Score all candidates, best first.
 
         Parameters
         ----------
         noise_dof : float
             Degrees of freedom of the noise estimate; inf where it is declared.
+        executor : Executor, optional
+            Where scans are done; in this process by default.
         """
-        n_scans = max(len(candidate.scans) for candidate in self.listed)
         best: dict[str, Screened] = {}
-        for k in range(n_scans):
-            active = [c for c in self.listed if k < len(c.scans)]
-            if not active:
-                continue
-            hessian, gradient, names = self.normal(active, k)
-            for candidate in active:
-                tried = self._score(candidate, k, hessian, gradient, names, noise_dof)
+        for normal in self.normals(executor or InProcess()):
+            for candidate in normal.active:
+                tried = self._score(candidate, normal, noise_dof)
                 known = best.get(candidate.name)
                 if known is None or tried.score > known.score:
                     best[candidate.name] = tried
         return sorted(best.values(), key=lambda item: item.p_value - 1e-9 * item.score)
 
-    def _score(
-        self,
-        candidate: Candidate,
-        k: int,
-        hessian: FloatArray,
-        gradient: FloatArray,
-        names: tuple[str, ...],
-        noise_dof: float,
-    ) -> Screened:
+    def _score(self, candidate: Candidate, normal: Normal, noise_dof: float) -> Screened:
+        hessian, gradient, names = normal.hessian, normal.gradient, normal.names
         base = [i for i, name in enumerate(names) if name in self.fit.problem.unknowns.names]
         columns = [names.index(name) for name in candidate.screened]
         h_bb = hessian[np.ix_(base, base)] + NO_INFORMATION * np.eye(len(base))
@@ -254,7 +265,7 @@ class Screen:
         n_places = max(1.0, len(candidate.scans) / SCANS_PER_TEST)
         single = survival(score, max(dof, 1), noise_dof)
         p_value = float(min(1.0, -np.expm1(n_places * np.log1p(-min(single, 1 - 1e-16)))))
-        values = dict(candidate.scans[k])
+        values = dict(candidate.scans[normal.k])
         for name, change in zip(candidate.screened, step, strict=True):
             i = self.model.names.index(name)
             parameter = self.model.parameters[i]

@@ -118,7 +118,10 @@ class Search:
     @cached_property
     def first(self) -> list[Screened]:
         """Score tests in the declared model."""
-        return screen(self.declared, self.center, self.exclude)
+        return self._screened(self.declared)
+
+    def _screened(self, current: Fit) -> list[Screened]:
+        return screen(current, self.center, self.exclude, self.executor)
 
     def run(self, pull: Pull | None = None) -> Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
@@ -139,7 +142,7 @@ class Search:
             if astray and pull is None:
                 screened, tried = self._afresh(current)
             else:
-                screened = self.first if k == 0 else screen(current, self.center, self.exclude)
+                screened = self.first if k == 0 else self._screened(current)
             p_values = {
                 item.candidate.name: sidak(item.p_value, len(screened)) for item in screened
             }
@@ -279,10 +282,15 @@ class Search:
         return p_alone > p_found
 
 
-def screen(fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]) -> list[Screened]:
+def screen(
+    fit: Fit,
+    center: tuple[float, float] | None,
+    exclude: Sequence[str],
+    executor: Executor | None = None,
+) -> list[Screened]:
     """Score tests of all `candidates_of` a fit, best first."""
     listed = candidates_of(fit, center, exclude)
-    return Screen(fit, listed).run(screening_degrees(fit)) if listed else []
+    return Screen(fit, listed).run(screening_degrees(fit), executor) if listed else []
 
 
 def prune(fit: Fit, added: list[AddedEffect], significance: float) -> tuple[Fit, list[AddedEffect]]:

@@ -1,4 +1,4 @@
-"""Figures of a run: poses, residuals, rest curvature, errors, candidates, the unexplained load."""
+"""Figures of a run: residuals, rest curvature, errors, candidates, the unexplained load."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from dlo_casadi.report.canvas import (
     label_of,
     millimetres,
 )
-from dlo_casadi.report.figures_poses import draw_poses
 from dlo_casadi.report.figures_room import draw_marks, frame_room
 from dlo_casadi.report.geometry import (
     directions,
@@ -36,7 +35,6 @@ from dlo_casadi.report.geometry import (
     residual_range,
     rest_about,
 )
-from dlo_casadi.report.overlay import write_overlays
 from dlo_casadi.report.scene import pull_marks, scene_of
 from dlo_casadi.session.outcome import Outcome
 
@@ -47,8 +45,7 @@ _PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 
 
 def write_figures(folder: Path, outcome: Outcome) -> None:
-    """Draw all figures that the outcome has something for into an existing folder."""
-    draw_poses(folder, outcome)
+    """Draw residuals, parameters and findings, as far as there are any, into a folder."""
     if any(stage.shapes for stage in outcome.stages):
         draw_residuals(folder / "residuals.png", outcome)
         draw_rest_curvature(folder / "rest_curvature.png", outcome)
@@ -61,8 +58,6 @@ def write_figures(folder: Path, outcome: Outcome) -> None:
         draw_unexplained(folder / "unexplained.png", outcome)
     if outcome.config.experiment.boundary.end == "free":
         draw_moment(folder / "moment.png", outcome)
-    if any(pose.image is not None for pose in outcome.poses):
-        write_overlays(folder / "overlays", outcome)
 
 
 # ---- residuals ---------------------------------------------------------------------------------

@@ -30,8 +30,9 @@ _DPI = 100
 
 
 def write_overlays(folder: Path, outcome: Outcome) -> None:
-    """Draw one JPEG for each pose with a photograph into a new folder."""
-    make_folder(folder)
+    """Draw one JPEG for each pose with a photograph, if there is any, into a new folder."""
+    if any(pose.image is not None for pose in outcome.poses):
+        make_folder(folder)
     for pose in outcome.poses:
         if pose.image is not None and pose.to_pixels is not None:
             try:

@@ -8,11 +8,9 @@ import re
 from functools import cache
 from typing import Any
 
-from bokeh.resources import INLINE
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from dlo_casadi.report.page_charts import charts
 from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.page_pictures import pictures, scene_pictures
 from dlo_casadi.report.page_views import view_pictures_of
@@ -30,6 +28,9 @@ def report_page(outcome: Outcome) -> str:
     All text of the session is escaped. The page's own policy forbids it to load anything, and to
     run any script but those that are written into it, known by their hashes.
     """
+    # Bokeh takes half a second to load: only who draws a page waits for it.
+    from dlo_casadi.report.page_charts import charts
+
     drawn = pictures(outcome)
     return render(
         "report.html",
@@ -117,6 +118,8 @@ def _text(name: str) -> str:
 @cache
 def _script_library() -> str:
     """Bokeh's own script, without its widgets and tables."""
+    from bokeh.resources import INLINE
+
     script = INLINE.clone(components=["bokeh"]).js_raw[0]
     assert "</script" not in script
     return script.strip()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from concurrent.futures import Executor
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -11,9 +12,13 @@ from typing import Self
 from dlo_casadi.config import Config
 from dlo_casadi.durable import FolderDraft, is_marked, make_folder, refuse_foreign, write_file
 from dlo_casadi.errors import DloError, OutputError
+from dlo_casadi.executors import InProcess
 from dlo_casadi.measurements import write_points, write_table
+from dlo_casadi.parallel import begin
 from dlo_casadi.report.figures import write_figures
+from dlo_casadi.report.figures_poses import draw_poses
 from dlo_casadi.report.json_report import report_text
+from dlo_casadi.report.overlay import write_overlays
 from dlo_casadi.report.page import GENERATOR, report_page
 from dlo_casadi.report.page_failure import write_failure_page
 from dlo_casadi.report.parameters_text import parameters_text
@@ -78,16 +83,21 @@ class ResultsFolder(FolderDraft):
                 return  # the error itself is what the user must see
             error.add_note(f"Pose by pose: {self.path / FAILURE}")
 
-    def write(self, outcome: Outcome) -> Path:
+    def write(self, outcome: Outcome, executor: Executor | None = None) -> Path:
         """Write all results, then put them in place of the previous ones.
 
         A page or a figure that cannot be drawn does not lose the numbers: they are put in place
         before the error goes on.
+
+        Parameters
+        ----------
+        executor : Executor, optional
+            Where a part is drawn at the same time; in this process by default.
         """
         write_numbers(self.folder, outcome)
         failed = None
         try:
-            draw(self.folder, outcome)
+            draw(self.folder, outcome, executor or InProcess())
         except OutputError:
             raise
         except Exception as error:
@@ -113,12 +123,22 @@ def write_numbers(folder: Path, outcome: Outcome) -> None:
             write_table(lines / f"{pose.name}_{which}.csv", ["u_px", "v_px"], view.sight.pixels)
 
 
-def draw(folder: Path, outcome: Outcome) -> None:
+def draw(folder: Path, outcome: Outcome, executor: Executor) -> None:
     """Write the page and the figures beside the numbers."""
-    write_file(folder / "report.html", report_page(outcome))
     figures = folder / "figures"
     make_folder(figures)
-    write_figures(figures, outcome)
+    drawn = begin(executor, draw_summary, folder, outcome)
+    try:
+        draw_poses(figures, outcome)
+        write_overlays(figures / "overlays", outcome)
+    finally:
+        drawn()
+
+
+def draw_summary(folder: Path, outcome: Outcome) -> None:
+    """Write the page, and the figures that do not show pose by pose: half of the work."""
+    write_file(folder / "report.html", report_page(outcome))
+    write_figures(folder / "figures", outcome)
 
 
 def _is_ours(report: Path) -> bool:

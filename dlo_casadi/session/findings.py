@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.diagnosis.diagnose import Diagnosis
+from dlo_casadi.diagnosis.diagnose import Diagnosis, pose_that_tells
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.result import Fit
@@ -82,16 +82,18 @@ def unexplained_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
 
 def next_pose_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
     """The pose that separates rival explanations, or None."""
-    if diagnosis.proposal is None:
+    told = pose_that_tells(diagnosis)
+    if told is None:
         return None
+    pose, rivals = told
     return {
-        "end": list(diagnosis.proposal.end),
-        "separates": list(diagnosis.proposal_for),
-        "expected_difference_m": diagnosis.proposal.difference,
+        "end": list(pose.end),
+        "separates": list(rivals),
+        "expected_difference_m": pose.difference,
         # In standard deviations of one measured line.
-        "expected_difference_std": diagnosis.proposal.separation,
+        "expected_difference_std": pose.separation,
         # Of a sensor of forces and moments: in N or N m, and in standard deviations of one reading.
-        "reading": asdict(diagnosis.proposal.reading),
+        "reading": asdict(pose.reading),
     }
 
 

@@ -12,6 +12,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.hyperparameters import first_reading_noise
+from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.mesh import fine_enough, mesh_error
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
@@ -73,17 +74,25 @@ def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) ->
     return max(min(count, 2), count - (model.start, model.end).count("clamped"))
 
 
-def solved_by_ipopt(fit: Fit) -> Fit:
-    """Minimum of the batch NLP, from the Gauss-Newton fit's; that one where IPOPT fails.
+def minimum_by_ipopt(fit: Fit) -> Point | None:
+    """Minimum of the batch NLP from the Gauss-Newton fit's; None where IPOPT fails.
 
     In space the fit's own: third derivatives of all elements would cost IPOPT minutes a run.
     """
     if fit.model.in_space:
-        return fit
+        return fit.point
     try:
-        point = solve_batch(fit.problem, fit.point).point
+        return solve_batch(fit.problem, fit.point).point
     except EstimationError:
+        return None
+
+
+def confirmed(fit: Fit, point: Point | None) -> Fit:
+    """The fit at IPOPT's minimum; as it is where IPOPT has failed, or ends higher."""
+    if point is None:
         return replace(fit, converged=False)
+    if point is fit.point:
+        return fit
     lower = point.objective <= fit.point.objective + 1e-6 * abs(fit.point.objective)
     return Fit(fit.problem, point, converged=True) if lower else fit
 

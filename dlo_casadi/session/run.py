@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -21,7 +22,9 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import fit_stiffness
+from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel
+from dlo_casadi.parallel import begin
 from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.declared import Declared, declared_model, straight
@@ -35,9 +38,10 @@ from dlo_casadi.session.findings import (
 )
 from dlo_casadi.session.fitting import (
     FIRST_MESH_IN_SPACE,
+    confirmed,
     fit_declared,
+    minimum_by_ipopt,
     reweighted,
-    solved_by_ipopt,
 )
 from dlo_casadi.session.measure import measured_poses, read_inputs
 from dlo_casadi.session.outcome import (
@@ -71,7 +75,7 @@ def run_session(
     Parameters
     ----------
     executor : Executor, optional
-        Where the search for missing effects does its refits; in this process by default.
+        Where what can be done at the same time is done; in this process by default.
 
     Raises
     ------
@@ -86,6 +90,8 @@ def run_session(
     clock = Clock()
     config = calibrated(config, lambda name, k, m: progress.step(f"calibrate {name}".strip(), k, m))
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
+    executor = executor or InProcess()
+    executor.submit(os.getpid)  # other processes start meanwhile
     try:
         with one_thread():
             return fit_session(config, inputs, clock, progress, executor)
@@ -99,7 +105,7 @@ def fit_session(
     inputs: Sequence[PoseInput],
     clock: Clock,
     progress: Progress,
-    executor: Executor | None = None,
+    executor: Executor,
 ) -> Outcome:
     """Fit and report a session whose poses have been read; raises as `run_session` does."""
     inputs, odd = without_implausible(config, inputs)
@@ -115,11 +121,13 @@ def fit_session(
         measured = reweighted(fit)
         fit, error = fit_declared(config, declared, measured, fit.model.n)
         clock.lap("fit")
-    fit = solved_by_ipopt(fit)
+    found = begin(executor, minimum_by_ipopt, fit)
     clock.lap("batch")
     progress.step("fit the declared model", 1, 1)
-
     stages = before_stages(config, declared, inputs, measured, fit.model.n, clock, progress)
+    fit = confirmed(fit, found())
+    clock.lap("batch")
+
     reported = _declared_names(config, fit.model)
     # A diagnosis that finds nothing replaces this stage, intervals and all.
     intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
@@ -170,7 +178,7 @@ def close_the_loop(
     center: tuple[float, float] | None,
     clock: Clock,
     progress: Progress,
-    executor: Executor | None,
+    executor: Executor,
 ) -> Outcome:
     """Diagnose the declared model's residual and add what is missing.
 
@@ -199,21 +207,22 @@ def close_the_loop(
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     if diagnosis.added:
-        fit = solved_by_ipopt(fit)
-    mesh = Discretization(fit.model.n, fit.model.element, error)
-    diagnosis = replace(diagnosis, after=fit)
-    complete = not diagnosis.added and not diagnosis.unexplained
-    intervals = profile_intervals(fit if complete or diagnosis.added else outcome.fit)
-    if diagnosis.added:
+        found = begin(executor, minimum_by_ipopt, fit)
+        next_pose = next_pose_row(diagnosis)
         first = profile_intervals(outcome.fit)
         stages[-1] = fit_stage("batch", outcome.fit, measured, first, reported)
+        fit = confirmed(fit, found())
         labels = {item.candidate.effect.label for item in diagnosis.added}
-        names = [name for name in fit.model.names if name.split(".")[0] in labels]
-        stages.append(fit_stage("closed", fit, measured, intervals, [*reported, *names]))
+        names = [*reported, *(name for name in fit.model.names if name.split(".")[0] in labels)]
+        intervals = profile_intervals(fit)
+        stages.append(fit_stage("closed", fit, measured, intervals, names))
     else:
+        next_pose = None
         # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
-        shown = fit if complete else outcome.fit
-        stages[-1] = fit_stage("batch", shown, measured, intervals, reported)
+        shown = outcome.fit if diagnosis.unexplained else fit
+        stages[-1] = fit_stage("batch", shown, measured, profile_intervals(shown), reported)
+    mesh = Discretization(fit.model.n, fit.model.element, error)
+    diagnosis = replace(diagnosis, after=fit)
     clock.lap("diagnosis")
     closed = replace(
         outcome,
@@ -227,7 +236,7 @@ def close_the_loop(
         effects=effect_rows(diagnosis),
         candidates=candidate_rows(diagnosis),
         unexplained=unexplained_row(diagnosis),
-        next_pose=next_pose_row(diagnosis),
+        next_pose=next_pose,
         structure=structure_rows(diagnosis),
         hidden_weight=hidden_weight_row(diagnosis),
         diagnosis=diagnosis,

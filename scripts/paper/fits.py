@@ -19,7 +19,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.parallel import map_in_order
-from dlo_casadi.session.fitting import solved_by_ipopt
+from dlo_casadi.session.fitting import confirmed, minimum_by_ipopt
 from dlo_casadi.session.stages import rest_curvature_of
 from dlo_casadi.tolerances import Tolerances
 from paper import published
@@ -141,7 +141,8 @@ def _batch(
     first = fit_model(model, measured, Tolerances())
     out = []
     for n in meshes:
-        fit = solved_by_ipopt(first if n == FIRST else refine_mesh(first, n))
+        finer = first if n == FIRST else refine_mesh(first, n)
+        fit = confirmed(finer, minimum_by_ipopt(finer))
         seconds = perf_counter() - begin
         interval = None
         if n == FIRST:

@@ -121,7 +121,7 @@ def test_a_result_predicts_as_its_file_does(result, written):
 def test_a_result_writes_what_the_command_writes(result, tmp_path, monkeypatch):
     filled = []
     for step in ("write_numbers", "draw"):
-        monkeypatch.setattr(writer, step, lambda folder, outcome: filled.append(outcome))
+        monkeypatch.setattr(writer, step, lambda folder, outcome, *_: filled.append(outcome))
     assert result.write(tmp_path / "rope") == tmp_path / "rope"
     assert filled == [result, result]
 

@@ -59,6 +59,7 @@ def drawn(path):
 
 
 def test_an_outcome_without_effects(outcome, tmp_path):
+    figures_poses.draw_poses(tmp_path, outcome)
     figures.write_figures(tmp_path, outcome)
 
     names = {path.name for path in tmp_path.iterdir()}
@@ -101,9 +102,9 @@ def test_nothing_is_drawn_of_what_is_missing(outcome, tmp_path):
 def test_stages_without_any_prediction_have_no_residuals(outcome, tmp_path):
     none = tuple(replace(stage, shapes={}) for stage in outcome.stages)
     figures.write_figures(tmp_path, replace(outcome, stages=none))
+    figures_poses.draw_poses(tmp_path, replace(outcome, stages=none))
 
-    assert (tmp_path / "poses.png").exists()
-    assert not (tmp_path / "residuals.png").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"poses.png", "errors.png"}
 
 
 def test_many_poses_take_several_pages(outcome, tmp_path, monkeypatch):

@@ -95,7 +95,8 @@ def test_earlier_results_stay_and_the_user_is_told_of_the_page(outcome, tmp_path
 
 
 def test_the_next_success_removes_the_page(outcome, tmp_path, monkeypatch):
-    monkeypatch.setattr(writer, "write_figures", lambda folder, outcome: None)
+    for step in ("write_figures", "draw_poses"):
+        monkeypatch.setattr(writer, step, lambda folder, outcome: None)
     target = tmp_path / "results"
     fail(target, outcome.config, DloError("broken"))
     assert [path.name for path in target.iterdir()] == ["failed.html"]

@@ -19,7 +19,7 @@ from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_file import load_parameters
 from dlo_casadi.report.parameters_text import final_rest, fit_dict, parameters_hash, parameters_text
 from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.fitting import solved_by_ipopt
+from dlo_casadi.session.fitting import confirmed, minimum_by_ipopt
 from dlo_casadi.session.measure import read_poses
 
 
@@ -311,7 +311,7 @@ def test_values_at_their_bounds_are_read_as_they_were_written(outcome, tmp_path,
 def test_a_fit_that_ends_at_a_bound_can_be_read(outcome, tmp_path):
     """IPOPT widens bounds by 1e-8 of them; here the softness would be -5e-10 m."""
     fit, _ = fitted("short_clean", BendingSoftening(), n=10)
-    fit = solved_by_ipopt(fit)
+    fit = confirmed(fit, minimum_by_ipopt(fit))
     assert fit.converged
     assert fit.value("bending_softening.softness") == 0.0
     assert np.array_equal(load_parameters(as_file(fit, outcome, tmp_path / "p.yaml")).p, fit.p)

@@ -9,6 +9,7 @@ from rich.console import Console
 from test_page import PROPOSAL, diagnosed
 
 from dlo_casadi.report.figures import write_figures
+from dlo_casadi.report.figures_poses import draw_poses
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.notebook import outcome_figure
 from dlo_casadi.report.page import report_page
@@ -82,6 +83,7 @@ def test_residuals_are_the_gap_across_the_cable(in_room):
 
 def test_every_figure_of_space_is_drawn(in_room, tmp_path):
     write_figures(tmp_path, in_room_pulled(in_room))
+    draw_poses(tmp_path, in_room_pulled(in_room))
     names = {"poses", "residuals", "rest_curvature", "errors", "candidates", "unexplained"}
     assert {path.stem for path in tmp_path.iterdir()} == names
     for path in tmp_path.iterdir():
