@@ -104,8 +104,8 @@ def fit(
         Told how far the run has come: an object with `step(name, done, total)` and
         `message(text)`.
     executor : Executor, optional
-        Where the search for missing effects does its refits, such as
-        `dlo_casadi.parallel.open_executor(jobs=2)`; in this process by default.
+        Where what can be done at the same time is done, such as
+        `dlo_casadi.parallel.open_executor(jobs=2, here=True)`; in this process by default.
 
     Returns
     -------

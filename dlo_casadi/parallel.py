@@ -154,6 +154,12 @@ def map_as_completed(
         future = executor.submit(_run, function, task.item, task.index, _text(logs))
         under_way[future] = task
 
+    def ended(task: Finished[Item, Result]) -> Finished[Item, Result]:
+        tally.add(task)
+        if progress is not None:
+            progress(tally.now())
+        return task
+
     try:
         while True:
             while again and room():
@@ -164,11 +170,7 @@ def map_as_completed(
             own = list(islice(waiting, int(here)))
             for index, item in own:
                 taken += 1
-                ended = Finished(index, item, *_run(function, item, index, None))
-                tally.add(ended)
-                if progress is not None:
-                    progress(tally.now())
-                yield ended
+                yield ended(Finished(index, item, *_run(function, item, index, None)))
             if not under_way:
                 if own:
                     continue
@@ -200,11 +202,7 @@ def map_as_completed(
                     result, error, seconds, worker = future.result()
                 else:
                     result, seconds, worker = None, 0.0, ""
-                finished = Finished(task.index, task.item, result, error, seconds, worker)
-                tally.add(finished)
-                if progress is not None:
-                    progress(tally.now())
-                yield finished
+                yield ended(Finished(task.index, task.item, result, error, seconds, worker))
     finally:
         for future in under_way:
             future.cancel()

@@ -18,6 +18,7 @@ from dlo_casadi.executors import InProcess
 from dlo_casadi.parallel import (
     LostTaskError,
     Tally,
+    begin,
     generator_of,
     map_as_completed,
     map_in_order,
@@ -57,10 +58,58 @@ def draw(index):
     return generator_of(7, index).standard_normal(3).tolist()
 
 
+def slowly(x):
+    time.sleep(0.05)
+    return x, os.getpid()
+
+
+def kill_elsewhere(pid):
+    if os.getpid() != pid:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return "done here"
+
+
 @pytest.fixture(scope="module")
 def pool():
     with open_executor(jobs=2) as executor:
         yield executor
+
+
+@pytest.fixture(scope="module")
+def two_of_us():
+    with open_executor(jobs=2, here=True, libraries=("dlo_casadi.pose",)) as executor:
+        executor.submit(os.getpid).result()
+        yield executor
+
+
+def test_this_process_does_its_share(two_of_us):
+    for count in (2, 3, 12):
+        done = map_in_order(two_of_us, slowly, range(count))
+        assert [x for x, _ in done] == list(range(count))
+        own = sum(pid == os.getpid() for _, pid in done)
+        assert len({pid for _, pid in done}) == 2
+        assert abs(own - count / 2) <= 1.5, "nobody waits while there is work"
+    assert map_in_order(two_of_us, slowly, [7]) == [(7, os.getpid())]
+    ended = {done.item: done for done in map_as_completed(two_of_us, root, iter([4.0, -1.0, 9.0]))}
+    assert (ended[4.0].value, ended[9.0].value) == (2.0, 3.0)
+    with pytest.raises(EquilibriumError):
+        _ = ended[-1.0].value
+
+
+def test_one_call_beside_others(two_of_us):
+    beside, here = begin(two_of_us, slowly, 3), begin(InProcess(), slowly, 3)
+    assert beside()[0] == here()[0] == 3
+    assert beside()[1] != here()[1] == os.getpid()
+    with pytest.raises(EquilibriumError):
+        begin(two_of_us, root, -1.0)()
+    with pytest.raises(EquilibriumError):
+        begin(InProcess(), root, -1.0)()
+
+
+def test_one_call_whose_worker_is_killed_is_done_here():
+    with open_executor(jobs=2, here=True) as executor:
+        assert begin(executor, kill_elsewhere, os.getpid())() == "done here"
+        assert map_in_order(executor, square, range(4)) == [0, 1, 4, 9]
 
 
 def test_in_process_results_come_one_by_one_and_in_order():

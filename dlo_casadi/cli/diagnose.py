@@ -11,12 +11,13 @@ from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import (
-    add_jobs_of_one,
+    SESSION_JOBS,
+    add_jobs,
     command,
     configuration,
     console,
-    jobs_of_one,
     print_json,
+    session_executor,
 )
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.report.json_report import report_dict
@@ -41,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     )
     parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
     parser.add_argument("--output", type=Path, metavar="DIR", help="write the results there")
-    add_jobs_of_one(parser)
+    add_jobs(parser, SESSION_JOBS)
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     chosen = parser.parse_args(argv)
@@ -53,7 +54,7 @@ def main(argv: Sequence[str]) -> int:
     with (
         results as folder,
         Watch(Console(stderr=True), chosen.quiet) as watch,
-        jobs_of_one(chosen.jobs) as executor,
+        session_executor(chosen.jobs) as executor,
     ):
         watch.warn(config.warnings)
         outcome = run_session(config, watch, executor)

@@ -10,12 +10,13 @@ from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import (
-    add_jobs_of_one,
+    SESSION_JOBS,
+    add_jobs,
     command,
     configuration,
     console,
-    jobs_of_one,
     print_json,
+    session_executor,
 )
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.report.json_report import report_dict
@@ -27,7 +28,7 @@ EXAMPLES = """\
 dlo fit configs/cable.yaml                       writes results/cable/
 dlo fit rope.yaml --output results/monday        to a folder of your choice
 dlo fit rope.yaml --no-diagnosis                 only the declared model: much faster
-dlo fit rope.yaml --jobs 2                       the search for effects on two cores
+dlo fit rope.yaml --jobs 1                       in one process: slower, and lighter
 dlo fit rope.yaml --quiet --json > rope.json     report.json to a program"""
 
 
@@ -46,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
         metavar="DIR",
         help="folder of the results; default results/<config name>/",
     )
-    add_jobs_of_one(parser)
+    add_jobs(parser, SESSION_JOBS)
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print report.json instead of tables")
     parser.add_argument(
@@ -62,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
     with (
         ResultsFolder(output, config) as folder,
         Watch(Console(stderr=True), chosen.quiet) as watch,
-        jobs_of_one(chosen.jobs) as executor,
+        session_executor(chosen.jobs) as executor,
     ):
         watch.warn(config.warnings)
         outcome = run_session(config, watch, executor)

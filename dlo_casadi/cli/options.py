@@ -6,9 +6,8 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,8 @@ from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.parallel import open_executor
 
+# Processes of a single session; it has nothing to do for a third.
+SESSION_JOBS = min(2, os.cpu_count() or 1)
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
 
@@ -46,17 +47,10 @@ def add_jobs(parser: argparse.ArgumentParser, default: int = 1) -> None:
     parser.add_argument("--jobs", type=int, default=default, metavar="N", help=text)
 
 
-def add_jobs_of_one(parser: argparse.ArgumentParser) -> None:
-    """Add `--jobs` of a single session: two where there are two processors, more save nothing."""
-    add_jobs(parser, min(2, os.cpu_count() or 1))
-
-
-@contextmanager
-def jobs_of_one(jobs: int) -> Iterator[Executor]:
-    """Open where a single session is fitted and drawn."""
+def session_executor(jobs: int) -> AbstractContextManager[Executor]:
+    """Open where one session is fitted and drawn: here, and in `jobs` - 1 other processes."""
     libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
-    with open_executor(jobs, here=True, libraries=libraries) as executor:
-        yield executor
+    return open_executor(jobs, here=True, libraries=libraries)
 
 
 def configuration(path: Path) -> Config:

@@ -46,6 +46,14 @@ def test_folds_where_a_state_is_carried(fit, pool):
     assert np.array_equal(here.squares, there.squares)
 
 
+def test_score_tests(fit, pool):
+    here, there = screen(fit, None, ()), screen(fit, None, (), pool)
+    assert len(here) > 10
+    assert [(x.candidate.name, x.score, x.start) for x in here] == [
+        (x.candidate.name, x.score, x.start) for x in there
+    ]
+
+
 def test_refits_of_candidates(fit, pool):
     best = screen(fit, None, ())[:2]
     work = _Confirm(fit)
