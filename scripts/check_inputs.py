@@ -103,7 +103,7 @@ def make_case(bases: Bases, seed: int, index: int) -> Case:
             files[name] = mutations.changed_points(files[name], random)
     files[CONFIG] = text
     if family == "fit":
-        return Case(family, files, ["fit", CONFIG, "--output", "results", "--quiet"])
+        return Case(family, files, ["fit", CONFIG, "--output", "results", "--quiet", "--jobs", "1"])
     return Case(family, files, ["check", CONFIG, *(["--json"] if random.random() < 0.5 else [])])
 
 
