@@ -22,6 +22,8 @@ from dlo_casadi.parallel import map_in_order
 SHARES = (1.0, 0.5, 0.2, 0.05)
 # Share of the gain that the score promises, from which on a refit that creeps is not tried again.
 PROMISED = 0.5
+# Starts whose objectives end nearer than that have led to one minimum, as those between would.
+SAME = 1.0
 # Gauss-Newton steps of one refit.
 MOST_STEPS = 25
 
@@ -125,8 +127,11 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
             )
         except EstimationError:
             continue
+        same = best is not None and abs(fit.point.objective - best.point.objective) < SAME
         if best is None or fit.point.objective < best.point.objective:
             best = fit
+        if same:
+            break
         gain = 2 * (base.point.objective - best.point.objective)
         if gain > 0 and (best.converged or gain > PROMISED * screened.score):
             break

@@ -63,7 +63,13 @@ from dlo_casadi.session.remarks import (
     worse_than_simpler,
 )
 from dlo_casadi.session.simpler import not_worse
-from dlo_casadi.session.stages import algorithm1_stage, fit_stage, initial_stage, stiffness_stage
+from dlo_casadi.session.stages import (
+    algorithm1_stage,
+    fit_stage,
+    fitted_parameters,
+    initial_stage,
+    stiffness_stage,
+)
 from dlo_casadi.workers import one_thread
 
 
@@ -129,7 +135,7 @@ def fit_session(
     clock.lap("batch")
 
     reported = _declared_names(config, fit.model)
-    # A diagnosis that finds nothing replaces this stage, intervals and all.
+    # A diagnosis that finds nothing replaces this stage; intervals are taken after it.
     intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
     stages.append(fit_stage("batch", fit, measured, intervals, reported))
     better = not_worse(fit, stages)
@@ -209,18 +215,19 @@ def close_the_loop(
     if diagnosis.added:
         found = begin(executor, minimum_by_ipopt, fit)
         next_pose = next_pose_row(diagnosis)
-        first = profile_intervals(outcome.fit)
-        stages[-1] = fit_stage("batch", outcome.fit, measured, first, reported)
+        stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
         fit = confirmed(fit, found())
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [*reported, *(name for name in fit.model.names if name.split(".")[0] in labels)]
         intervals = profile_intervals(fit)
         stages.append(fit_stage("closed", fit, measured, intervals, names))
+    elif diagnosis.unexplained:
+        next_pose = None
+        stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
     else:
         next_pose = None
         # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
-        shown = outcome.fit if diagnosis.unexplained else fit
-        stages[-1] = fit_stage("batch", shown, measured, profile_intervals(shown), reported)
+        stages[-1] = fit_stage("batch", fit, measured, profile_intervals(fit), reported)
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
     clock.lap("diagnosis")
@@ -284,6 +291,11 @@ def before_stages(
         progress.step("the paper's loop", 1, 1)
     clock.lap("fit")
     return stages
+
+
+def with_intervals(stage: Stage, fit: Fit, reported: Sequence[str]) -> Stage:
+    """A stage of a fit, with the intervals that it was made without."""
+    return replace(stage, parameters=fitted_parameters(fit, profile_intervals(fit), reported))
 
 
 def versions() -> dict[str, str]:

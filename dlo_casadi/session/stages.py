@@ -263,6 +263,24 @@ def fit_stage(
     reported : sequence of str
         Qualified names of the parameters that are effects, not nuisances.
     """
+    return _stage(
+        name,
+        fit.model,
+        fit.p,
+        fit.rest,
+        measured,
+        fitted_parameters(fit, intervals, reported),
+        rest_curvature_of(fit),
+        fit.chi2_of_points,
+        uncertainty=Uncertainty.of(fit),
+        fitted={fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used},
+    )
+
+
+def fitted_parameters(
+    fit: Fit, intervals: Mapping[str, Interval], reported: Sequence[str] = ()
+) -> dict[str, ParameterEstimate]:
+    """What a fit says of its parameters; see `fit_stage`."""
     model = fit.model
     parameters: dict[str, ParameterEstimate] = {}
     for full, interval in intervals.items():
@@ -285,18 +303,7 @@ def fit_stage(
         parameters[qualified] = ParameterEstimate(
             value, fit.std(qualified), q.unit, at_bound=at_bound
         )
-    return _stage(
-        name,
-        model,
-        fit.p,
-        fit.rest,
-        measured,
-        parameters,
-        rest_curvature_of(fit),
-        fit.chi2_of_points,
-        uncertainty=Uncertainty.of(fit),
-        fitted={fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used},
-    )
+    return parameters
 
 
 def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
