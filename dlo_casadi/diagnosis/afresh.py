@@ -18,17 +18,16 @@ from dlo_casadi.assembly import Shapes
 from dlo_casadi.composition import END_ROLL
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.fit import (
-    FIRST_LOOK,
-    MORE,
     ROUGHNESS_START,
     SEARCH_STD,
     STEPS_OF_A_RIVAL,
-    with_border_of,
 )
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes, twists
+from dlo_casadi.estimation.starting_points import FIRST_LOOK, MORE
+from dlo_casadi.estimation.transfer import with_border_of
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
 

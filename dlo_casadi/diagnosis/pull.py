@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import DECADES, fit_model, starting_points
+from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.starting_points import DECADES, starting_points
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel

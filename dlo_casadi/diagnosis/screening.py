@@ -28,11 +28,11 @@ from scipy.special import chdtrc, fdtrc
 from dlo_casadi.assembly import Shapes
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import StateEffect
-from dlo_casadi.estimation.fit import carried_shapes
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
 from dlo_casadi.estimation.linearization import Linearization, Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.sweep import Sweep
+from dlo_casadi.estimation.transfer import carried_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel

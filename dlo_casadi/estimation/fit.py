@@ -1,4 +1,4 @@
-"""Fit of a model to all measured poses: where to start, and from one model or mesh to another."""
+"""Fit of a model to all measured poses: the best of some starts, or from a similar fit."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Shapes
-from dlo_casadi.composition import END_ROLL, STIFFNESSES
-from dlo_casadi.errors import EquilibriumError, EstimationError
+from dlo_casadi.composition import END_ROLL
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.hyperparameters import (
     SCATTER_FLOOR,
@@ -25,35 +24,19 @@ from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import (
-    Guess,
-    all_at_once,
-    equilibria_near,
-    measured_shapes,
-    turned_either_way,
-)
+from dlo_casadi.estimation.starting_points import DECADES, ROLLS, starting_points
+from dlo_casadi.estimation.transfer import carried_feet, carried_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model import CableModel
-from dlo_casadi.solve import continued, solve_equilibrium
 from dlo_casadi.thresholds import DIFFERENT
 from dlo_casadi.tolerances import Tolerances
 
 FloatArray = NDArray[np.floating]
 
-# Decades about the prior stiffness from which fits are started.
-DECADES = (0, -1, 1, -2, 2, -3, 3)
-# Rolls of the end [rad] about which twists are counted in turn: a standard deviation to both sides.
-ROLLS = (0.0, 1.0, -1.0)
 # Tried where from those nothing comes near, all twists either way round: a cable rolled by 2.05 rad
 # was not found, nor one by 2.3 rad of which one pose's twist came within 0.1 rad of half a turn.
 FAR_ROLLS = (0.0, 1.0, -1.0, 2.0, -2.0)
 BETWEEN_DECADES = (-0.5, 0.5, -1.5, 1.5, -2.5, 2.5, -3.5, 3.5)
-# Iterations of all starts, and how many more the promising ones take in space, where frames take
-# longer: at the true stiffnesses, none of three sessions in which an effect is missing had settled
-# after 6 whole steps, two had after 12 to 20, one had not.
-FIRST_LOOK, MORE = 6, 14
-# Starts that are descended from, and unknowns [scaled] within which two starts are one.
-DESCENTS, ALIKE = 3, 1e-2
 # Of many poses only so many, evenly picked, are searched for where to start with all.
 POSES_OF_A_SEARCH = 40
 # Iterations in which a start that is not the first has to come below the best minimum. In one
@@ -79,68 +62,6 @@ FIRST_STD = 3e-4
 ROUGHNESS_START = 0.3
 # Turns per length, several times what heavy cables were measured to have, 0.1 to 0.3 1/m.
 FIRST_REST_TURNS = 0.05
-
-
-def starting_points(
-    problem: BatchProblem,
-    theta: FloatArray,
-    decades: Sequence[float] = DECADES,
-    rolls: Sequence[float] = ROLLS,
-    *,
-    either_way: bool = False,
-) -> list[Point]:
-    """Equilibria near the measured shapes for stiffnesses over decades, best first.
-
-    All starts take a few iterations, then the most promising take more, until as many as are
-    descended from have led to equilibria. `either_way`: see `turned_either_way`.
-    """
-    names = problem.unknowns.names
-    # Bending and torsion go together: their ratio is known better than either.
-    stiffnesses = [k for k, name in enumerate(names) if name in STIFFNESSES]
-    rolls = rolls if END_ROLL in names else (0.0,)
-    # The roll of a cable in its end clamp is as unknown as its rest shape.
-    held = np.array([k < problem.unknowns.n_parameters for k in range(len(names))])
-    held &= np.array([name != END_ROLL for name in names])
-    guesses: list[Guess] = []
-    for roll in rolls:
-        shapes, feet = measured_shapes(problem, roll)
-        if not problem.has_metric:
-            problem.refresh(theta, shapes, feet)
-        rolled = theta.copy()
-        if roll:
-            own = names.index(END_ROLL)
-            rolled[own] += roll / problem.unknowns.scales[own]
-        if either_way:
-            still = held | (np.array(names) == END_ROLL)
-            turned = turned_either_way(problem, Guess(rolled, shapes, feet), still, roll)
-            shapes, feet = turned.shapes, turned.feet
-        for decade in decades:
-            start = rolled.copy()
-            start[stiffnesses] += decade * np.log(10)
-            guess = all_at_once(problem, Guess(start, shapes, feet), held, FIRST_LOOK)
-            if guess is not None:
-                guesses.append(guess)
-    found: list[Point] = []
-    for guess in _promising(guesses):
-        if len(found) == DESCENTS:
-            break
-        more = all_at_once(problem, guess, held, MORE) if problem.unknowns.model.in_space else None
-        for one in (more, guess):
-            point = None if one is None else equilibria_near(problem, one)
-            if point is not None:
-                found.append(point)
-                break
-    return sorted(found, key=lambda point: point.objective)
-
-
-def _promising(guesses: Sequence[Guess]) -> list[Guess]:
-    """Guesses that differ, the best first."""
-    ranked = sorted(guesses, key=lambda guess: guess.objective)
-    return [
-        guess
-        for k, guess in enumerate(ranked)
-        if not any(np.allclose(guess.theta, other.theta, atol=ALIKE) for other in ranked[:k])
-    ]
 
 
 def fit_model(
@@ -384,64 +305,11 @@ def _continue(
     shapes, solved = problem.sweep.solve(carried_shapes(problem, start), p, unknowns.rest(theta))
     if not solved.all():
         raise EstimationError("the shapes of the first fit are no equilibria of the second model")
-    feet = _feet_for(problem, start)
+    feet = carried_feet(problem, start)
     problem.share_metric(start.problem)
     point = problem.evaluate(theta, shapes, feet)
     point, converged = problem.descend(point, max_iterations)
     return Fit(problem, point, converged)
-
-
-def carried_shapes(problem: BatchProblem, start: Fit) -> Shapes:
-    """Shapes of a problem's poses from those of a fit, on the problem's mesh.
-
-    Poses that the fit did not need, because it carried no state, are predicted.
-
-    Raises
-    ------
-    EstimationError
-        If such a pose has no equilibrium.
-    """
-    known = {index: k for k, index in enumerate(start.problem.indices)}
-    own = start.point.shapes
-    rows = []
-    for index in problem.indices:
-        if index in known:
-            k = known[index]
-            rows.append((own.x[k], own.lam[k], own.deviation[k]))
-            continue
-        pose = problem.history[index].pose
-        try:
-            if pose.branch == "previous" and rows:
-                before = problem.history[index - 1].pose
-                found = continued(start.model, start.p, start.rest, pose, before, rows[-1][0])
-            else:
-                found = solve_equilibrium(start.model, start.p, start.rest, pose)
-        except EquilibriumError as error:
-            raise EstimationError(error.message) from error
-        rows.append((found.x, found.multipliers, np.zeros(len(start.model.deviation_names))))
-    x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
-    model = problem.unknowns.model
-    shapes = with_border_of(Shapes(x, lam, deviation), start.model, model)
-    return on_other_mesh(shapes, start.model, model)
-
-
-def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
-    """Nodes interpolated from one model's mesh to another's."""
-    if model.chain == other.chain:
-        return shapes
-    coarse, fine = model.chain.places, other.chain.places
-    return replace(shapes, x=other.chain.kind.node.interpolated(fine, coarse, shapes.x))
-
-
-def with_border_of(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
-    """Multipliers in another model's order; what it has beside them begins at zero."""
-    if model.border_names == other.border_names:
-        return shapes
-    lam = np.zeros((len(shapes.lam), other.n_border))
-    for i, name in enumerate(other.border_names):
-        if name in model.border_names:
-            lam[:, i] = shapes.lam[:, model.border_names.index(name)]
-    return replace(shapes, lam=lam)
 
 
 def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
@@ -475,9 +343,3 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
         moved.problem, moved.point, estimate=not fit.noise.known, rounds=2, modes=modes
     )
     return Fit(problem, point, converged)
-
-
-def _feet_for(problem: BatchProblem, start: Fit) -> list[FloatArray]:
-    """Feet of the problem's fitted poses, by the pose's place in the session."""
-    known = dict(zip(start.problem.fitted, start.point.feet, strict=True))
-    return [known[k] for k in problem.fitted]

@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 from benchmarks.space_ipopt import Ipopt
 from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.codegen import plane, space
-from dlo_casadi.codegen.compiled import shape_record
 from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.kernels import kernels_of
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.poses import frame_poses
+from dlo_casadi.codegen.records import shape_record
 from dlo_casadi.composition import EndKind, StartKind
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium import JOINT_BOUND

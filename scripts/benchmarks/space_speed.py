@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.random_cables import SpaceProblem
 from benchmarks.speed import FLAGS, HERE, summary
 from dlo_casadi.codegen import CompiledSpaceSolver, generate
-from dlo_casadi.codegen.compiled import shape_record
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.poses import frame_poses
+from dlo_casadi.codegen.records import shape_record
 from dlo_casadi.effects import Cable
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
