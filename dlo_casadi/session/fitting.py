@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -74,25 +75,36 @@ def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) ->
     return max(min(count, 2), count - (model.start, model.end).count("clamped"))
 
 
-def minimum_by_ipopt(fit: Fit) -> Point | None:
-    """Minimum of the batch NLP from the Gauss-Newton fit's; None where IPOPT fails.
+@dataclass(frozen=True)
+class Minimum:
+    """Minimum of the batch NLP as IPOPT has found it, None where it fails, and its time [s]."""
 
-    In space the fit's own: third derivatives of all elements would cost IPOPT minutes a run.
+    point: Point | None
+    seconds: float
+
+
+def minimum_by_ipopt(fit: Fit) -> Minimum:
+    """Minimum of the batch NLP, from the Gauss-Newton fit's; none is looked for in space.
+
+    Third derivatives of all elements would cost IPOPT minutes a run there.
     """
     if fit.model.in_space:
-        return fit.point
+        return Minimum(None, 0.0)
+    began = time.perf_counter()
     try:
-        return solve_batch(fit.problem, fit.point).point
+        point = solve_batch(fit.problem, fit.point).point
     except EstimationError:
-        return None
+        point = None
+    return Minimum(point, time.perf_counter() - began)
 
 
-def confirmed(fit: Fit, point: Point | None) -> Fit:
-    """The fit at IPOPT's minimum; as it is where IPOPT has failed, or ends higher."""
+def confirmed(fit: Fit, found: Minimum) -> Fit:
+    """The fit at IPOPT's minimum; as it is in space, and where IPOPT has failed or ends higher."""
+    point = found.point
+    if fit.model.in_space:
+        return fit
     if point is None:
         return replace(fit, converged=False)
-    if point is fit.point:
-        return fit
     lower = point.objective <= fit.point.objective + 1e-6 * abs(fit.point.objective)
     return Fit(fit.problem, point, converged=True) if lower else fit
 

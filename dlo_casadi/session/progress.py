@@ -32,7 +32,7 @@ class Silent:
 
 
 class Clock:
-    """Wall-clock time per part of the run."""
+    """Wall-clock time per part of the run; parts that run beside one another both count."""
 
     def __init__(self) -> None:
         self._begin = time.perf_counter()
@@ -44,6 +44,10 @@ class Clock:
         now = time.perf_counter()
         self.parts[name] = self.parts.get(name, 0.0) + now - self._last
         self._last = now
+
+    def add(self, name: str, seconds: float) -> None:
+        """Add the time [s] that a named part has taken beside others."""
+        self.parts[name] = self.parts.get(name, 0.0) + seconds
 
     def total(self) -> dict[str, float]:
         """All parts and the total [s]."""

@@ -127,13 +127,12 @@ def fit_session(
         measured = reweighted(fit)
         fit, error = fit_declared(config, declared, measured, fit.model.n)
         clock.lap("fit")
-    found = begin(executor, minimum_by_ipopt, fit)
-    clock.lap("batch")
+    beside = begin(executor, minimum_by_ipopt, fit)
     progress.step("fit the declared model", 1, 1)
     stages = before_stages(config, declared, inputs, measured, fit.model.n, clock, progress)
-    fit = confirmed(fit, found())
-    clock.lap("batch")
-
+    found = beside()
+    fit = confirmed(fit, found)
+    clock.add("batch", found.seconds)
     reported = _declared_names(config, fit.model)
     # A diagnosis that finds nothing replaces this stage; intervals are taken after it.
     intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
@@ -213,10 +212,10 @@ def close_the_loop(
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     if diagnosis.added:
-        found = begin(executor, minimum_by_ipopt, fit)
+        beside = begin(executor, minimum_by_ipopt, fit)
         next_pose = next_pose_row(diagnosis)
         stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
-        fit = confirmed(fit, found())
+        fit = confirmed(fit, beside())
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [*reported, *(name for name in fit.model.names if name.split(".")[0] in labels)]
         intervals = profile_intervals(fit)

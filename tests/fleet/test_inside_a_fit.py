@@ -1,5 +1,7 @@
 """Starts, folds, candidates and pulls of one fit give the same digits in other processes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tiny_sessions import write_session
@@ -12,6 +14,7 @@ from dlo_casadi.diagnosis.search import screen
 from dlo_casadi.effects import RestCurvatureDrift
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.parallel import map_in_order, open_executor
+from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.session import run_session
 
 
@@ -25,6 +28,17 @@ def fit(tmp_path_factory):
 def pool():
     with open_executor(jobs=2) as executor:
         yield executor
+
+
+def test_a_whole_session(tmp_path):
+    config = load_config(write_session(tmp_path / "cable", "thin"))
+    asked = config.diagnosis.model_copy(update={"enabled": True, "max_effects": 1})
+    config = replace(config, diagnosis=asked)
+    with open_executor(jobs=2, here=True) as executor:
+        both = [report_dict(run_session(config, executor=where)) for where in (None, executor)]
+    for report in both:
+        del report["timing_s"]
+    assert both[0] == both[1]
 
 
 class _Confirm:
