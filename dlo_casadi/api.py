@@ -104,8 +104,9 @@ def fit(
         Told how far the run has come: an object with `step(name, done, total)` and
         `message(text)`.
     executor : Executor, optional
-        Where what can be done at the same time is done, such as
-        `dlo_casadi.parallel.open_executor(jobs=2, here=True)`; in this process by default.
+        Where what can be done at the same time is done; in this process by default. In a script,
+        below `if __name__ == "__main__":`, `with open_executor(2, here=True) as executor` of
+        `dlo_casadi.parallel` opens one.
 
     Returns
     -------

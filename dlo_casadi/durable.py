@@ -138,7 +138,10 @@ class FolderDraft:
         obsolete : iterable of str
             Names of ours that go even if the draft holds nothing of that name.
         """
-        for folder, *_ in os.walk(self.folder):
+        for folder, _, files in os.walk(self.folder):
+            for name in files:
+                if name.startswith(_DRAFT):  # of a process that was killed
+                    Path(folder, name).unlink()
             _sync_folder(Path(folder))
         with _explained(self.path):
             if os.path.exists(self.path):

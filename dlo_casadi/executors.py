@@ -1,7 +1,8 @@
 """Where tasks run: in this process, in a pool of processes, or on a Dask cluster.
 
-Each is a `concurrent.futures.Executor`; `parallel.py` uses no more than that and what
-`capacity` and `losses` tell.
+Each is a `concurrent.futures.Executor` that tells `parallel.py` how many `workers` do its tasks,
+how many tasks may be under way (`capacity`), whether this process does some of them (`here`), how
+a lost worker shows (`losses`), and where workers keep their `logs`.
 """
 
 from __future__ import annotations
@@ -10,15 +11,19 @@ import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 from dlo_casadi.durable import make_folder
 from dlo_casadi.errors import DloError
-from dlo_casadi.workers import THREADS, begin_worker, environment, signals_held, software
+from dlo_casadi.workers import THREADS, begin_worker, environment, interrupts_held, software
 
 # How long a scheduler may take to answer, and to have a worker [s].
 PATIENCE = 30.0
+# How long a process that is told to end is waited for [s]: one that is just starting takes one.
+LAST_WORDS = 2.0
 
 
 class InProcess(Executor):
@@ -26,6 +31,7 @@ class InProcess(Executor):
 
     workers = 1
     capacity = 1
+    here = False
     losses: tuple[type[BaseException], ...] = ()
     logs: Path | None = None
 
@@ -67,7 +73,8 @@ class Pool(Executor):
         self.workers = others + here
         self.capacity = 2 * others
         self.logs, self.libraries = logs, tuple(libraries)
-        self._others = set(multiprocessing.active_children())
+        self._processes: set[BaseProcess] = set()
+        self._tasks: WeakSet[Future[Any]] = WeakSet()
         # A worker inherits it, and loads its libraries after that.
         self._environment = ExitStack()
         self._environment.enter_context(environment(THREADS))
@@ -84,21 +91,31 @@ class Pool(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit to the pool, to a new one if a worker of the last was killed."""
-        with signals_held():  # the first task starts the processes
-            try:
-                return self._inner.submit(fn, *args, **kwargs)
-            except BrokenExecutor:
-                self._inner.shutdown()
-                self._inner = self._start()
-                return self._inner.submit(fn, *args, **kwargs)
+        try:
+            return self._submitted(fn, *args, **kwargs)
+        except BrokenExecutor:
+            self._inner.shutdown()
+            self._inner = self._start()
+            return self._submitted(fn, *args, **kwargs)
+
+    def _submitted(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        before = set(multiprocessing.active_children())
+        with interrupts_held():  # the first task starts the processes
+            future = self._inner.submit(fn, *args, **kwargs)
+        self._processes |= set(multiprocessing.active_children()) - before
+        self._tasks.add(future)
+        return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers; with `wait=False` those in the middle of a task, too."""
-        own = set(multiprocessing.active_children()) - self._others
+        # One without a task is not waited for: it takes half a second to end by itself.
+        wait = wait and not all(task.done() for task in self._tasks)
         self._inner.shutdown(wait, cancel_futures=cancel_futures)
         if not wait:
-            for process in own:
+            for process in self._processes:
                 process.terminate()
+            for process in self._processes:
+                process.join(LAST_WORDS)
         self._environment.close()
 
 
@@ -220,8 +237,8 @@ def open_executor(
     logs : Path, optional
         Folder of the workers' logs, made if it is missing.
     here : bool
-        Whether this process is one of the `jobs`: for few tasks, none of which can crash. Else it
-        waits for the others, and outlives them.
+        Whether this process is one of the `jobs`, and does what a lost worker has left: for tasks
+        none of which can crash. Else it waits for the others, and outlives them.
     libraries : sequence of str
         Modules that other processes import before they are asked for anything.
 
@@ -250,5 +267,4 @@ def open_executor(
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         raise
-    # Its tasks are done: that other processes end takes half a second.
-    executor.shutdown(wait=not here)
+    executor.shutdown()

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Sequence, Sized
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
@@ -15,7 +16,7 @@ from typing import Any, Generic, TypeVar, cast
 import numpy as np
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.executors import open_executor
+from dlo_casadi.executors import InProcess, open_executor
 from dlo_casadi.workers import one_thread, worker_log, worker_name
 
 __all__ = [
@@ -111,8 +112,9 @@ def map_as_completed(
 
     What the function raises ends its own item alone. A task that is lost with a killed worker
     is given to another, in its last repetition with no task beside it; one that is lost every
-    time ends with a `LostTaskError`. Each task has one thread of BLAS, OpenMP and OpenCV, so
-    that its numbers do not depend on where it runs.
+    time ends with a `LostTaskError`. Where this process is one of the executor's workers it does
+    tasks between those that it hands out, and those that are lost. Each task has one thread of
+    BLAS, OpenMP and OpenCV, so that its numbers do not depend on where it runs.
 
     Parameters
     ----------
@@ -154,6 +156,9 @@ def map_as_completed(
         future = executor.submit(_run, function, task.item, task.index, _text(logs))
         under_way[future] = task
 
+    def done_here(task: _Task[Item]) -> tuple[Result | None, Exception | None, float, str]:
+        return _run(function, task.item, task.index, None)
+
     def ended(task: Finished[Item, Result]) -> Finished[Item, Result]:
         tally.add(task)
         if progress is not None:
@@ -170,7 +175,7 @@ def map_as_completed(
             own = list(islice(waiting, int(here)))
             for index, item in own:
                 taken += 1
-                yield ended(Finished(index, item, *_run(function, item, index, None)))
+                yield ended(Finished(index, item, *done_here(_Task(index, item))))
             if not under_way:
                 if own:
                     continue
@@ -184,6 +189,9 @@ def map_as_completed(
                 if future.cancelled():
                     raise LostTaskError("the executor was shut down with tasks under way")
                 error = future.exception()
+                if here and isinstance(error, losses):
+                    yield ended(Finished(task.index, task.item, *done_here(task)))
+                    continue
                 if isinstance(error, losses):
                     task.lost += 1
                     if task.lost < retries:
@@ -223,21 +231,32 @@ def map_in_order(
 
 
 def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Callable[[], Result]:
-    """Begin one call; what is returned waits for its result, or raises what it raised.
+    """Begin one call beside others; what is returned waits for it, and raises what it raised.
 
-    It is made here and at once where the executor has no process of its own, and made here again
-    where its worker is killed.
+    It is made here, at once, where the executor has no worker but this process, and again where its
+    worker is killed. As each task of `map_as_completed` it has one thread.
     """
+    call = partial(_run, _called, (function, args), 0)
+    elsewhere = getattr(executor, "workers", 1) > 1
+    logs = _text(getattr(executor, "logs", None))
+    begun = (executor if elsewhere else InProcess()).submit(call, logs)
     losses = getattr(executor, "losses", (BrokenExecutor,))
-    future = executor.submit(function, *args)
 
     def result() -> Result:
         try:
-            return future.result()
+            found, error, _, _ = begun.result()
         except losses:
-            return function(*args)
+            found, error, _, _ = call(None)
+        if error is not None:
+            raise error
+        return cast(Result, found)
 
     return result
+
+
+def _called(call: tuple[Callable[..., Result], tuple[Any, ...]]) -> Result:
+    function, args = call
+    return function(*args)
 
 
 def generator_of(seed: int, index: int) -> np.random.Generator:

@@ -29,8 +29,8 @@ THREADS = dict.fromkeys(
     "1",
 )
 
-# By which a command is interrupted.
-HELD = (signal.SIGINT, signal.SIGTERM)
+# Signals by which a command is interrupted.
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
@@ -65,27 +65,35 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def signals_held() -> Iterator[None]:
+def interrupts_held() -> Iterator[None]:
     """Hold interrupts back while processes are started, and in them until `begin_worker`.
 
     A process that is interrupted half way in its start, or whose parent is, prints its stack.
     """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
+    if threading.current_thread() is not threading.main_thread():
+        yield  # interrupts are the main thread's
         return
     resource_tracker.ensure_running()  # which lets go of the signals when it starts
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, HELD)
+    received: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in INTERRUPTS}
+    # What is started inherits the mask; here another thread may take the signal all the same.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
+    for number in INTERRUPTS:
+        signal.signal(number, lambda number, _: received.append(number))
     try:
         yield
     finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for one in received:
+            signal.raise_signal(one)
 
 
 def begin_worker(logs: str | None, libraries: Sequence[str] = ()) -> None:
     """Leave interrupts to the parent, end with it, keep the stack of a crash; import libraries."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, HELD)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()

@@ -177,6 +177,14 @@ def give_up(draft, error):
     raise error("given up")
 
 
+def test_what_a_killed_process_has_left_in_a_draft_is_not_kept(tmp_path):
+    with FolderDraft(tmp_path / "out") as draft:
+        fill(draft)
+        (draft.folder / ".dlo-draft-0123456789abcdef").write_text("half")
+        draft.put_in_place()
+    assert not list((tmp_path / "out").rglob(".*"))
+
+
 def replace_all(folder, before_the_end=lambda: None):
     with FolderDraft(folder) as draft:
         fill(draft)

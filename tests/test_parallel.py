@@ -1,7 +1,9 @@
 """Tasks end once each, wherever they run and whatever happens to their workers."""
 
+import multiprocessing
 import os
 import signal
+import threading
 import time
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
@@ -24,6 +26,7 @@ from dlo_casadi.parallel import (
     map_in_order,
     open_executor,
 )
+from dlo_casadi.workers import interrupts_held
 
 
 def square(x):
@@ -106,10 +109,58 @@ def test_one_call_beside_others(two_of_us):
         begin(InProcess(), root, -1.0)()
 
 
-def test_one_call_whose_worker_is_killed_is_done_here():
+def test_what_a_killed_worker_leaves_is_done_here():
     with open_executor(jobs=2, here=True) as executor:
         assert begin(executor, kill_elsewhere, os.getpid())() == "done here"
+        assert map_in_order(executor, kill_elsewhere, [os.getpid()] * 6) == ["done here"] * 6
         assert map_in_order(executor, square, range(4)) == [0, 1, 4, 9]
+
+
+def test_without_a_worker_that_starts_all_is_done_here():
+    with open_executor(jobs=2, here=True, libraries=("no_such_module",)) as executor:
+        assert begin(executor, square, 3)() == 9
+        assert map_in_order(executor, square, range(5)) == [0, 1, 4, 9, 16]
+
+
+def test_one_call_has_one_thread_wherever_it_is_made(two_of_us):
+    for executor in (two_of_us, InProcess(), ThreadPoolExecutor(1)):
+        blas, opencv, pid = begin(executor, threads, None)()
+        assert (set(blas), opencv) == ({1}, 1)
+        # CasADi's expressions are not made for threads.
+        assert (pid == os.getpid()) == (executor is not two_of_us)
+
+
+def test_a_pool_ends_its_own_processes_and_no_task():
+    with open_executor(jobs=2, here=True) as executor:
+        begin(executor, os.getpid)()
+        other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(1.5,))
+        other.start()
+        late = executor.submit(slowly, 5)
+    assert late.result()[0] == 5
+    other.join()
+    assert other.exitcode == 0
+
+
+def test_an_interrupt_waits_for_the_start_of_processes():
+    """Also where another thread takes the signal, as that of a progress bar."""
+    stop = threading.Event()
+    thread = threading.Thread(target=stop.wait)
+    thread.start()
+    done = []
+
+    def start():
+        with interrupts_held():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+            done.append("started")
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            start()
+    finally:
+        stop.set()
+        thread.join()
+    assert done == ["started"]
 
 
 def test_in_process_results_come_one_by_one_and_in_order():

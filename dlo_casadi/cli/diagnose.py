@@ -11,13 +11,13 @@ from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import (
-    SESSION_JOBS,
     add_jobs,
     command,
     configuration,
     console,
     print_json,
     session_executor,
+    session_jobs,
 )
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.report.json_report import report_dict
@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     )
     parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
     parser.add_argument("--output", type=Path, metavar="DIR", help="write the results there")
-    add_jobs(parser, SESSION_JOBS)
+    add_jobs(parser, session_jobs())
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     chosen = parser.parse_args(argv)

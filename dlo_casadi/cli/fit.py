@@ -10,13 +10,13 @@ from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import (
-    SESSION_JOBS,
     add_jobs,
     command,
     configuration,
     console,
     print_json,
     session_executor,
+    session_jobs,
 )
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.report.json_report import report_dict
@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
         metavar="DIR",
         help="folder of the results; default results/<config name>/",
     )
-    add_jobs(parser, SESSION_JOBS)
+    add_jobs(parser, session_jobs())
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--json", action="store_true", help="print report.json instead of tables")
     parser.add_argument(

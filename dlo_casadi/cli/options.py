@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import sys
 from concurrent.futures import Executor
@@ -17,8 +18,6 @@ from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.parallel import open_executor
 
-# Processes of a single session; it has nothing to do for a third.
-SESSION_JOBS = min(2, os.cpu_count() or 1)
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
 
@@ -45,6 +44,16 @@ def add_jobs(parser: argparse.ArgumentParser, default: int = 1) -> None:
     """Add `--jobs`."""
     text = "number of processes; default %(default)s"
     parser.add_argument("--jobs", type=int, default=default, metavar="N", help=text)
+
+
+def session_jobs() -> int:
+    """Processes of a single session by default: two where there are two processors.
+
+    A third saves little. One where other processes cannot be started.
+    """
+    if multiprocessing.current_process().daemon:
+        return 1
+    return min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
 
 def session_executor(jobs: int) -> AbstractContextManager[Executor]:

@@ -92,8 +92,8 @@ def diagnose(
     step : callable
         Told how far the search has come.
     executor : Executor, optional
-        Where candidates are refitted and places of an unknown load tried, half a second to some
-        seconds each; in this process by default.
+        Where candidates are screened and refitted and places of an unknown load tried, half a
+        second to some seconds each; in this process by default.
     finest : int, optional
         Elements up to which the mesh may be refined where what effects leave is not noise; by
         default it stays.
@@ -138,8 +138,11 @@ def diagnose(
     )
 
 
-def pose_that_tells(diagnosis: Diagnosis) -> tuple[NextPose, tuple[str, str]] | None:
-    """Pose that separates an added effect from its closest rival, and their names."""
+def separating_pose(diagnosis: Diagnosis) -> tuple[NextPose, tuple[str, str]] | None:
+    """Pose that separates an added effect from its closest rival, and their names.
+
+    Both as fits on the mesh of the search.
+    """
     for item in diagnosis.added:
         if item.rivals:
             rival = item.rivals[0]

@@ -156,7 +156,7 @@ def _derivatives(
 
 
 @dataclass(frozen=True)
-class Normal:
+class AtScan:
     """Normal equations of the model with all candidates, those `active` at their scan `k`."""
 
     active: list[Candidate]
@@ -175,20 +175,20 @@ class Screen:
         self.model = extended(fit, listed)
         self.p = fit.values_in(self.model)
 
-    def normals(self, executor: Executor) -> Iterator[Normal]:
+    def normals(self, executor: Executor) -> Iterator[AtScan]:
         """Normal equations at each scan.
 
         The scans are dealt out in as many parts as there are workers, for what a part needs is
         made once.
         """
         n_scans = max(len(candidate.scans) for candidate in self.listed)
-        workers = getattr(executor, "workers", 1)
+        workers = max(1, min(getattr(executor, "workers", 1), n_scans - 1))
         parts = [range(1 + i, n_scans, workers) for i in range(workers)]
         begun = [begin(executor, _derivatives, self.fit, self.listed, part) for part in parts[1:]]
         problem, point, lin = self._linearized()
         names = problem.unknowns.names
         normal = problem.normal_equations(point, lin)
-        yield Normal(self.listed, 0, normal.hessian, normal.gradient, names)
+        yield AtScan(self.listed, 0, normal.hessian, normal.gradient, names)
         moved = [_derivatives(self.fit, self.listed, parts[0]), *(found() for found in begun)]
         for k in range(1, n_scans):
             part, at = (k - 1) % workers, (k - 1) // workers
@@ -198,7 +198,7 @@ class Screen:
                     by_theta[:, columns] = change
             normal = problem.normal_equations(point, lin)
             active = [c for c in self.listed if k < len(c.scans)]
-            yield Normal(active, k, normal.hessian, normal.gradient, names)
+            yield AtScan(active, k, normal.hessian, normal.gradient, names)
 
     def _linearized(self) -> tuple[BatchProblem, Point, Linearization]:
         """The fit's model with candidates at their nominal values, linearised at the fit."""
@@ -234,7 +234,7 @@ class Screen:
                     best[candidate.name] = tried
         return sorted(best.values(), key=lambda item: item.p_value - 1e-9 * item.score)
 
-    def _score(self, candidate: Candidate, normal: Normal, noise_dof: float) -> Screened:
+    def _score(self, candidate: Candidate, normal: AtScan, noise_dof: float) -> Screened:
         hessian, gradient, names = normal.hessian, normal.gradient, normal.names
         base = [i for i, name in enumerate(names) if name in self.fit.problem.unknowns.names]
         columns = [names.index(name) for name in candidate.screened]

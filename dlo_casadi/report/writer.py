@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -127,16 +128,25 @@ def draw(folder: Path, outcome: Outcome, executor: Executor) -> None:
     """Write the page and the figures beside the numbers."""
     figures = folder / "figures"
     make_folder(figures)
-    drawn = begin(executor, draw_summary, folder, outcome)
-    try:
-        draw_poses(figures, outcome)
-        write_overlays(figures / "overlays", outcome)
-    finally:
-        drawn()
+    other_half = begin(executor, draw_summary, folder, outcome)
+    failed: list[Exception] = []
+    for half in (partial(draw_each, figures, outcome), other_half):
+        try:
+            half()
+        except Exception as error:  # the other half writes to the folder still
+            failed.append(error)
+    if failed:
+        raise next((error for error in failed if isinstance(error, OutputError)), failed[0])
+
+
+def draw_each(figures: Path, outcome: Outcome) -> None:
+    """Draw the figures that show pose by pose: half of the work."""
+    draw_poses(figures, outcome)
+    write_overlays(figures / "overlays", outcome)
 
 
 def draw_summary(folder: Path, outcome: Outcome) -> None:
-    """Write the page, and the figures that do not show pose by pose: half of the work."""
+    """Write the page, and the other figures: the other half."""
     write_file(folder / "report.html", report_page(outcome))
     write_figures(folder / "figures", outcome)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.diagnosis.diagnose import Diagnosis, pose_that_tells
+from dlo_casadi.diagnosis.diagnose import Diagnosis, separating_pose
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.result import Fit
@@ -82,7 +82,7 @@ def unexplained_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
 
 def next_pose_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
     """The pose that separates rival explanations, or None."""
-    told = pose_that_tells(diagnosis)
+    told = separating_pose(diagnosis)
     if told is None:
         return None
     pose, rivals = told

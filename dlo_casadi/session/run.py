@@ -97,7 +97,7 @@ def run_session(
     config = calibrated(config, lambda name, k, m: progress.step(f"calibrate {name}".strip(), k, m))
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
     executor = executor or InProcess()
-    executor.submit(os.getpid)  # other processes start meanwhile
+    begin(executor, os.getpid)  # other processes start meanwhile
     try:
         with one_thread():
             return fit_session(config, inputs, clock, progress, executor)

@@ -2,6 +2,8 @@
 
 import json
 import os
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from small_sessions import BENCH
 from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.measurements import read_points
+from dlo_casadi.parallel import open_executor
 from dlo_casadi.report import writer
 from dlo_casadi.report.page import GENERATOR
 from dlo_casadi.report.writer import OWNED, ResultsFolder
@@ -100,6 +103,57 @@ def test_a_run_that_stops_while_writing_leaves_no_trace(outcome, monkeypatch, ea
         folder.write(outcome)
 
     assert tree(earlier) == before
+
+
+def broken(folder, outcome):
+    raise ZeroDivisionError("no range")
+
+
+def full(folder, outcome):
+    time.sleep(0.3)
+    raise OutputError("no space", folder)
+
+
+def interrupted(folder, outcome):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "error", "kept"),
+    [
+        (broken, None, ZeroDivisionError, False),
+        (None, broken, ZeroDivisionError, False),
+        (broken, full, OutputError, True),
+        (full, broken, OutputError, True),
+        (interrupted, full, KeyboardInterrupt, True),
+    ],
+)
+def test_halves_that_fail(outcome, monkeypatch, earlier, here, there, error, kept):
+    """In two processes: the numbers stay where they can, and what the user has to see is raised."""
+    monkeypatch.setattr(writer, "draw_each", here or nothing)
+    monkeypatch.setattr(writer, "draw_summary", there or nothing)
+    before = tree(earlier)
+    with (
+        pytest.raises(error),
+        ResultsFolder(earlier) as folder,
+        open_executor(2, here=True) as executor,
+    ):
+        folder.write(outcome, executor)
+    assert (tree(earlier) == before) == kept
+    assert not list(earlier.glob(".*"))
+
+
+def nothing(folder, outcome):
+    pass
+
+
+def test_two_processes_draw_what_one_draws(outcome, tmp_path):
+    outcome = replace(outcome, poses=outcome.poses[:2])
+    with open_executor(2, here=True) as executor:
+        for name, where in (("one", None), ("two", executor)):
+            with ResultsFolder(tmp_path / name) as folder:
+                folder.write(outcome, where)
+    assert tree(tmp_path / "one").keys() == tree(tmp_path / "two").keys()
 
 
 def test_a_disk_that_is_full_leaves_the_earlier_results(outcome, monkeypatch, earlier):
