@@ -154,10 +154,12 @@ def test_an_interrupt_waits_for_the_start_of_processes():
             time.sleep(0.05)
             done.append("started")
 
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored below nohup
     try:
         with pytest.raises(KeyboardInterrupt):
             start()
     finally:
+        signal.signal(signal.SIGINT, before)
         stop.set()
         thread.join()
     assert done == ["started"]
