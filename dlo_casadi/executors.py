@@ -71,8 +71,7 @@ class Pool(Executor):
     ) -> None:
         self.others, self.here = others, here
         self.workers = others + here
-        # None waits for a worker that this process could do.
-        self.capacity = others if here else 2 * others
+        self.capacity = 2 * others
         self.logs, self.libraries = logs, tuple(libraries)
         self._processes: set[BaseProcess] = set()
         self._tasks: WeakSet[Future[Any]] = WeakSet()

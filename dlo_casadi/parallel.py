@@ -149,7 +149,9 @@ def map_as_completed(
         # Asked anew each time: workers of a cluster come and go.
         most = in_flight or int(getattr(executor, "capacity", 2))
         if here and total is not None:
-            most = min(most, (total - taken) * (workers - 1) // workers)
+            # The fewer are left, the fewer wait for a worker that this process could do.
+            left = total - taken
+            most = min(most, (workers - 1) * max(1, left // (2 * workers))) if left > 1 else 0
         return max(0, most - len(under_way))
 
     def submit(task: _Task[Item]) -> None:
