@@ -19,7 +19,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from dlo_casadi.config import Config, load_config
-from dlo_casadi.errors import ConfigError
+from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.pose import Branch
 from dlo_casadi.prediction import PredictedShape, predict
 from dlo_casadi.report.notebook import outcome_figure, outcome_html, outcome_text
@@ -117,6 +117,8 @@ def fit(
     ------
     ConfigError
         If the configuration cannot be used.
+    DloError
+        If the executor is none.
     MeasurementError
         If no pose can be read, or if the lines contradict the configuration beyond doubt.
     EstimationError
@@ -126,6 +128,11 @@ def fit(
         raise ConfigError(
             f"{config!r} is no configuration.\n"
             '  Try: the path of a YAML file, such as "configs/cable.yaml".'
+        )
+    if executor is not None and not isinstance(executor, Executor):
+        raise DloError(
+            f"executor={executor!r} is no Executor.\n"
+            "  Try: with dlo_casadi.parallel.open_executor(2, here=True) as executor: ..."
         )
     if not isinstance(config, Config):
         config = load_config(config)

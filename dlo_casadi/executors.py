@@ -18,7 +18,7 @@ from weakref import WeakSet
 
 from dlo_casadi.durable import make_folder
 from dlo_casadi.errors import DloError
-from dlo_casadi.workers import THREADS, begin_worker, environment, interrupts_held, software
+from dlo_casadi.workers import THREADS, begin_worker, environment, software, starting_processes
 
 # How long a scheduler may take to answer, and to have a worker [s].
 PATIENCE = 30.0
@@ -100,7 +100,7 @@ class Pool(Executor):
 
     def _submitted(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         before = set(multiprocessing.active_children())
-        with interrupts_held():  # the first task starts the processes
+        with starting_processes():  # the first task starts the processes
             future = self._inner.submit(fn, *args, **kwargs)
         self._processes |= set(multiprocessing.active_children()) - before
         self._tasks.add(future)

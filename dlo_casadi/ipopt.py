@@ -23,6 +23,7 @@ from dlo_casadi.equilibrium import (
     Status,
     equilibria_of,
 )
+from dlo_casadi.interrupts import interrupts_held
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -75,18 +76,17 @@ class _Held:
         return isinstance(other, _Held) and other.model is self.model
 
 
-def stats_of(solver: ca.Function) -> dict[str, Any]:
-    """Statistics of an IPOPT solver's last run.
+def run_ipopt(solver: ca.Function, **given: Any) -> tuple[dict[str, ca.DM], dict[str, Any]]:
+    """Outputs and statistics of one run of an IPOPT solver.
 
     Raises
     ------
     KeyboardInterrupt
-        If the run was interrupted: IPOPT takes the signal for an answer and returns.
+        After a run that was interrupted: CasADi would take the signal for a failure of the solver.
     """
-    stats: dict[str, Any] = solver.stats()
-    if stats["return_status"] == "User_Requested_Stop":
-        raise KeyboardInterrupt
-    return stats
+    with interrupts_held():
+        out = solver(**given)
+    return out, solver.stats()
 
 
 def by_ipopt(
@@ -111,8 +111,7 @@ def by_ipopt(
     bounds = np.zeros(model.n_multipliers + chain.n_nodes - 1)
     bounds[model.n_multipliers :] = JOINT_BOUND
     parameters = np.concatenate([p, rest, pose.vector, deviation])
-    out = solver(x0=x0, p=parameters, lbg=-bounds, ubg=bounds)
-    stats = stats_of(solver)
+    out, stats = run_ipopt(solver, x0=x0, p=parameters, lbg=-bounds, ubg=bounds)
     multipliers = np.array(out["lam_g"]).ravel()
     coordinates, places = np.array(out["x"]).ravel(), 2 * model.n_springs
     border = np.zeros(model.n_border)

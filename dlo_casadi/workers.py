@@ -20,6 +20,8 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+from dlo_casadi.interrupts import INTERRUPTS, interrupts_held
+
 # Read by BLAS, OpenMP and OpenCV when they are loaded.
 THREADS = dict.fromkeys(
     (
@@ -28,9 +30,6 @@ THREADS = dict.fromkeys(
     ),
     "1",
 )
-
-# Signals by which a command is interrupted.
-INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
@@ -65,29 +64,19 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def interrupts_held() -> Iterator[None]:
+def starting_processes() -> Iterator[None]:
     """Hold interrupts back while processes are started, and in them until `begin_worker`.
 
     A process that is interrupted half way in its start, or whose parent is, prints its stack.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # interrupts are the main thread's
-        return
-    resource_tracker.ensure_running()  # which lets go of the signals when it starts
-    received: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in INTERRUPTS}
-    # What is started inherits the mask; here another thread may take the signal all the same.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
-    for number in INTERRUPTS:
-        signal.signal(number, lambda number, _: received.append(number))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for one in received:
-            signal.raise_signal(one)
+    with interrupts_held():
+        resource_tracker.ensure_running()  # which lets go of the signals when it starts
+        # What is started inherits the mask.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def begin_worker(logs: str | None, libraries: Sequence[str] = ()) -> None:

@@ -212,6 +212,15 @@ def test_a_bug_is_told_apart_from_bad_input(config, tmp_path, capsys, monkeypatc
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("jobs", ["0", "-1", "two"])
+def test_a_number_of_processes_that_cannot_be_is_refused_at_once(config, tmp_path, capsys, jobs):
+    with pytest.raises(SystemExit) as caught:
+        main(["fit", str(config), "--output", str(tmp_path / "out"), "--jobs", jobs])
+    assert caught.value.code == 2
+    assert f"{jobs}: a number of processes, 1 or more" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_unknown_arguments_are_bad_input(capsys):
     with pytest.raises(SystemExit) as caught:
         main(["fit", "configs/cable.yaml", "--outptu", "x"])

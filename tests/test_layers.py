@@ -11,7 +11,7 @@ from dlo_casadi.effects import EFFECTS, NUISANCES
 PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-CHAIN = ["errors", "thresholds", "parameters", "rod", "rest", "ends", "tolerances"]
+CHAIN = ["errors", "interrupts", "thresholds", "parameters", "rod", "rest", "ends", "tolerances"]
 CHAIN += [
     "effects",
     "assembly",
@@ -39,7 +39,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": MECHANICS,
     "diagnosis": MECHANICS | {"estimation"} | PARALLEL,
     "codegen": MECHANICS | {"durable"},
-    "workers": {"vision"},
+    "workers": {"interrupts", "vision"},
     "executors": {"durable", "errors", "workers"},
     "parallel": {"errors", "executors", "workers"},
 }

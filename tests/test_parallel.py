@@ -6,10 +6,11 @@ import signal
 import threading
 import time
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
+import casadi as ca
 import cv2
 import pytest
 from threadpoolctl import threadpool_info
@@ -17,6 +18,8 @@ from threadpoolctl import threadpool_info
 from dlo_casadi import parallel
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.executors import InProcess
+from dlo_casadi.interrupts import interrupts_held
+from dlo_casadi.ipopt import run_ipopt
 from dlo_casadi.parallel import (
     LostTaskError,
     Tally,
@@ -26,7 +29,6 @@ from dlo_casadi.parallel import (
     map_in_order,
     open_executor,
 )
-from dlo_casadi.workers import interrupts_held
 
 
 def square(x):
@@ -154,15 +156,44 @@ def test_an_interrupt_waits_for_the_start_of_processes():
             time.sleep(0.05)
             done.append("started")
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored below nohup
     try:
-        with pytest.raises(KeyboardInterrupt):
+        with interruptible(), pytest.raises(KeyboardInterrupt):
             start()
     finally:
-        signal.signal(signal.SIGINT, before)
         stop.set()
         thread.join()
     assert done == ["started"]
+
+
+@contextmanager
+def interruptible():
+    """As in a terminal: below nohup interrupts are ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_is_no_failure_of_the_solver():
+    """CasADi swallows it, and IPOPT returns as if its functions could not be evaluated."""
+    x = ca.MX.sym("x", 40)
+    interrupting = Interrupting("interrupting", {"enable_fd": True})
+    problem = {"x": x, "f": ca.sumsqr(x) + 1e-9 * interrupting(x[0])}
+    options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+    solver = ca.nlpsol("solver", "ipopt", problem, options)
+    with interruptible(), pytest.raises(KeyboardInterrupt):
+        run_ipopt(solver, x0=1.0)
+
+
+class Interrupting(ca.Callback):
+    def __init__(self, name, options):
+        ca.Callback.__init__(self)
+        self.construct(name, options)
+
+    def eval(self, arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+        return [arguments[0] ** 2]
 
 
 def test_in_process_results_come_one_by_one_and_in_order():

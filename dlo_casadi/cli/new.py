@@ -82,7 +82,9 @@ def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list
     try:
         found = [path for path in folder.iterdir() if path.suffix.lower() in endings]
     except OSError as error:
-        raise DloError(f"{folder} cannot be read: {error.strerror}") from None
+        raise DloError(
+            f"{folder} cannot be read: {error.strerror}.\n  Try: the folder that holds your {what}."
+        ) from None
     if not found:
         raise DloError(f"{folder} holds no {what} ({', '.join(endings)})")
     found.sort(key=lambda path: [int(t) if t.isdigit() else t for t in _PARTS.split(path.name)])

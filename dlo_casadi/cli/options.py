@@ -43,7 +43,13 @@ def command(name: str, description: str, examples: str, codes: str = "") -> argp
 def add_jobs(parser: argparse.ArgumentParser, default: int = 1) -> None:
     """Add `--jobs`."""
     text = "number of processes; default %(default)s"
-    parser.add_argument("--jobs", type=int, default=default, metavar="N", help=text)
+    parser.add_argument("--jobs", type=_positive, default=default, metavar="N", help=text)
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: a number of processes, 1 or more")
+    return int(text)
 
 
 def session_jobs() -> int:

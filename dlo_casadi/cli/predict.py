@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
             nargs=4,
             type=float,
             metavar=("QX", "QY", "QZ", "QW"),
-            help=f"frame of a {side} clamped in space, x forward along the cable",
+            help=f"frame of the clamp at the {side} in space, x forward along the cable",
         )
     parser.add_argument(
         "--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"

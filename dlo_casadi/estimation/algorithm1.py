@@ -32,7 +32,7 @@ from dlo_casadi.equilibrium import JOINT_BOUND
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.initial import arc_headings
-from dlo_casadi.ipopt import stats_of
+from dlo_casadi.ipopt import run_ipopt
 from dlo_casadi.model import CableModel
 from dlo_casadi.pose import Pose
 from dlo_casadi.rod.chain import Chain
@@ -333,10 +333,10 @@ class InnerProblem:
             chosen = (index, seen)
             nearest = target.points[index].T.ravel()
             p = np.concatenate([[k_theta], theta_0, target.end, seen, nearest])
-            found = self._solver(x0=phi, p=p, lbg=-bound, ubg=bound)
-            if not stats_of(self._solver)["success"]:
+            found, stats = run_ipopt(self._solver, x0=phi, p=p, lbg=-bound, ubg=bound)
+            if not stats["success"]:
                 return phi, False
-            phi = found["x"].toarray().ravel()
+            phi = np.array(found["x"]).ravel()
         return phi, True
 
     def solve_cobyla(

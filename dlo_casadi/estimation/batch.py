@@ -32,7 +32,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.sensors import ObservedChange
-from dlo_casadi.ipopt import stats_of
+from dlo_casadi.ipopt import run_ipopt
 from dlo_casadi.whole_pose import PoseSymbols, balance, curve, readings, rest_after
 
 FloatArray = NDArray[np.floating]
@@ -330,7 +330,8 @@ class _BatchNlp:
             if problem.unknowns.model.has_state:
                 parts.append(rests[j])
             own.append(np.concatenate(parts))
-        out = self.solver(
+        out, stats = run_ipopt(
+            self.solver,
             x0=np.concatenate([point.theta, *own]),
             p=np.concatenate([np.concatenate([r.ravel(order="F") for r in rows]), *targets]),
             lbx=self.lower,
@@ -339,7 +340,7 @@ class _BatchNlp:
             ubg=0.0,
         )
         residual = float(np.abs(np.array(out["g"])).max())
-        return np.array(out["x"]).ravel(), stats_of(self.solver), residual
+        return np.array(out["x"]).ravel(), stats, residual
 
     def unpack(self, vector: FloatArray, shapes: Shapes) -> tuple[FloatArray, Shapes]:
         """Unknowns and shapes of the solution."""

@@ -118,6 +118,11 @@ def test_a_result_predicts_as_its_file_does(result, written):
     assert "<tr><td>end</td><td>(0.3, -0.1) m</td></tr>" in direct._repr_html_()
 
 
+def test_a_number_is_no_executor(outcome):
+    with pytest.raises(dlo.DloError, match=r"executor=2 is no Executor.\n  Try: with dlo_casadi"):
+        dlo.fit(outcome.config, executor=2)
+
+
 def test_a_result_writes_what_the_command_writes(result, tmp_path, monkeypatch):
     filled = []
     for step in ("write_numbers", "draw"):
