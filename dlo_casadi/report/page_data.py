@@ -13,6 +13,7 @@ from dlo_casadi.report.text_findings import (
     CANDIDATE_ORDER,
     ON_BRANCH,
     cross_validated,
+    finding_of,
     p_value_note,
     predicted_share,
     reading_text,
@@ -165,21 +166,11 @@ def stage_rows(outcome: Outcome) -> list[dict[str, Any]]:
 
 def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
     """Candidates for a missing effect, as ranked, with what could not be told apart."""
-    added = {effect["name"] for effect in outcome.effects}
-    tied = {
-        rival: effect["name"]
-        for effect in outcome.effects
-        for rival in effect["indistinguishable_from"]
-    }
     largest = max([row["score"] or 0.0 for row in outcome.candidates], default=0.0)
     rows = []
     for row in outcome.candidates:
         name, score, p = row["name"], row["score"], row["p_value"]
-        status = ("added", "added to the model") if name in added else ("", "not needed")
-        if name in tied:
-            status = ("tied", f"cannot be told apart from {tied[name]}")
-        elif name not in added and outcome.verdict == "unexplained":
-            status = ("", "does not explain it")
+        status, said = finding_of(outcome, row)
         rows.append(
             {
                 "name": name,
@@ -192,8 +183,8 @@ def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
                 "share": 0.0 if not score or largest <= 0 else max(score, 0.0) / largest,
                 "p_value": NOTHING if p is None else f"{p:.2g}",
                 "validated": _mm(row["rmse_cross_validated"]),
-                "status": status[0],
-                "said": status[1],
+                "status": status,
+                "said": said,
             }
         )
     return rows

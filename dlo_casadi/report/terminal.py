@@ -17,6 +17,7 @@ from dlo_casadi.report.text_findings import (
     CANDIDATE_ORDER,
     ON_BRANCH,
     cross_validated,
+    finding_of,
     p_value_note,
     predicted_share,
     timing_rows,
@@ -158,18 +159,15 @@ def candidate_table(outcome: Outcome) -> Table:
     table.add_column("effect")
     for column in ("score", "p-value", "cross-validated error"):
         table.add_column(column, justify="right")
-    table.add_column("")
-    added = {effect["name"] for effect in outcome.effects}
-    rivals = {name for effect in outcome.effects for name in effect["indistinguishable_from"]}
+    table.add_column("finding")
     for row in outcome.candidates:
-        name, p = row["name"], row["p_value"]
-        remark = "added" if name in added else "cannot be told apart from it" * (name in rivals)
+        p = row["p_value"]
         table.add_row(
-            name,
+            row["name"],
             f"{row['score']:.1f}",
             "-" if p is None else f"{p:.2g}",
             millimetres(row["rmse_cross_validated"]),
-            remark,
+            finding_of(outcome, row)[1],
         )
     return table
 

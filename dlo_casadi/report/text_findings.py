@@ -183,6 +183,19 @@ def _quantity(name: str, row: dict[str, Any]) -> str:
 CANDIDATE_ORDER = "first those that a refit confirms, by BIC, then other refits, the rest by score"
 
 
+def finding_of(outcome: Outcome, row: dict[str, Any]) -> tuple[str, str]:
+    """What a candidate has led to, and the sentence: added, tied, or neither (an empty word)."""
+    name = row["name"]
+    for effect in outcome.effects:
+        if name == effect["name"]:
+            return "added", "added to the model"
+        if name in effect["indistinguishable_from"]:
+            return "tied", f"cannot be told apart from {effect['name']}"
+    if row["rmse_cross_validated"] is None:
+        return "", "not refitted"
+    return "", "does not explain it" if outcome.verdict == "unexplained" else "not needed"
+
+
 def p_value_note(outcome: Outcome) -> str:
     """What the p-values of candidates and of added effects are."""
     note = "p-value: score test in the declared model, corrected for the number of effects tried."

@@ -162,9 +162,9 @@ def test_the_candidates_are_printed_in_their_order(outcome):
     assert "tried: first those that a refit confirms, by BIC, then other refits" in text
     assert "under the noise left once it is in the model" in text
     rows = [" ".join(line.split()) for line in printed.getvalue().splitlines()]
-    assert "lumped_mass 12.3 1e-09 0.2 mm added" in rows
-    assert "point_force 12.3 1e-09 0.2 mm cannot be told apart from it" in rows
-    assert "side_load 0.5 - -" in rows
+    assert "lumped_mass 12.3 1e-09 0.2 mm added to the model" in rows
+    assert "point_force 12.3 1e-09 0.2 mm cannot be told apart from lumped_mass" in rows
+    assert "side_load 0.5 - - not refitted" in rows
     order = [row.split()[0] for row in rows if "_" in row]
     assert order == ["lumped_mass", "point_force", "side_load"]
 

@@ -101,15 +101,17 @@ def test_candidates_keep_their_rank_and_rivals_are_named(outcome):
     assert [row["said"] for row in rows] == [
         "added to the model",
         "cannot be told apart from lumped_mass",
-        "not needed",
+        "not refitted",
     ]
+    again = tuple(row | {"rmse_cross_validated": 1e-3} for row in CANDIDATES)
+    assert candidate_rows(diagnosed(outcome, candidates=again))[2]["said"] == "not needed"
     assert rows[0]["share"] == 1.0
     assert rows[1]["share"] == pytest.approx(690 / 700)
 
 
 def test_no_candidate_explains_what_is_unexplained(outcome):
     rows = candidate_rows(diagnosed(outcome, effects=(), verdict="unexplained"))
-    assert {row["said"] for row in rows} == {"does not explain it"}
+    assert {row["said"] for row in rows} == {"does not explain it", "not refitted"}
 
 
 def test_an_effect_has_a_meaning_and_an_unknown_one_none():
