@@ -156,7 +156,8 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
     Its fit has not converged; or poses are predicted, from their ends alone, worse than UNSEEN
     times what noise, fixtures, parameters and the cable's scatter let expect. Where a cable may
     fall to either side, a pose on the other one is what its scatter lets expect. A pose whose
-    equilibrium has no name but the way that led there tells of the model what it tells there.
+    equilibrium has no name but the way that led there tells of the model what it tells there; but
+    where that holds for all poses, and a simpler model comes nearer, nothing is predicted.
     """
     lines, stage, noise = [], stages[-1], fit.noise.of_points.beside_hangings
     if fit.failed:
@@ -191,7 +192,26 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
                 f"to which it comes within {1e3 * other.rmse:.3g} mm; {_cure(other.chosen_by)}"
             )
         lines.append(text)
-    return tuple(lines)
+    return (*lines, *_nothing_predicted(stages))
+
+
+def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
+    """That all poses were measured in another equilibrium, and a simpler stage comes nearer."""
+    stage = stages[-1]
+    shown = {name for name, shape in stage.shapes.items() if shape.rmse is not None}
+    simpler = [x for x in stages if x.name in SIMPLER and x.rmse_fit is not None]
+    nearest = min(simpler, key=lambda x: x.rmse_fit or 0.0, default=None)
+    if len(shown) < 2 or not shown <= set(stage.other_branch) or nearest is None:
+        return []
+    off, other = stage.rmse_fit or 0.0, nearest.rmse_fit or 0.0
+    if off <= other:
+        return []
+    return [
+        f"no pose is predicted from its ends: in all {len(shown)} the model's lowest equilibrium "
+        f"is another one than the measured one, {1e3 * off:.3g} mm RMS off, and stage "
+        f"{nearest.name} comes nearer, {1e3 * other:.3g} mm. Try: are start and end of the poses "
+        "exchanged, or headings off by a turn?"
+    ]
 
 
 def _errors(shape: PoseShape, length: float, noise: float) -> FloatArray:

@@ -127,6 +127,20 @@ def test_a_pose_predicted_on_another_equilibrium_is_in_doubt(held_out):
     assert judged(poses, fit_model(MODEL, poses, Tolerances(), NOISE))[1] == ()
 
 
+@pytest.mark.parametrize(("nearer", "doubted"), [(0.5, True), (2.0, False)])
+def test_where_no_pose_is_predicted_a_simpler_model_may_do_better(nearer, doubted):
+    poses = measured("cw", "cw", "cw")
+    fit = fit_model(MODEL, poses, Tolerances(), NOISE)
+    stage, _ = judged(poses, fit)
+    assert set(stage.other_branch) == {"0", "1", "2"}
+    simpler = replace(initial_stage(MODEL, poses), rmse_fit=nearer * stage.rmse_fit)
+    doubts = doubts_of([simpler, stage], [], fit)
+    assert len(doubts) == doubted
+    for text in doubts:
+        assert text.startswith("no pose is predicted from its ends: in all 3 the model's lowest")
+        assert f"{1e3 * stage.rmse_fit:.3g} mm RMS off, and stage initial comes nearer" in text
+
+
 def test_a_fit_is_no_worse_than_the_stiffness_alone():
     """One that was stopped far off starts again from the simpler one."""
     poses = measured("ccw", "ccw", "ccw")
