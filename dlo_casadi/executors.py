@@ -8,6 +8,7 @@ a lost worker shows (`losses`), and where workers keep their `logs`.
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -99,9 +100,16 @@ class Pool(Executor):
             return self._submitted(fn, *args, **kwargs)
 
     def _submitted(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        try:
+            # The pool would pickle in a thread of its own, what is being worked on meanwhile.
+            task = pickle.dumps((fn, args, kwargs))
+        except Exception as error:
+            unsent: Future[Any] = Future()
+            unsent.set_exception(error)
+            return unsent
         before = set(multiprocessing.active_children())
         with starting_processes():  # the first task starts the processes
-            future = self._inner.submit(fn, *args, **kwargs)
+            future = self._inner.submit(_unpickled, task)
         self._processes |= set(multiprocessing.active_children()) - before
         self._tasks.add(future)
         return future
@@ -117,6 +125,11 @@ class Pool(Executor):
             for process in self._processes:
                 process.join(LAST_WORDS)
         self._environment.close()
+
+
+def _unpickled(task: bytes) -> Any:
+    function, args, kwargs = pickle.loads(task)
+    return function(*args, **kwargs)
 
 
 class Cluster(Executor):

@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar, cast
 import numpy as np
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.executors import InProcess, open_executor
+from dlo_casadi.executors import open_executor
 from dlo_casadi.workers import one_thread, worker_log, worker_name
 
 __all__ = [
@@ -235,18 +235,18 @@ def map_in_order(
 def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Callable[[], Result]:
     """Begin one call beside others; what is returned waits for it, and raises what it raised.
 
-    It is made here, at once, where the executor has no worker but this process, and again where its
-    worker is killed. As each task of `map_as_completed` it has one thread.
+    Where the executor has no worker but this process, it is made when the result is asked for, and
+    where the worker is killed, again. As each task of `map_as_completed` it has one thread.
     """
     call = partial(_run, _called, (function, args), 0)
-    elsewhere = getattr(executor, "workers", 1) > 1
-    logs = _text(getattr(executor, "logs", None))
-    begun = (executor if elsewhere else InProcess()).submit(call, logs)
+    begun: Future[Any] | None = None
+    if getattr(executor, "workers", 1) > 1:
+        begun = executor.submit(call, _text(getattr(executor, "logs", None)))
     losses = getattr(executor, "losses", (BrokenExecutor,))
 
     def result() -> Result:
         try:
-            found, error, _, _ = begun.result()
+            found, error, _, _ = call(None) if begun is None else begun.result()
         except losses:
             found, error, _, _ = call(None)
         if error is not None:

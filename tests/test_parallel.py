@@ -111,6 +111,24 @@ def test_one_call_beside_others(two_of_us):
         begin(InProcess(), root, -1.0)()
 
 
+def test_a_task_is_what_it_was_when_it_was_begun(two_of_us):
+    numbers = dict.fromkeys(range(300_000))
+    beside = begin(two_of_us, len, numbers)
+    numbers.clear()
+    assert beside() == 300_000
+    with pytest.raises(TypeError, match="pickle"):
+        begin(two_of_us, len, threading.Lock())()
+    assert [done.item for done in map_as_completed(two_of_us, slowly, range(2))]
+
+
+def test_a_call_that_nobody_else_makes_is_made_when_it_is_asked_for():
+    made = []
+    beside = begin(InProcess(), made.append, 1)
+    assert not made
+    beside()
+    assert made == [1]
+
+
 def test_what_a_killed_worker_leaves_is_done_here():
     with open_executor(jobs=2, here=True) as executor:
         assert begin(executor, kill_elsewhere, os.getpid())() == "done here"

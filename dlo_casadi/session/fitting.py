@@ -12,6 +12,7 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
+from dlo_casadi.estimation.gauss_newton import CONVERGED
 from dlo_casadi.estimation.hyperparameters import first_reading_noise
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.mesh import fine_enough, mesh_error
@@ -36,8 +37,7 @@ def fit_declared(
 
     A mesh that is too coarse looks like a missing effect; it is refined first.
     """
-    finest = config.model.n or n
-    first = FIRST_MESH_IN_SPACE if declared.model.in_space else FIRST_MESH
+    finest, first = config.model.n or n, first_mesh(declared.model)
     model = declared.model.with_mesh(min(finest or first, first))
     if config.estimation.rest_curvature_coefficients is None:
         model = replace(model, n_rest=min(model.n_rest, carried_coefficients(model, measured)))
@@ -56,6 +56,11 @@ def fit_declared(
         fit = refine_mesh(fit, finest)
         return fit, mesh_error(fit)
     return fine_enough(fit, first)
+
+
+def first_mesh(model: CableModel) -> int:
+    """Number of elements on which stiffnesses and shapes are searched for."""
+    return FIRST_MESH_IN_SPACE if model.in_space else FIRST_MESH
 
 
 def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) -> int:
@@ -99,14 +104,19 @@ def minimum_by_ipopt(fit: Fit) -> Minimum:
 
 
 def confirmed(fit: Fit, found: Minimum) -> Fit:
-    """The fit at IPOPT's minimum; as it is in space, and where IPOPT has failed or ends higher."""
-    point = found.point
+    """The fit, at IPOPT's minimum if that is lower; as it is in space, and where IPOPT ends higher.
+
+    A minimum is lower by more than what a descent stops at.
+    """
+    point, own = found.point, fit.point.objective
     if fit.model.in_space:
         return fit
     if point is None:
         return replace(fit, converged=False)
-    lower = point.objective <= fit.point.objective + 1e-6 * abs(fit.point.objective)
-    return Fit(fit.problem, point, converged=True) if lower else fit
+    if point.objective < own - CONVERGED:
+        return Fit(fit.problem, point, converged=True)
+    alike = point.objective <= own + CONVERGED
+    return replace(fit, converged=True) if alike and not fit.converged else fit
 
 
 def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:

@@ -14,20 +14,19 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.errors import DloError
-from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SETTLED_MODES
 from dlo_casadi.estimation.mesh import SEARCH_MESH, fine_enough, mesh_error
 from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.executors import InProcess
 from dlo_casadi.model import CableModel
 from dlo_casadi.parallel import begin
 from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import without_implausible
-from dlo_casadi.session.declared import Declared, declared_model, straight
+from dlo_casadi.session.compared import simpler_fits
+from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.findings import (
     candidate_rows,
     effect_rows,
@@ -37,8 +36,8 @@ from dlo_casadi.session.findings import (
     unexplained_row,
 )
 from dlo_casadi.session.fitting import (
-    FIRST_MESH_IN_SPACE,
     confirmed,
+    first_mesh,
     fit_declared,
     minimum_by_ipopt,
     reweighted,
@@ -64,11 +63,8 @@ from dlo_casadi.session.remarks import (
 )
 from dlo_casadi.session.simpler import not_worse
 from dlo_casadi.session.stages import (
-    algorithm1_stage,
     fit_stage,
     fitted_parameters,
-    initial_stage,
-    stiffness_stage,
 )
 from dlo_casadi.workers import one_thread
 
@@ -121,32 +117,37 @@ def fit_session(
     declared = declared_model(config, _center(inputs), _pixel(inputs))
 
     progress.step("fit the declared model", 0, 1)
-    fit, error = fit_declared(config, declared, measured)
-    clock.lap("fit")
+    n, refined = config.model.n or first_mesh(declared.model), None
     if config.estimation.robust:
-        measured = reweighted(fit)
-        fit, error = fit_declared(config, declared, measured, fit.model.n)
-        clock.lap("fit")
-    beside = begin(executor, minimum_by_ipopt, fit)
+        fit, _ = fit_declared(config, declared, measured)
+        measured, n, refined = reweighted(fit), fit.model.n, fit.model.n
+    # Most sessions need no finer mesh; where one does, the simpler fits are made anew on it.
+    compared = begin(executor, simpler_fits, config.estimation, declared.model, measured, n)
+    fit, error = fit_declared(config, declared, measured, refined)
+    confirming = begin(executor, minimum_by_ipopt, fit)
     progress.step("fit the declared model", 1, 1)
-    stages = before_stages(config, declared, inputs, measured, fit.model.n, clock, progress)
-    found = beside()
-    fit = confirmed(fit, found)
-    clock.add("batch", found.seconds)
+
+    progress.step("compare with simpler fits", 0, 1)
     reported = _declared_names(config, fit.model)
-    # A diagnosis that finds nothing replaces this stage; intervals are taken after it.
-    intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
-    stages.append(fit_stage("batch", fit, measured, intervals, reported))
-    better = not_worse(fit, stages)
-    if better is not fit:
-        fit = better
-        stages[-1] = fit_stage("batch", fit, measured, intervals, reported)
+    own = _declared_stage(config, fit, measured, reported)
+    if fit.model.n == n:
+        simpler = compared()
+    else:
+        simpler = simpler_fits(config.estimation, declared.model, measured, fit.model.n)
+    found = confirming()
+    clock.add("algorithm1", simpler.algorithm1_seconds)
+    clock.add("batch", found.seconds)
+    best = confirmed(fit, found)
+    best = not_worse(best, [*simpler.stages, own])
+    if best is not fit:
+        fit, own = best, _declared_stage(config, best, measured, reported)
+    progress.step("compare with simpler fits", 1, 1)
     clock.lap("fit")
     outcome = Outcome(
         config=config,
         poses=tuple(inputs),
         measurement=_summary(config, inputs, measured, fit),
-        stages=tuple(stages),
+        stages=(*simpler.stages, own),
         discretization=Discretization(fit.model.n, fit.model.element, error),
         repeatability=Repeatability.of(fit),
         timing=clock.total(),
@@ -212,14 +213,16 @@ def close_the_loop(
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     if diagnosis.added:
-        beside = begin(executor, minimum_by_ipopt, fit)
+        confirming = begin(executor, minimum_by_ipopt, fit)
         next_pose = next_pose_row(diagnosis)
         stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
-        fit = confirmed(fit, beside())
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [*reported, *(name for name in fit.model.names if name.split(".")[0] in labels)]
-        intervals = profile_intervals(fit)
-        stages.append(fit_stage("closed", fit, measured, intervals, names))
+        closed = fit_stage("closed", fit, measured, profile_intervals(fit), names)
+        best = confirmed(fit, confirming())
+        if best is not fit:
+            fit, closed = best, fit_stage("closed", best, measured, profile_intervals(best), names)
+        stages.append(closed)
     elif diagnosis.unexplained:
         next_pose = None
         stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
@@ -230,7 +233,7 @@ def close_the_loop(
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
     clock.lap("diagnosis")
-    closed = replace(
+    looped = replace(
         outcome,
         fit=fit,
         measurement=_summary(outcome.config, outcome.poses, measured, fit),
@@ -247,49 +250,15 @@ def close_the_loop(
         hidden_weight=hidden_weight_row(diagnosis),
         diagnosis=diagnosis,
     )
-    return judged(closed)
+    return judged(looped)
 
 
-def before_stages(
-    config: Config,
-    declared: Declared,
-    inputs: Sequence[PoseInput],
-    measured: Sequence[MeasuredPose],
-    n: int,
-    clock: Clock,
-    progress: Progress,
-) -> list[Stage]:
-    """The stages to compare with: prior, stiffness alone, the paper's loop."""
-    plain = straight(declared.model).with_mesh(n)
-    progress.step("stiffness alone", 0, 1)
-    stages = [initial_stage(plain, measured)]
-    # One number of a model that is far off by itself: a coarse mesh finds it.
-    coarse = plain.with_mesh(min(n, FIRST_MESH_IN_SPACE)) if plain.in_space else plain
-    stages.append(stiffness_stage(plain, measured, fit_stiffness(coarse, measured)))
-    progress.step("stiffness alone", 1, 1)
-    clock.lap("fit")
-    if not config.estimation.algorithm1:
-        stages.append(algorithm1_stage(None, measured, plain, "switched off"))
-    elif not applies(declared.model):
-        note = "the paper's loop needs a plane and two pinned ends"
-        stages.append(algorithm1_stage(None, measured, plain, note))
-    elif any(item.s is not None for item in inputs):
-        note = "the paper's loop needs lines along the cable, not single markers"
-        stages.append(algorithm1_stage(None, measured, plain, note))
-    else:
-        progress.step("the paper's loop", 0, 1)
-        result = run_algorithm1(
-            declared.model.cable,
-            [item for item in measured if item.readable and not item.held_out],
-            declared.model.gravity,
-            n=config.estimation.algorithm1_n,
-            inner=config.estimation.algorithm1_inner,
-        )
-        clock.lap("algorithm1")
-        stages.append(algorithm1_stage(result, measured, plain))
-        progress.step("the paper's loop", 1, 1)
-    clock.lap("fit")
-    return stages
+def _declared_stage(
+    config: Config, fit: Fit, measured: Sequence[MeasuredPose], reported: Sequence[str]
+) -> Stage:
+    # A diagnosis that finds nothing replaces this stage; intervals are taken after it.
+    intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
+    return fit_stage("batch", fit, measured, intervals, reported)
 
 
 def with_intervals(stage: Stage, fit: Fit, reported: Sequence[str]) -> Stage:
