@@ -49,9 +49,11 @@ _DPI = 150
 
 
 @contextmanager
-def figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
+def figure(
+    path: Path, size: tuple[float, float], layout: Literal["constrained"] | None = "constrained"
+) -> Iterator[Figure]:
     """Open a figure of a size [inch] and save it to a file when it is drawn."""
-    with styled(size) as drawing:
+    with styled(size, layout) as drawing:
         yield drawing
         save_figure(path, drawing, _DPI)
 

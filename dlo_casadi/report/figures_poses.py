@@ -37,8 +37,11 @@ _HELD_OUT_TEXT = "#8C3B6C"
 # A typical deviation is drawn about this share of the cable's length wide.
 _VISIBLE = 0.02
 _FACTORS = (1, 5, 10, 20, 50, 100)
-# Tallest single row of poses [inch].
-_TALLEST = 8.0
+# Sizes [inch] of a page: least width, width of a panel with what is beside it, tallest single row.
+_NARROWEST, _PANEL, _TALLEST = 7.5, 3.1, 8.0
+# Room [inch] for ticks and names of axes, the headline, the legend, titles of two lines, the edge.
+_LEFT, _BOTTOM, _BESIDE = 0.8, 0.85, 0.3
+_TOP, _LEGEND, _ABOVE, _EDGE = 0.95, 0.45, 0.45, 0.1
 
 
 def draw_poses(folder: Path, outcome: Outcome) -> None:
@@ -62,12 +65,12 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
     center, span = _common_frame(outcome, poses, arrows)
     if standing:
         span = standing[0].window
-    width = max(3.1 * columns, 7.5)
-    height = 0.82 * width / columns * float(span[1] / span[0])
-    if rows == 1 and height > _TALLEST:
-        width, height = max(width * _TALLEST / height, 7.5), _TALLEST
-    with figure(path, (width, (height + 0.4) * rows + 1.3)) as drawing:
-        grid = drawing.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    size, spaces = _laid_out(rows, columns, float(span[1] / span[0]), ticks=not standing)
+    # Asked where every tick and title ends, an engine would take as long as all the drawing.
+    with figure(path, size, layout=None) as drawing:
+        grid = drawing.subplots(
+            rows, columns, squeeze=False, sharex=True, sharey=True, gridspec_kw=spaces
+        )
         for axes, pose, room in zip_longest(grid.ravel()[: len(poses)], poses, standing):
             if room is not None:
                 _draw_in_room(axes, outcome, pose, lines, factor, room)
@@ -99,7 +102,7 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
             handles.append(Line2D([], [], color=BLACK, ls=":", label="force as read"))
         if any(pose.role == "held_out" for pose in poses):
             handles.append(Patch(fc="white", ec=HELD_OUT, lw=2, label="held out of the fit"))
-        drawing.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        drawing.legend(handles=handles, loc="lower center", ncols=len(handles))
         drawn = "" if factor == 1 else f"; deviations drawn {factor} times as large"
         if standing:
             drawn += f"; squares of {standing[0].square:g} mm"
@@ -107,7 +110,31 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
             f"{outcome.config.cable.name}: predicted from the end conditions alone\n"
             f"RMS distance to the measured points above each pose{drawn}",
             fontsize=12,
+            y=1 - _EDGE / size[1],
         )
+
+
+def _laid_out(
+    rows: int, columns: int, slope: float, *, ticks: bool
+) -> tuple[tuple[float, float], dict[str, float]]:
+    """Size [inch] of a page of panels `slope` times as high as wide, and the spaces about them."""
+    left, bottom, beside = (_LEFT, _BOTTOM, _BESIDE) if ticks else (_EDGE, _LEGEND, _EDGE)
+    width = max(_PANEL * columns, _NARROWEST)
+    panel = (width - left - _EDGE - (columns - 1) * beside) / columns
+    tall = slope * panel
+    if rows == 1 and tall > _TALLEST:
+        tall, width = _TALLEST, max(width - columns * (panel - _TALLEST / slope), _NARROWEST)
+        panel = (width - left - _EDGE - (columns - 1) * beside) / columns
+    height = _TOP + rows * tall + (rows - 1) * _ABOVE + bottom
+    spaces = {
+        "left": left / width,
+        "right": 1 - _EDGE / width,
+        "top": 1 - _TOP / height,
+        "bottom": bottom / height,
+        "wspace": beside / panel,
+        "hspace": _ABOVE / tall,
+    }
+    return (width, height), spaces
 
 
 def _label_grid(grid: NDArray[np.object_], count: int) -> None:
