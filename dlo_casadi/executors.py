@@ -239,7 +239,7 @@ def open_executor(
             for done in map_as_completed(executor, function, items):
                 ...
 
-    On an exception, an interrupt too, waiting tasks are cancelled and running ones ended.
+    On an exception it ends as in `ended_first`.
 
     Parameters
     ----------
@@ -275,9 +275,19 @@ def open_executor(
         executor = Cluster(scheduler, logs)
     else:
         executor = InProcess() if jobs == 1 else Pool(jobs - here, logs, here, libraries)
-    try:
+    with ended_first(executor):
         yield executor
+    executor.shutdown()
+
+
+@contextmanager
+def ended_first(executor: Executor) -> Iterator[None]:
+    """End an executor on an exception, an interrupt too, before what its tasks work with is left.
+
+    Waiting tasks are cancelled, running ones ended.
+    """
+    try:
+        yield
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         raise
-    executor.shutdown()

@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-
-from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import (
     add_jobs,
     command,
     configuration,
-    console,
-    print_json,
     session_executor,
     session_jobs,
 )
-from dlo_casadi.cli.watch import Watch
-from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.report.terminal import candidate_table, print_summary
-from dlo_casadi.report.writer import ResultsFolder
-from dlo_casadi.session import run_session
 
 EXAMPLES = """\
 dlo diagnose configs/cable.yaml                  prints; writes nothing
@@ -50,23 +40,8 @@ def main(argv: Sequence[str]) -> int:
     config = configuration(chosen.config)
     options = config.diagnosis.model_copy(update={"enabled": True})
     config = replace(config, diagnosis=options)
-    results = nullcontext() if chosen.output is None else ResultsFolder(chosen.output, config)
-    with (
-        results as folder,
-        Watch(Console(stderr=True), chosen.quiet) as watch,
-        session_executor(chosen.jobs) as executor,
-    ):
-        watch.warn(config.warnings)
-        outcome = run_session(config, watch, executor)
-        if folder is not None:
-            folder.write(outcome, executor)
-    if chosen.json:
-        report = report_dict(outcome)
-        print_json({key: report[key] for key in KEYS})
-        return OK
-    page = console(quiet=chosen.quiet)
-    print_summary(page, outcome)
-    page.print(candidate_table(outcome))
-    if chosen.output is not None:
-        page.print(f"Results: {chosen.output}", soft_wrap=True)
+    with session_executor(chosen.jobs) as executor:
+        from dlo_casadi.cli.session import fit_and_show  # beside the other process's imports
+
+        fit_and_show(chosen, config, chosen.output, executor, keys=KEYS, candidates=True)
     return OK

@@ -6,23 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import (
     add_jobs,
     command,
     configuration,
-    console,
-    print_json,
     session_executor,
     session_jobs,
 )
-from dlo_casadi.cli.watch import Watch
-from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.report.terminal import print_summary
-from dlo_casadi.report.writer import ResultsFolder
-from dlo_casadi.session import run_session
 
 EXAMPLES = """\
 dlo fit configs/cable.yaml                       writes results/cable/
@@ -60,20 +51,8 @@ def main(argv: Sequence[str]) -> int:
         diagnosis = config.diagnosis.model_copy(update={"enabled": False})
         config = replace(config, diagnosis=diagnosis)
     output = chosen.output or Path("results") / config.name
-    with (
-        ResultsFolder(output, config) as folder,
-        Watch(Console(stderr=True), chosen.quiet) as watch,
-        session_executor(chosen.jobs) as executor,
-    ):
-        watch.warn(config.warnings)
-        outcome = run_session(config, watch, executor)
-        watch.step("write the results", 0, 1)
-        folder.write(outcome, executor)
-        watch.step("write the results", 1, 1)
-    if chosen.json:
-        print_json(report_dict(outcome))
-        return OK
-    page = console(quiet=chosen.quiet)
-    print_summary(page, outcome)
-    page.print(f"Results: {output}", soft_wrap=True)
+    with session_executor(chosen.jobs) as executor:
+        from dlo_casadi.cli.session import fit_and_show  # beside the other process's imports
+
+        fit_and_show(chosen, config, output, executor)
     return OK

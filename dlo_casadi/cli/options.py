@@ -7,8 +7,9 @@ import json
 import multiprocessing
 import os
 import sys
+from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from rich.console import Console
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
-from dlo_casadi.parallel import open_executor
+from dlo_casadi.parallel import begin, open_executor
 
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
@@ -62,10 +63,13 @@ def session_jobs() -> int:
     return min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
 
-def session_executor(jobs: int) -> AbstractContextManager[Executor]:
-    """Open where one session is fitted and drawn: here, and in `jobs` - 1 other processes."""
-    libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
-    return open_executor(jobs, here=True, libraries=libraries)
+@contextmanager
+def session_executor(jobs: int) -> Iterator[Executor]:
+    """Open where one session is fitted and drawn: here, and in `jobs` - 1 processes, begun now."""
+    libraries = ("dlo_casadi.session", "dlo_casadi.report.writer", "dlo_casadi.report.page_charts")
+    with open_executor(jobs, here=True, libraries=libraries) as executor:
+        begin(executor, os.getpid)
+        yield executor
 
 
 def configuration(path: Path) -> Config:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -93,7 +92,6 @@ def run_session(
     config = calibrated(config, lambda name, k, m: progress.step(f"calibrate {name}".strip(), k, m))
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
     executor = executor or InProcess()
-    begin(executor, os.getpid)  # other processes start meanwhile
     try:
         with one_thread():
             return fit_session(config, inputs, clock, progress, executor)

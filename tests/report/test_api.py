@@ -16,8 +16,8 @@ from small_sessions import small
 
 import dlo_casadi as dlo
 from dlo_casadi import api
-from dlo_casadi.cli import fit as fit_command
 from dlo_casadi.cli import main
+from dlo_casadi.cli import session as session_command
 from dlo_casadi.report import writer
 from dlo_casadi.report.terminal import candidate_table
 from dlo_casadi.session import Silent
@@ -97,7 +97,7 @@ def written(outcome, tmp_path_factory):
     command = ["fit", str(outcome.config.path), "--json", "--quiet", "--output", str(folder)]
     printed = StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
-        patch.setattr(fit_command, "run_session", lambda *_: outcome)
+        patch.setattr(session_command, "run_session", lambda *_: outcome)
         assert main(command) == 0
     return folder, printed.getvalue()
 
