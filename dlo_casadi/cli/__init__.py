@@ -76,8 +76,11 @@ def _run(arguments: list[str]) -> int:
         return OK
     if arguments:
         near = get_close_matches(arguments[0], COMMANDS, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        print(f"no subcommand is called {arguments[0]!r}{hint}\n", file=sys.stderr)
+        text = f"no subcommand is called {arguments[0]!r}"
+        if near:
+            print(f"{text}; did you mean {near[0]!r}? `dlo --help` lists them all", file=sys.stderr)
+            return BAD_INPUT
+        print(f"{text}\n", file=sys.stderr)
     print(_overview(), file=sys.stderr)
     return BAD_INPUT
 

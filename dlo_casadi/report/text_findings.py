@@ -207,32 +207,21 @@ def p_value_note(outcome: Outcome) -> str:
     return note
 
 
-# Parts of the run in the order in which they are done.
-TIMED = {
-    "vision": "photographs to centre-lines",
-    "algorithm1": "Algorithm 1",
-    "batch": "batch estimate",
-    "diagnosis": "diagnosis",
-}
-# Parts that take less [s] were left out.
-_NO_TIME = 1e-3
-
-
 def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
     """Part of the run, seconds and remark; the total comes last."""
     timing = outcome.timing
+    read, search, total = timing["vision"], timing["diagnosis"], timing["total"]
     photographs = sum((pose.image is not None) + len(pose.views) for pose in outcome.poses)
-    rest = timing["total"] - sum(timing.get(name, 0.0) for name in TIMED)
-    rows = []
-    for name, label in TIMED.items():
-        if timing.get(name, 0.0) < _NO_TIME:  # in space IPOPT, and the paper's loop, do not run
-            continue
-        remark = ""
-        if name == "vision" and photographs:
-            remark = f"{timing[name] / photographs:.2f} s a photograph ({photographs})"
-        elif name == "vision":
-            label = "centre-lines"
-        rows.append((label, f"{timing[name]:.2f}", remark))
-    rows.append(("other fits and predictions", f"{max(rest, 0.0):.2f}", ""))
-    rows.append(("total", f"{timing['total']:.2f}", ""))
-    return rows
+    rows = [("centre-lines", read, "")]
+    if photographs:
+        remark = f"{read / photographs:.2f} s a photograph ({photographs})"
+        rows = [("photographs to centre-lines", read, remark)]
+    # In space neither IPOPT nor the paper's loop runs.
+    within = {"Algorithm 1": timing["algorithm1"], "IPOPT": timing["batch"]}
+    parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in within.items() if seconds)
+    rows.append(("fits and predictions", max(total - read - search, 0.0), ""))
+    if search:
+        rows.append(("diagnosis", search, ""))
+    remark = "without imports and writing" + (f"; {parts} of it" if parts else "")
+    rows.append(("total", total, remark))
+    return [(name, f"{seconds:.2f}", remark) for name, seconds, remark in rows]
