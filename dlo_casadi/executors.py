@@ -11,7 +11,7 @@ import multiprocessing
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -76,9 +76,6 @@ class Pool(Executor):
         self.logs, self.libraries = logs, tuple(libraries)
         self._processes: set[BaseProcess] = set()
         self._tasks: WeakSet[Future[Any]] = WeakSet()
-        # A worker inherits it, and loads its libraries after that.
-        self._environment = ExitStack()
-        self._environment.enter_context(environment(THREADS))
         self._inner = self._start()
 
     def _start(self) -> ProcessPoolExecutor:
@@ -108,7 +105,8 @@ class Pool(Executor):
             unsent.set_exception(error)
             return unsent
         before = set(multiprocessing.active_children())
-        with starting_processes():  # the first task starts the processes
+        # Tasks start the processes, which inherit the environment and load libraries after that.
+        with environment(THREADS), starting_processes():
             future = self._inner.submit(_unpickled, task)
         self._processes |= set(multiprocessing.active_children()) - before
         self._tasks.add(future)
@@ -124,7 +122,6 @@ class Pool(Executor):
                 process.terminate()
             for process in self._processes:
                 process.join(LAST_WORDS)
-        self._environment.close()
 
 
 def _unpickled(task: bytes) -> Any:

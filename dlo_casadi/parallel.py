@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import threading
 import time
+import traceback
 from collections.abc import Callable, Generator, Iterable, Sequence, Sized
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass
@@ -285,6 +287,8 @@ def _run(
             result = function(item)
         except Exception as error:
             log.info("task %d failed", index, exc_info=True)
+            if multiprocessing.parent_process() is not None and not isinstance(error, DloError):
+                error.add_note(traceback.format_exc())  # the stack does not come along
             return None, error, time.perf_counter() - begin, worker_name()
         seconds = time.perf_counter() - begin
         log.info("task %d done in %.3f s", index, seconds)

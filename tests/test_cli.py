@@ -65,7 +65,7 @@ def test_fit_prints_tables_and_progress_apart(run):
     assert "3 fit poses, 1 held out" in text
     assert "bending_stiffness" in text
     assert "warning: lost" in text
-    assert "without imports and writing; Algorithm 1" in text
+    assert "without imports and writing; of it or beside it Algorithm 1" in text
     assert "Results: results/rope" in text
     assert "read the poses:" in done.stderr
     assert "write the results:" in done.stderr

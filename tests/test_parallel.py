@@ -121,6 +121,19 @@ def test_a_task_is_what_it_was_when_it_was_begun(two_of_us):
     assert [done.item for done in map_as_completed(two_of_us, slowly, range(2))]
 
 
+def broken(x):
+    raise ZeroDivisionError("oops")
+
+
+def test_a_bug_elsewhere_comes_with_its_stack(two_of_us):
+    with pytest.raises(ZeroDivisionError) as caught:
+        begin(two_of_us, broken, 1)()
+    assert "in broken" in "".join(caught.value.__notes__)
+    with pytest.raises(EquilibriumError) as caught:
+        begin(two_of_us, root, -1.0)()
+    assert not hasattr(caught.value, "__notes__")  # what a user has done is no bug
+
+
 def test_a_call_that_nobody_else_makes_is_made_when_it_is_asked_for():
     made = []
     beside = begin(InProcess(), made.append, 1)
@@ -327,10 +340,11 @@ def test_remaining_time_is_an_interval_that_holds_the_truth(monkeypatch):
 def test_environment_is_as_before(monkeypatch):
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    with open_executor(jobs=2):
-        assert os.environ["MKL_NUM_THREADS"] == os.environ["OMP_NUM_THREADS"] == "1"
-    assert "MKL_NUM_THREADS" not in os.environ
-    assert os.environ["OMP_NUM_THREADS"] == "3"
+    with open_executor(jobs=2) as executor:
+        for name in ("MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+            assert executor.submit(os.getenv, name).result() == "1"
+        assert "MKL_NUM_THREADS" not in os.environ
+        assert os.environ["OMP_NUM_THREADS"] == "3"
 
 
 def test_bad_numbers_of_processes():

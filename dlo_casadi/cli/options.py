@@ -65,7 +65,10 @@ def session_jobs() -> int:
 
 @contextmanager
 def session_executor(jobs: int) -> Iterator[Executor]:
-    """Open where one session is fitted and drawn: here, and in `jobs` - 1 processes, begun now."""
+    """Open where one session is fitted and drawn: here, and in `jobs` - 1 processes.
+
+    The first of them is begun at once.
+    """
     libraries = ("dlo_casadi.session", "dlo_casadi.report.writer", "dlo_casadi.report.page_charts")
     with open_executor(jobs, here=True, libraries=libraries) as executor:
         begin(executor, os.getpid)

@@ -301,8 +301,8 @@ class BatchProblem:
         for _ in range(max_iterations):
             limit = point.objective + 1e-9 * abs(point.objective)
             before, trial = damping, self._ahead(point, lin, damping, limit, WATCHED)
-            excess = max(1.0, point.data / max(self.n_residuals, 1))
-            if trial is None and self._promised(point, lin) < tolerance * excess:
+            least = self.least_decrease(point, tolerance)
+            if trial is None and self._promised(point, lin) < least:
                 # What a pose's deviations do to the poses after it, through a state, is left out.
                 return point, True
             while trial is None:
@@ -314,14 +314,20 @@ class BatchProblem:
             if damping == before:
                 damping = damping / 10 if damping > 1e-6 else 0.0
             point = trial
-            # Where the residual exceeds the noise, so does a standard deviation's decrease.
-            excess = max(1.0, point.data / max(self.n_residuals, 1))
-            if gains[-1] < tolerance * excess and damping < 1e-2:
+            least = self.least_decrease(point, tolerance)
+            if gains[-1] < least and damping < 1e-2:
                 return point, True
-            if sum(gains) < tolerance * excess:
+            if sum(gains) < least:
                 return point, False
             lin = self.linearize(point)
         return point, False
+
+    def least_decrease(self, point: Point, tolerance: float = CONVERGED) -> float:
+        """Decrease of the objective about a point that is worth a step.
+
+        Where the residual exceeds the noise, so does a standard deviation's decrease.
+        """
+        return tolerance * max(1.0, point.data / max(self.n_residuals, 1))
 
     def _promised(self, point: Point, lin: Linearization) -> float:
         """Decrease of the objective that an undamped step promises."""

@@ -84,6 +84,7 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
             axes.set_axis_off()
         if not standing:
             _label_grid(grid, len(poses))
+            _make_room(grid)
         handles: list[Line2D | Patch] = [
             Line2D([], [], color=BLACK, marker=".", ls="none", ms=7, label="measured")
         ]
@@ -109,7 +110,7 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
         drawing.suptitle(
             f"{outcome.config.cable.name}: predicted from the end conditions alone\n"
             f"RMS distance to the measured points above each pose{drawn}",
-            fontsize=12,
+            fontsize=11,
             y=1 - _EDGE / size[1],
         )
 
@@ -149,6 +150,20 @@ def _label_grid(grid: NDArray[np.object_], count: int) -> None:
         below = grid.ravel()[lowest]
         below.set_xlabel("x [m]")
         below.tick_params(labelbottom=True)
+
+
+def _make_room(grid: NDArray[np.object_]) -> None:
+    """Move all panels to the right where the ticks and the name of the first axis need it."""
+    first = grid[0, 0]
+    drawing = first.get_figure()
+    first.apply_aspect()  # which moves it within its place
+    taken = first.yaxis.get_tightbbox(drawing.canvas.get_renderer())
+    missing = _EDGE - taken.x0 / drawing.dpi
+    if missing > 0:
+        places = first.get_gridspec()
+        places.update(left=places.left + missing / drawing.get_figwidth())
+        for axes in grid.ravel():
+            axes.set_position(axes.get_subplotspec().get_position(drawing))
 
 
 def _arranged(count: int) -> tuple[int, int]:

@@ -222,6 +222,6 @@ def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
     rows.append(("fits and predictions", max(total - read - search, 0.0), ""))
     if search:
         rows.append(("diagnosis", search, ""))
-    remark = "without imports and writing" + (f"; {parts} of it" if parts else "")
+    remark = "without imports and writing" + (f"; of it or beside it {parts}" if parts else "")
     rows.append(("total", total, remark))
     return [(name, f"{seconds:.2f}", remark) for name, seconds, remark in rows]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dlo_casadi.config.options import EstimationOptions
-from dlo_casadi.estimation.algorithm1 import applies, run_algorithm1
+from dlo_casadi.estimation.algorithm1 import Algorithm1Result, applies, run_algorithm1
 from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.stiffness import fit_stiffness
+from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
 from dlo_casadi.model import CableModel
 from dlo_casadi.session.declared import straight
 from dlo_casadi.session.fitting import first_mesh
@@ -18,47 +18,59 @@ from dlo_casadi.session.stages import algorithm1_stage, initial_stage, stiffness
 
 
 @dataclass(frozen=True)
-class Compared:
-    """Stages of simpler fits.
-
-    Parameters
-    ----------
-    stages : sequence of Stage
-    algorithm1_seconds : float [s]
-        That the paper's loop took.
-    """
-
-    stages: tuple[Stage, ...]
-    algorithm1_seconds: float
-
-
-def simpler_fits(
-    options: EstimationOptions, model: CableModel, measured: Sequence[MeasuredPose], n: int
-) -> Compared:
-    """Stages of the simpler fits on a mesh of n elements.
+class SimplerFits:
+    """Simpler fits of the same cable, straight at rest, without its effects.
 
     Parameters
     ----------
     model : CableModel
-        As declared; they are of the same cable, straight at rest, without its effects.
+        On the mesh that the stiffness was searched on.
+    alone : StiffnessFit
+        The stiffness alone.
+    loop : Algorithm1Result, optional
+        Of the paper's loop.
+    missing : str
+        Why the loop did not run.
+    seconds : float [s]
+        That it took.
     """
-    plain = straight(model).with_mesh(n)
+
+    model: CableModel
+    alone: StiffnessFit
+    loop: Algorithm1Result | None
+    missing: str
+    seconds: float
+
+    def stages(self, measured: Sequence[MeasuredPose], n: int) -> list[Stage]:
+        """Prior, stiffness alone and the paper's loop as stages on a mesh of n elements."""
+        model = self.model.with_mesh(n)
+        return [
+            initial_stage(model, measured),
+            stiffness_stage(model, measured, self.alone),
+            algorithm1_stage(self.loop, measured, model, self.missing),
+        ]
+
+
+def simpler_fits(
+    options: EstimationOptions, declared: CableModel, measured: Sequence[MeasuredPose], n: int
+) -> tuple[SimplerFits, list[Stage]]:
+    """The simpler fits, and their stages on a mesh of n elements."""
     # One number of a model that is far off by itself: a coarse mesh finds it.
-    coarse = plain.with_mesh(min(n, first_mesh(plain)))
-    alone = fit_stiffness(coarse, measured)
-    stages = initial_stage(plain, measured), stiffness_stage(plain, measured, alone)
-    missing, result, seconds = _not_applicable(options, model, measured), None, 0.0
+    model = straight(declared).with_mesh(min(n, first_mesh(declared)))
+    alone = fit_stiffness(model, measured)
+    missing, loop, seconds = _not_applicable(options, declared, measured), None, 0.0
     if not missing:
         began = time.perf_counter()
-        result = run_algorithm1(
-            model.cable,
+        loop = run_algorithm1(
+            declared.cable,
             [item for item in measured if item.readable and not item.held_out],
-            model.gravity,
+            declared.gravity,
             n=options.algorithm1_n,
             inner=options.algorithm1_inner,
         )
         seconds = time.perf_counter() - began
-    return Compared((*stages, algorithm1_stage(result, measured, plain, missing)), seconds)
+    found = SimplerFits(model, alone, loop, missing, seconds)
+    return found, found.stages(measured, n)
 
 
 def _not_applicable(
@@ -69,6 +81,7 @@ def _not_applicable(
         return "switched off"
     if not applies(model):
         return "the paper's loop needs a plane and two pinned ends"
-    if any(sensor.marked for item in measured for sensor in item.sensors):
+    sensors = [sensor for item in measured for sensor in item.sensors]
+    if any(sensor.marked and sensor.per_point for sensor in sensors):
         return "the paper's loop needs lines along the cable, not single markers"
     return ""

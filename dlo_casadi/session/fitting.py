@@ -12,7 +12,6 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
-from dlo_casadi.estimation.gauss_newton import CONVERGED
 from dlo_casadi.estimation.hyperparameters import first_reading_noise
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.mesh import fine_enough, mesh_error
@@ -26,6 +25,9 @@ from dlo_casadi.session.declared import REST_COEFFICIENTS, Declared
 FIRST_MESH, FIRST_MESH_IN_SPACE = 20, 10
 # Markers that are nearer to each other than this share of the cable are at one place.
 SAME_PLACE = 0.02
+# Share of the objective by which IPOPT's minimum may lie higher and be the same: it stops once the
+# points' places along the cable move by a thousandth of the noise. 1.5e-7 is the most of ten fits.
+SAME_MINIMUM = 1e-6
 # Huber's constant: points beyond it count with their distance instead of its square.
 HUBER = 1.5
 
@@ -104,19 +106,21 @@ def minimum_by_ipopt(fit: Fit) -> Minimum:
 
 
 def confirmed(fit: Fit, found: Minimum) -> Fit:
-    """The fit, at IPOPT's minimum if that is lower; as it is in space, and where IPOPT ends higher.
+    """The fit, held against IPOPT's minimum.
 
-    A minimum is lower by more than what a descent stops at.
+    Where that is lower by more than what a descent stops at, it is the fit's. Where it is the same,
+    the fit has converged; where IPOPT has failed, it has not. In space, and where IPOPT ends
+    higher, the fit stays as it is.
     """
     point, own = found.point, fit.point.objective
     if fit.model.in_space:
         return fit
     if point is None:
         return replace(fit, converged=False)
-    if point.objective < own - CONVERGED:
+    if point.objective < own - fit.problem.least_decrease(fit.point):
         return Fit(fit.problem, point, converged=True)
-    alike = point.objective <= own + CONVERGED
-    return replace(fit, converged=True) if alike and not fit.converged else fit
+    same = point.objective <= own + SAME_MINIMUM * abs(own)
+    return replace(fit, converged=True) if same and not fit.converged else fit
 
 
 def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:

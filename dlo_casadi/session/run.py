@@ -89,9 +89,10 @@ def run_session(
     """
     progress = progress or Silent()
     clock = Clock()
+    executor = executor or InProcess()
+    begin(executor, versions)  # another process starts, and imports what fits, meanwhile
     config = calibrated(config, lambda name, k, m: progress.step(f"calibrate {name}".strip(), k, m))
     inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
-    executor = executor or InProcess()
     try:
         with one_thread():
             return fit_session(config, inputs, clock, progress, executor)
@@ -119,7 +120,6 @@ def fit_session(
     if config.estimation.robust:
         fit, _ = fit_declared(config, declared, measured)
         measured, n, refined = reweighted(fit), fit.model.n, fit.model.n
-    # Most sessions need no finer mesh; where one does, the simpler fits are made anew on it.
     compared = begin(executor, simpler_fits, config.estimation, declared.model, measured, n)
     fit, error = fit_declared(config, declared, measured, refined)
     confirming = begin(executor, minimum_by_ipopt, fit)
@@ -128,24 +128,25 @@ def fit_session(
     progress.step("compare with simpler fits", 0, 1)
     reported = _declared_names(config, fit.model)
     own = _declared_stage(config, fit, measured, reported)
-    if fit.model.n == n:
-        simpler = compared()
-    else:
-        simpler = simpler_fits(config.estimation, declared.model, measured, fit.model.n)
+    simpler, stages = compared()
+    if fit.model.n != n:
+        stages = simpler.stages(measured, fit.model.n)
     found = confirming()
-    clock.add("algorithm1", simpler.algorithm1_seconds)
+    clock.add("algorithm1", simpler.seconds)
     clock.add("batch", found.seconds)
     best = confirmed(fit, found)
-    best = not_worse(best, [*simpler.stages, own])
-    if best is not fit:
-        fit, own = best, _declared_stage(config, best, measured, reported)
+    if best.point is not fit.point:
+        own = _declared_stage(config, best, measured, reported)
+    fit = not_worse(best, [*stages, own])
+    if fit is not best:
+        own = _declared_stage(config, fit, measured, reported)
     progress.step("compare with simpler fits", 1, 1)
     clock.lap("fit")
     outcome = Outcome(
         config=config,
         poses=tuple(inputs),
         measurement=_summary(config, inputs, measured, fit),
-        stages=(*simpler.stages, own),
+        stages=(*stages, own),
         discretization=Discretization(fit.model.n, fit.model.element, error),
         repeatability=Repeatability.of(fit),
         timing=clock.total(),
@@ -217,9 +218,12 @@ def close_the_loop(
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [*reported, *(name for name in fit.model.names if name.split(".")[0] in labels)]
         closed = fit_stage("closed", fit, measured, profile_intervals(fit), names)
-        best = confirmed(fit, confirming())
-        if best is not fit:
-            fit, closed = best, fit_stage("closed", best, measured, profile_intervals(best), names)
+        found = confirming()
+        clock.add("batch", found.seconds)
+        best = confirmed(fit, found)
+        if best.point is not fit.point:
+            closed = fit_stage("closed", best, measured, profile_intervals(best), names)
+        fit = best
         stages.append(closed)
     elif diagnosis.unexplained:
         next_pose = None

@@ -27,20 +27,36 @@ def pool():
         yield executor
 
 
-def test_a_whole_session(tmp_path):
-    config = load_config(write_session(tmp_path / "cable", "thin"))
-    few = {"gravity_tilt", "rest_curvature_drift"}
+@pytest.mark.parametrize(
+    ("name", "tried", "n", "verdict"),
+    [
+        ("thin", "gravity_tilt", 10, "unexplained"),
+        ("softening", "bending_softening", None, "effect_found"),
+    ],
+)
+def test_a_whole_session(tmp_path, name, tried, n, verdict):
+    """One that ends with a pull, and one with an effect."""
+    config = load_config(write_session(tmp_path / "cable", name))
+    few = {tried, "rest_curvature_drift"}
     limits = {"enabled": True, "max_effects": 1, "exclude": tuple(sorted(set(EFFECTS) - few))}
-    asked = config.diagnosis.model_copy(update=limits)
-    config = replace(config, diagnosis=asked)
+    config = replace(
+        config,
+        model=config.model.model_copy(update={"n": n}),
+        estimation=config.estimation.model_copy(update={"algorithm1": True}),
+        diagnosis=config.diagnosis.model_copy(update=limits),
+    )
     with open_executor(jobs=2, here=True) as executor:
         both = [report_dict(run_session(config, executor=where)) for where in (None, executor)]
     for report in both:
         del report["timing_s"]
+        for stage in report["stages"]:
+            stage.pop("note", None)  # the loop's tells its seconds
     assert both[0] == both[1]
-    assert {row["name"] for row in both[0]["candidates"]} >= few
+    assert both[0]["verdict"] == verdict
+    assert both[0]["stages"][2]["rmse_fit"], "the paper's loop has run"
+    assert tried in {row["name"] for row in both[0]["candidates"]}
     assert any(row["rmse_cross_validated"] for row in both[0]["candidates"]), "some were refitted"
-    assert both[0]["unexplained"]["force_per_pose"]
+    assert (verdict == "unexplained") == bool(both[0]["unexplained"])
 
 
 def test_folds_where_a_state_is_carried(fit, pool):

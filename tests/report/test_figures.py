@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dlo_casadi.report import figures, figures_poses, overlay
+from dlo_casadi.report import canvas, figures, figures_poses, overlay
 from dlo_casadi.report.canvas import before_after, label_of
 from dlo_casadi.report.drawing import draw_prediction
 from dlo_casadi.report.geometry import magnified
@@ -188,6 +188,29 @@ def with_readings(outcome):
     measurement = replace(outcome.measurement, readings=6, force_std=0.02, moment_std=0.01)
     stages = (*outcome.stages[:-1], replace(stage, shapes=shapes))
     return replace(outcome, stages=stages, measurement=measurement)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.1])
+@pytest.mark.parametrize("count", [1, 8, 21])
+def test_all_names_lie_on_the_page(outcome, tmp_path, monkeypatch, count, size):
+    pages = []
+    monkeypatch.setattr(canvas, "save_figure", lambda path, drawing, dpi: pages.append(drawing))
+    pose = replace(outcome.poses[0], points=size * outcome.poses[0].points)
+    shape = outcome.stages[-1].shapes[pose.name]
+    shapes = {pose.name: replace(shape, curve=size * shape.curve)}
+    stages = tuple(replace(stage, shapes=shapes) for stage in outcome.stages)
+    figures_poses.draw_poses(tmp_path, replace(outcome, poses=(pose,) * count, stages=stages))
+    assert len(pages) == -(-count // 20)
+    for page in pages:
+        texts = [one for x in page.axes for one in (x.title, x.xaxis.label, x.yaxis.label)]
+        texts = [page._suptitle, *(text for text in texts if text.get_text())]
+        assert {"x [m]", "y [m]"} < {text.get_text() for text in texts}
+        page.canvas.draw()
+        wide, high = page.get_size_inches() * page.dpi
+        for text in texts:
+            box = text.get_window_extent()
+            inside = min(box.x0, box.y0) >= 0 and box.x1 <= wide and box.y1 <= high
+            assert inside, (text.get_text(), box)
 
 
 def test_readings_are_drawn_beside_predicted_ones(outcome, tmp_path):

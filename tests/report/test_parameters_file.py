@@ -15,11 +15,12 @@ from dlo_casadi.effects import BendingSoftening, ImageDistortion, RestCurvatureD
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_file import load_parameters
 from dlo_casadi.report.parameters_text import final_rest, fit_dict, parameters_hash, parameters_text
 from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.fitting import confirmed, minimum_by_ipopt
+from dlo_casadi.session.fitting import minimum_by_ipopt
 from dlo_casadi.session.measure import read_poses
 
 
@@ -311,8 +312,9 @@ def test_values_at_their_bounds_are_read_as_they_were_written(outcome, tmp_path,
 def test_a_fit_that_ends_at_a_bound_can_be_read(outcome, tmp_path):
     """IPOPT widens bounds by 1e-8 of them; here the softness would be -5e-10 m."""
     fit, _ = fitted("short_clean", BendingSoftening(), n=10)
-    fit = confirmed(fit, minimum_by_ipopt(fit))
-    assert fit.converged
+    point = minimum_by_ipopt(fit).point
+    assert point is not None
+    fit = Fit(fit.problem, point, converged=True)
     assert fit.value("bending_softening.softness") == 0.0
     assert np.array_equal(load_parameters(as_file(fit, outcome, tmp_path / "p.yaml")).p, fit.p)
 

@@ -46,7 +46,7 @@ def test_a_summary_tells_units_what_was_fixed_and_the_noise(outcome):
     assert "noise (estimated)" in text
     assert "warning: stage algorithm1: switched off" in text
     assert "Diagnosis: switched off" in text
-    assert "without imports and writing; IPOPT" in text
+    assert "without imports and writing; of it or beside it IPOPT" in text
     assert "total" in text
 
 
