@@ -69,7 +69,7 @@ def session_executor(jobs: int) -> Iterator[Executor]:
 
     The first of them is begun at once.
     """
-    libraries = ("dlo_casadi.session", "dlo_casadi.report.writer", "dlo_casadi.report.page_charts")
+    libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
     with open_executor(jobs, here=True, libraries=libraries) as executor:
         begin(executor, os.getpid)
         yield executor
