@@ -98,7 +98,8 @@ def _outwards(
 
     Over decades of stiffness the objective has one valley, in one of twelve sessions and a ridge
     beside it. With stiffnesses declared right, and 10 and 100 times off either way, eleven sessions
-    end at the minimum to which all decades lead, in 55 of 55 fits. `whole`: all decades.
+    end at the minimum to which all decades lead, in 55 of 55 fits; so do twelve in space as they
+    are declared. `whole`: all decades.
     """
     # Bending and torsion go together: their ratio is known better than either.
     stiffnesses = [k for k, name in enumerate(problem.unknowns.names) if name in STIFFNESSES]
