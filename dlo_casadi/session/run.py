@@ -24,7 +24,6 @@ from dlo_casadi.model import CableModel
 from dlo_casadi.parallel import begin
 from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import without_implausible
-from dlo_casadi.session.compared import simpler_fits
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.findings import (
     candidate_rows,
@@ -60,11 +59,8 @@ from dlo_casadi.session.remarks import (
     weight_warning,
     worse_than_simpler,
 )
-from dlo_casadi.session.simpler import not_worse
-from dlo_casadi.session.stages import (
-    fit_stage,
-    fitted_parameters,
-)
+from dlo_casadi.session.simpler import not_worse, simpler_fits
+from dlo_casadi.session.stages import fit_stage, fitted_parameters
 from dlo_casadi.workers import one_thread
 
 
@@ -217,14 +213,14 @@ def close_the_loop(
         stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [*reported, *(name for name in fit.model.names if name.split(".")[0] in labels)]
-        closed = fit_stage("closed", fit, measured, profile_intervals(fit), names)
+        own = fit_stage("closed", fit, measured, profile_intervals(fit), names)
         found = confirming()
         clock.add("batch", found.seconds)
         best = confirmed(fit, found)
         if best.point is not fit.point:
-            closed = fit_stage("closed", best, measured, profile_intervals(best), names)
+            own = fit_stage("closed", best, measured, profile_intervals(best), names)
         fit = best
-        stages.append(closed)
+        stages.append(own)
     elif diagnosis.unexplained:
         next_pose = None
         stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
@@ -235,7 +231,7 @@ def close_the_loop(
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
     clock.lap("diagnosis")
-    looped = replace(
+    closed = replace(
         outcome,
         fit=fit,
         measurement=_summary(outcome.config, outcome.poses, measured, fit),
@@ -252,7 +248,7 @@ def close_the_loop(
         hidden_weight=hidden_weight_row(diagnosis),
         diagnosis=diagnosis,
     )
-    return judged(looped)
+    return judged(closed)
 
 
 def _declared_stage(
