@@ -13,20 +13,20 @@ if TYPE_CHECKING:
     from dlo_casadi.config import load_config as load_config
     from dlo_casadi.effects import EFFECTS as EFFECTS
     from dlo_casadi.effects import Cable as Cable
-    from dlo_casadi.equilibrium import Equilibrium as Equilibrium
+    from dlo_casadi.equilibrium.equilibrium import Equilibrium as Equilibrium
+    from dlo_casadi.equilibrium.pose import Pose as Pose
+    from dlo_casadi.equilibrium.solve import solve_equilibrium as solve_equilibrium
     from dlo_casadi.errors import ConfigError as ConfigError
     from dlo_casadi.errors import DloError as DloError
     from dlo_casadi.errors import EquilibriumError as EquilibriumError
     from dlo_casadi.errors import EstimationError as EstimationError
     from dlo_casadi.errors import MeasurementError as MeasurementError
     from dlo_casadi.errors import VisionError as VisionError
-    from dlo_casadi.model import CableModel as CableModel
-    from dlo_casadi.pose import Pose as Pose
+    from dlo_casadi.model.cable_model import CableModel as CableModel
     from dlo_casadi.prediction import PredictedShape as PredictedShape
     from dlo_casadi.prediction import predict as predict
     from dlo_casadi.session import Outcome as Outcome
     from dlo_casadi.session import run_session as run_session
-    from dlo_casadi.solve import solve_equilibrium as solve_equilibrium
 
 # Module -> its public names. They are imported when they are first asked for, so that the command
 # answers at once and an interrupt finds it ready.
@@ -35,7 +35,9 @@ _PUBLIC = {
     "codegen": ("CompiledSolver",),
     "config": ("Config", "load_config"),
     "effects": ("EFFECTS", "Cable"),
-    "equilibrium": ("Equilibrium",),
+    "equilibrium.equilibrium": ("Equilibrium",),
+    "equilibrium.pose": ("Pose",),
+    "equilibrium.solve": ("solve_equilibrium",),
     "errors": (
         "ConfigError",
         "DloError",
@@ -44,11 +46,9 @@ _PUBLIC = {
         "MeasurementError",
         "VisionError",
     ),
-    "model": ("CableModel",),
-    "pose": ("Pose",),
+    "model.cable_model": ("CableModel",),
     "prediction": ("PredictedShape", "predict"),
     "session": ("Outcome", "run_session"),
-    "solve": ("solve_equilibrium",),
 }
 _HOMES = {name: f"{__name__}.{module}" for module, names in _PUBLIC.items() for name in names}
 

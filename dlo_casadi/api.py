@@ -19,11 +19,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from dlo_casadi.config import Config, load_config
+from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.errors import ConfigError, DloError
-from dlo_casadi.pose import Branch
 from dlo_casadi.prediction import PredictedShape, predict
 from dlo_casadi.report.notebook import outcome_figure, outcome_html, outcome_text
-from dlo_casadi.report.parameters_file import parameters_of
+from dlo_casadi.report.parameters_text import parameters_of
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
 
@@ -106,7 +106,7 @@ def fit(
     executor : Executor, optional
         Where what can be done at the same time is done; in this process by default. In a script,
         below `if __name__ == "__main__":`, `with open_executor(2, here=True) as executor` of
-        `dlo_casadi.parallel` opens one.
+        `dlo_casadi.runtime.parallel` opens one.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def fit(
     if executor is not None and not isinstance(executor, Executor):
         raise DloError(
             f"executor={executor!r} is no Executor.\n"
-            "  Try: with dlo_casadi.parallel.open_executor(2, here=True) as executor: ..."
+            "  Try: with dlo_casadi.runtime.parallel.open_executor(2, here=True) as executor: ..."
         )
     if not isinstance(config, Config):
         config = load_config(config)

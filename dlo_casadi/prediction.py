@@ -12,19 +12,19 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from dlo_casadi.assembly import Given
 from dlo_casadi.config import implausible_quaternion
 from dlo_casadi.effects import MeasurementEffect
-from dlo_casadi.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.pose import Branch, Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import EDGE, spread_across
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.estimation.band import EDGE, spread_across
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Branch, Pose
+from dlo_casadi.io.parameters import Parameters, load_parameters
+from dlo_casadi.model.assembly import Given
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.drawing import prediction_figure
 from dlo_casadi.report.notebook import shape_html, shape_text
-from dlo_casadi.report.parameters_file import Parameters, load_parameters
-from dlo_casadi.solve import solve_equilibrium
 
 FloatArray = NDArray[np.floating]
 

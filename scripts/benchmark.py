@@ -34,7 +34,7 @@ from benchmarks import (
 )
 
 from dlo_casadi.codegen import STATUSES
-from dlo_casadi.durable import make_folder, write_file
+from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 
 PARTS = (

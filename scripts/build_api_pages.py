@@ -10,7 +10,7 @@ try:
 except ModuleNotFoundError:
     sys.exit("error: the pages need pdoc.\n  Try: pip install -e '.[docs]'")
 
-MODULES = ("dlo_casadi", "dlo_casadi.effects", "dlo_casadi.vision", "dlo_casadi.parallel")
+MODULES = ("dlo_casadi", "dlo_casadi.effects", "dlo_casadi.vision", "dlo_casadi.runtime.parallel")
 FOLDER = Path(__file__).parents[1] / "results/api"
 
 

@@ -21,9 +21,9 @@ import numpy as np
 import yaml
 
 from dlo_casadi.config import load_config
-from dlo_casadi.durable import write_file
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.parallel import map_as_completed, open_executor
+from dlo_casadi.io.files import write_file
+from dlo_casadi.runtime.parallel import map_as_completed, open_executor
 from dlo_casadi.session import run_session
 from dlo_casadi.session.outcome import Outcome
 

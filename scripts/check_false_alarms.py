@@ -37,16 +37,17 @@ from simulated import random_session
 
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
-from dlo_casadi.durable import write_file
 from dlo_casadi.effects import EFFECTS
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.spread import modes_in
 from dlo_casadi.estimation.mesh import SEARCH_MESH
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_intervals
-from dlo_casadi.estimation.rest_scatter import SMOOTHNESS, RestScatter, modes_in
-from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
-from dlo_casadi.pose import Pose
+from dlo_casadi.io.files import write_file
+from dlo_casadi.model.rest_curvature import SMOOTHNESS, RestScatter
+from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import conditions

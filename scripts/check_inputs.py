@@ -34,8 +34,8 @@ from inputs.watch import MOST_SECONDS, watched
 
 from dlo_casadi.cli import main as dlo
 from dlo_casadi.config import dump_yaml
-from dlo_casadi.parallel import generator_of
 from dlo_casadi.report.writer import FAILURE, OWNED
+from dlo_casadi.runtime.parallel import generator_of
 
 # Family -> share of the inputs. A fit takes a hundred times as long as a refusal: some two
 # seconds where the input is right, several where its numbers are far off.

@@ -36,15 +36,15 @@ from simulated import random_session
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
-from dlo_casadi.durable import write_file
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.mesh import fine_enough
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import profile_intervals
-from dlo_casadi.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.io.files import write_file
 from dlo_casadi.report.canvas import BLUE, GREY, VERMILLION, figure
+from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import conditions

@@ -31,10 +31,10 @@ from benchmarks.random_cables import SpaceProblem, space_problem
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import MOST_SHED, solve_equilibria
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import MOST_SHED, solve_equilibria
 
 FloatArray = NDArray[np.floating]
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import DloError
-from dlo_casadi.parallel import map_as_completed, open_executor
+from dlo_casadi.runtime.parallel import map_as_completed, open_executor
 from dlo_casadi.session import run_session
 from dlo_casadi.session.remarks import worse_than_simpler
 

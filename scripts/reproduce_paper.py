@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from paper import energies, equations, monte_carlo, page, scale, tables, timing
 from paper.content import Part
 
-from dlo_casadi.parallel import open_executor
+from dlo_casadi.runtime.parallel import open_executor
 
 ORDER = ("table4", "replica", "equations", "speed")
 LONG = ("monte_carlo", "scale")

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Shapes
 from dlo_casadi.config import Config
+from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.estimation.sweep import Sweep
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.session.measure import conditions
 
 # Waves of the rest curvature along the cable.

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dlo_casadi.assembly import Assembly, Directions, Given, Shapes, deviation_names
+from dlo_casadi.model.assembly import Assembly, Directions, Given, Shapes
+from dlo_casadi.rod.ends import deviation_names
 
 FloatArray = np.ndarray
 

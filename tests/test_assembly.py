@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from perturbed import any_rest, any_shapes, central, directions
 
-from dlo_casadi.assembly import Assembly, Given, Shapes
 from dlo_casadi.effects import (
     AxialStretch,
     BendingSoftening,
@@ -26,9 +25,10 @@ from dlo_casadi.effects import (
     StiffSection,
     UnknownPull,
 )
-from dlo_casadi.estimation.sweep import Sweep
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.model.assembly import Assembly, Given, Shapes
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS
 
 CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)

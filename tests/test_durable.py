@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from dlo_casadi.durable import FolderDraft, refuse_foreign, write_file
 from dlo_casadi.errors import OutputError
+from dlo_casadi.io.files import FolderDraft, refuse_foreign, write_file
 
 REMEDY = r"\n  Try: another place, or check its permissions and the free space"
 

@@ -9,7 +9,6 @@ import pytest
 from perturbed import any_rest, any_shapes, central, directions
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.effects import (
     EFFECTS,
     BendingSoftening,
@@ -39,12 +38,13 @@ from dlo_casadi.effects import (
     Tether,
     UnknownPull,
 )
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
-from dlo_casadi.solve import solve_equilibrium
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 # Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.effects import (
     EFFECTS,
     BendingAnisotropy,
@@ -26,9 +25,10 @@ from dlo_casadi.effects import (
     Sight,
     Tether,
 )
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.cable_model import CableModel
 
 FLAT = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 CABLE = replace(FLAT, torsional_stiffness=0.03)

@@ -12,7 +12,6 @@ from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
-from dlo_casadi.assembly import Given
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import (
     AxialStretch,
@@ -23,13 +22,14 @@ from dlo_casadi.effects import (
     LumpedMass,
     PointForce,
 )
-from dlo_casadi.equilibrium import Equilibrium, Status
+from dlo_casadi.equilibrium.equilibrium import Equilibrium, Status
+from dlo_casadi.equilibrium.guesses import guesses
+from dlo_casadi.equilibrium.ipopt import by_ipopt
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.guesses import guesses
-from dlo_casadi.ipopt import by_ipopt
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibria, solve_equilibrium
+from dlo_casadi.model.assembly import Given
+from dlo_casadi.model.cable_model import CableModel
 
 DATA = Path(__file__).parent / "data"
 SCRIPTS = Path(__file__).parents[1] / "scripts"

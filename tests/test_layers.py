@@ -1,4 +1,4 @@
-"""Imports go one way; yaml, cv2 and print each have one place."""
+"""Imports go one way, in no circle; yaml, cv2 and print each have one place."""
 
 import ast
 from collections.abc import Iterator
@@ -11,92 +11,106 @@ from dlo_casadi.effects import EFFECTS, NUISANCES
 PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
-CHAIN = ["errors", "interrupts", "thresholds", "parameters", "rod", "rest", "ends", "tolerances"]
-CHAIN += [
-    "effects",
-    "assembly",
-    "composition",
-    "lagrangian",
-    "model",
-    "whole_pose",
-    "descent",
-    "initial",
-    "initial_frames",
-    "pose",
-]
-CHAIN += ["guesses", "equilibrium", "ipopt", "solve"]
-MECHANICS = set(CHAIN)
-PARALLEL = {"executors", "parallel"}
-
-# layer -> what it may import beside itself. A new module gets its line here.
+# Room -> the rooms below it that it may import. A new room gets its line here.
+EVERYWHERE = {"errors", "thresholds", "__version__"}
+MECHANICS = {"rod", "effects", "model", "equilibrium"}
 MAY_IMPORT: dict[str, set[str]] = {
-    **{layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)},
-    "assembly": {*CHAIN[: CHAIN.index("assembly")], "model"},  # the model only for its type
-    "config": {"errors", "thresholds", "parameters", "rod", "ends", "tolerances", "effects"},
-    "durable": {"errors"},
-    "measurements": {"errors", "config", "durable"},
-    "vision": {"errors", "durable"},
-    "estimation": MECHANICS,
-    "diagnosis": MECHANICS | {"estimation"} | PARALLEL,
-    "codegen": MECHANICS | {"durable"},
-    "workers": {"interrupts", "vision"},
-    "executors": {"durable", "errors", "workers"},
-    "parallel": {"errors", "executors", "workers"},
+    "errors": set(),
+    "thresholds": set(),
+    "runtime": set(),
+    "rod": set(),
+    "effects": {"rod"},
+    "model": {"rod", "effects"},
+    "equilibrium": {"rod", "effects", "model", "runtime"},
+    "config": {"rod", "effects", "model"},
+    "io": {*MECHANICS, "config"},
+    "codegen": {*MECHANICS, "io"},
+    "vision": set(),
+    "sensing": {*MECHANICS, "vision"},
+    "estimation": {*MECHANICS, "sensing"},
+    "paper": {*MECHANICS, "sensing"},
+    "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
 }
-# A session: what is declared and measured -> stages and findings -> one outcome.
-READ = {"config", "measurements", "vision", "workers"}
-MAY_IMPORT["session"] = MECHANICS | READ | {"estimation", "diagnosis"} | PARALLEL
+FITTING = {*MECHANICS, "sensing", "estimation", "diagnosis"}
+MAY_IMPORT["session"] = {*FITTING, "paper", "config", "io", "vision", "runtime"}
 # A report reads results and solves nothing.
-STATED = set(CHAIN[: CHAIN.index("whole_pose")])
-MAY_IMPORT["report"] = STATED | READ | {"durable", "estimation", "diagnosis", "session"} | PARALLEL
-MAY_IMPORT["shape_table"] = MECHANICS | {"codegen", "durable", "parallel"}
-MAY_IMPORT["fleet"] = {"errors", "config", "durable", "workers", "session", "report"} | PARALLEL
-MAY_IMPORT["prediction"] = MECHANICS | {"config", "estimation", "report"}
-MAY_IMPORT["api"] = {"errors", "config", "pose", "prediction", "session", "report"}
+MAY_IMPORT["report"] = {*MAY_IMPORT["session"], "session"} - {"equilibrium", "paper", "sensing"}
+MAY_IMPORT["report"] |= {"equilibrium", "sensing"}  # types of what they hold
+MAY_IMPORT["fleet"] = {"config", "io", "session", "report", "runtime", "codegen", "model"}
+MAY_IMPORT["prediction"] = {*MECHANICS, "config", "io", "report"}
+MAY_IMPORT["api"] = {"config", "equilibrium", "io", "prediction", "session", "report"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 
-def layer_of(file: Path) -> str:
-    """Name of the layer: the folder or module directly in the package."""
+def room_of(file: Path) -> str:
+    """Name of the room: the folder or module directly in the package."""
     return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+def module_of(file: Path) -> str:
+    """Dotted name of a file."""
+    parts = file.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
 def imports(file: Path) -> Iterator[str]:
-    """Absolute names of all modules that a file imports, also inside functions."""
+    """Absolute names of all modules that a file imports, inside functions and for types, too."""
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{file}: relative import in line {node.lineno}"
             assert node.module is not None
-            yield node.module
-            if node.module == "dlo_casadi":
-                yield from (f"dlo_casadi.{alias.name}" for alias in node.names)
+            folder = PACKAGE.parent.joinpath(*node.module.split("."))
+            for alias in node.names:
+                is_module = (folder / f"{alias.name}.py").exists()
+                yield f"{node.module}.{alias.name}" if is_module else node.module
 
 
 def name(file: Path) -> str:
     return str(file.relative_to(PACKAGE))
 
 
-@pytest.mark.parametrize("file", [file for file in FILES if layer_of(file) != "__init__"], ids=name)
+@pytest.mark.parametrize("file", [file for file in FILES if room_of(file) != "__init__"], ids=name)
 def test_imports_go_one_way(file):
-    layer = layer_of(file)
-    assert layer in MAY_IMPORT, f"give the layer {layer!r} its line in MAY_IMPORT"
+    room = room_of(file)
+    assert room in MAY_IMPORT, f"give the room {room!r} its line in MAY_IMPORT"
     for module in imports(file):
         if module.startswith("dlo_casadi."):
             other = module.split(".")[1]
-            if other == "__version__":
-                continue
-            assert other in MAY_IMPORT[layer] | {layer}, f"{layer} must not import {other}"
+            allowed = MAY_IMPORT[room] | EVERYWHERE | {room}
+            assert other in allowed, f"{room} must not import {other}"
+
+
+def test_no_file_imports_itself_by_way_of_others():
+    files = {module_of(file): file for file in FILES if room_of(file) != "__init__"}
+    below = {
+        module: {other for other in imports(file) if other in files and other != module}
+        for module, file in files.items()
+    }
+    before = None
+    while before != len(
+        below
+    ):  # leave out what imports nothing that is left, or is imported by none
+        before = len(below)
+        below = {module: others & below.keys() for module, others in below.items()}
+        used = {other for others in below.values() for other in others}
+        below = {module: others for module, others in below.items() if others and module in used}
+    assert not below, f"in a circle: {sorted(below)}"
+
+
+def test_the_top_holds_rooms_and_little_else():
+    at_the_top = {file.name for file in FILES if file.parent == PACKAGE}
+    assert at_the_top == {"__init__.py", "api.py", "errors.py", "prediction.py", "thresholds.py"}
 
 
 @pytest.mark.parametrize(
-    ("library", "layer"), [("yaml", "config"), ("pydantic", "config"), ("cv2", "vision")]
+    ("library", "room"), [("yaml", "config"), ("pydantic", "config"), ("cv2", "vision")]
 )
-def test_a_library_with_one_place(library, layer):
+def test_a_library_with_one_place(library, room):
     users = {name(f) for f in FILES if any(m.split(".")[0] == library for m in imports(f))}
     assert users, f"nothing imports {library}"
-    assert all(user.startswith(f"{layer}/") or user == f"{layer}.py" for user in users), users
+    assert all(user.startswith(f"{room}/") for user in users), users
 
 
 def test_effects_are_named_by_themselves_alone():
@@ -104,7 +118,7 @@ def test_effects_are_named_by_themselves_alone():
     kinds = {**EFFECTS, **NUISANCES}
     names = {*kinds, *(kind.__name__ for kind in kinds.values())}
     for file in FILES:
-        if layer_of(file) == "effects":
+        if room_of(file) == "effects":
             continue
         for node in ast.walk(ast.parse(file.read_text())):
             said = [node.value] if isinstance(node, ast.Constant) else []
@@ -115,7 +129,7 @@ def test_effects_are_named_by_themselves_alone():
 
 def test_only_the_commands_print_or_exit():
     for file in FILES:
-        if layer_of(file) == "cli":
+        if room_of(file) == "cli":
             continue
         for node in ast.walk(ast.parse(file.read_text())):
             called = ast.unparse(node.func) if isinstance(node, ast.Call) else ""

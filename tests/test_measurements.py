@@ -7,7 +7,7 @@ import pytest
 
 from dlo_casadi.config import Centerlines, load_config
 from dlo_casadi.errors import MeasurementError, OutputError
-from dlo_casadi.measurements import read_points, write_points
+from dlo_casadi.io.points import read_points, write_points
 
 ROOT = Path(__file__).parents[1]
 START, END = (0.0, 0.0), (0.5, 0.1)

@@ -10,7 +10,7 @@ import pytest
 
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml, read_yaml
-from dlo_casadi.measurements import read_points, write_points
+from dlo_casadi.io.points import read_points, write_points
 
 ROOT = Path(__file__).parents[1]
 BENCH = ROOT / "tests/data/bench"

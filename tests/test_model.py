@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from perturbed import any_rest, any_shapes, directions
 
-from dlo_casadi.assembly import DEVIATIONS, Given, Shapes
 from dlo_casadi.effects import (
     AxialStretch,
     Cable,
@@ -19,15 +18,18 @@ from dlo_casadi.effects import (
     StiffnessGradient,
     StiffSection,
 )
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
-from dlo_casadi.whole_pose import potential
+from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.whole_pose import potential
+from dlo_casadi.rod.ends import deviation_names
+from dlo_casadi.rod.node import Heading
 
 CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
 WEIGHT = 9.81 * CABLE.mass  # N
-STILL = np.zeros(len(DEVIATIONS))
+STILL = np.zeros(len(deviation_names(Heading)))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 
 

@@ -16,13 +16,14 @@ from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import EFFECTS, Cable, Effect, Fitted, PointForce, PointLoad, Setup
 from dlo_casadi.effects.effect import Params, PointForceAt
+from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
-from dlo_casadi.parameters import Parameter
-from dlo_casadi.pose import Pose
-from dlo_casadi.report.parameters_file import load_parameters, parameters_of
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.io.parameters import load_parameters
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.report.parameters_text import parameters_of
 
 NOISE = 3e-4
 LIFT, PLACE = 0.4, 0.35  # N, m

@@ -15,12 +15,12 @@ import cv2
 import pytest
 from threadpoolctl import threadpool_info
 
-from dlo_casadi import parallel
+from dlo_casadi.equilibrium.ipopt import run_ipopt
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.executors import InProcess
-from dlo_casadi.interrupts import interrupts_held
-from dlo_casadi.ipopt import run_ipopt
-from dlo_casadi.parallel import (
+from dlo_casadi.runtime import parallel
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.interrupts import interrupts_held
+from dlo_casadi.runtime.parallel import (
     LostTaskError,
     Tally,
     begin,
@@ -82,7 +82,7 @@ def pool():
 
 @pytest.fixture(scope="module")
 def two_of_us():
-    with open_executor(jobs=2, here=True, libraries=("dlo_casadi.pose",)) as executor:
+    with open_executor(jobs=2, here=True, libraries=("dlo_casadi.equilibrium.pose",)) as executor:
         executor.submit(os.getpid).result()
         yield executor
 
@@ -279,6 +279,7 @@ def test_items_are_taken_only_when_there_is_room():
 
 
 def test_a_killed_worker_loses_nothing(tmp_path):
+    (tmp_path / "logs").mkdir()
     with open_executor(jobs=2, logs=tmp_path / "logs") as executor:
         work = partial(kill_once, str(tmp_path / "mark"))
         assert map_in_order(executor, work, range(8)) == [x * x for x in range(8)]

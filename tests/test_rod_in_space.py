@@ -7,14 +7,14 @@ from scipy.linalg import null_space
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.assembly import Given, Shapes
-from dlo_casadi.descent import descend
 from dlo_casadi.effects import EFFECTS, Cable
+from dlo_casadi.equilibrium.descent import descend
+from dlo_casadi.equilibrium.initial_frames import same_sign
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.initial_frames import same_sign
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.cable_model import CableModel
 
 LENGTH, EI, GJ = 0.8, 0.02, 0.015
 DOWN = (0.0, 0.0, -9.81)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from perturbed import any_rest, any_shapes
 
-from dlo_casadi.assembly import Given
 from dlo_casadi.effects import (
     AxialStretch,
     Cable,
@@ -16,9 +15,10 @@ from dlo_casadi.effects import (
     LumpedMass,
     RestCurvatureDrift,
 )
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.assembly import Given
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, potential, rest_after
 from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.whole_pose import PoseSymbols, balance, curve, potential, rest_after
 
 CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
 # Start, end [m], headings [rad], no camera.

@@ -12,13 +12,13 @@ from dlo_casadi.cli.guard import BAD_INPUT, OK
 from dlo_casadi.cli.options import command, configuration, console, print_json
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config
-from dlo_casadi.durable import make_folder
 from dlo_casadi.errors import DloError, MeasurementError
+from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.report.check_table import advice_lines, check_dict, check_table
 from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import find_suspicions
 from dlo_casadi.session.measure import draw_steps, read_inputs
-from dlo_casadi.vision import write_picture
+from dlo_casadi.vision import encoded
 
 EXAMPLES = """\
 dlo check configs/cable.yaml
@@ -92,6 +92,6 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
             continue
         for name, picture in pictures.items():
             written.append(folder / f"{name}.jpg")
-            write_picture(written[-1], picture)
+            write_file(written[-1], encoded(picture, ".jpg"))
     watch.step("draw the steps", len(poses), len(poses))
     return written

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from dlo_casadi.cli.guard import signals
-from dlo_casadi.parallel import Tally
+from dlo_casadi.runtime.parallel import Tally
 
 # Without a terminal: no more than one line in so many seconds.
 _PATIENCE = 10.0

@@ -12,7 +12,8 @@ from dlo_casadi.cli.guard import BAD_INPUT, OK
 from dlo_casadi.cli.options import add_jobs, command, console, print_json
 from dlo_casadi.fleet import FleetResult, Options, find_sessions, fit_fleet
 from dlo_casadi.fleet.outliers import judge
-from dlo_casadi.parallel import open_executor
+from dlo_casadi.io.files import make_folder
+from dlo_casadi.runtime.parallel import open_executor
 
 EXAMPLES = """\
 dlo fit-many cables/                                  all configurations in it and below
@@ -53,10 +54,12 @@ def main(argv: Sequence[str]) -> int:
     base, sessions = find_sessions(chosen.where)
     output = chosen.output or Path("results") / f"fleet-{base.name}"
     options = Options(diagnosis=not chosen.no_diagnosis, reports=not chosen.no_reports)
+    logs = output / "logs"
+    make_folder(logs)
     try:
         with (
             Counter(Console(stderr=True), "sessions", chosen.quiet) as counter,
-            open_executor(chosen.jobs, chosen.scheduler, output / "logs") as executor,
+            open_executor(chosen.jobs, chosen.scheduler, logs) as executor,
         ):
 
             def begin(taken_over: int, left: int) -> None:

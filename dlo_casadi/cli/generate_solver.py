@@ -9,7 +9,7 @@ from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, print_json
 from dlo_casadi.codegen import generate
 from dlo_casadi.errors import DloError
-from dlo_casadi.report.parameters_file import load_parameters
+from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.rod.chain import ELEMENTS
 
 EXAMPLES = """\

@@ -12,8 +12,8 @@ from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, print_json
 from dlo_casadi.config.schema import schema_text
 from dlo_casadi.config.template import template
-from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError
+from dlo_casadi.io.files import write_file
 
 EXAMPLES = """\
 dlo new rope.yaml

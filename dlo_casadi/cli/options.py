@@ -17,7 +17,7 @@ from rich.console import Console
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
-from dlo_casadi.parallel import begin, open_executor
+from dlo_casadi.runtime.parallel import begin, open_executor
 
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 

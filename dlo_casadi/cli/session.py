@@ -17,10 +17,10 @@ from rich.console import Console
 from dlo_casadi.cli.options import console, print_json
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config
-from dlo_casadi.executors import ended_first
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import candidate_table, print_summary
 from dlo_casadi.report.writer import ResultsFolder
+from dlo_casadi.runtime.executors import ended_first
 from dlo_casadi.session import run_session
 
 

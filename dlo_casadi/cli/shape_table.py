@@ -12,13 +12,14 @@ from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import add_jobs, command, console, print_json
 from dlo_casadi.cli.predict import plain_numbers
 from dlo_casadi.errors import DloError
+from dlo_casadi.fleet.shape_poses import Grid, PoseList, Poses
+from dlo_casadi.fleet.shape_solve import Plan
+from dlo_casadi.fleet.shape_table import shape_table
 from dlo_casadi.fleet.store import parquet_library
-from dlo_casadi.model import CableModel
-from dlo_casadi.parallel import open_executor
-from dlo_casadi.report.parameters_file import Parameters, load_parameters
+from dlo_casadi.io.parameters import Parameters, load_parameters
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.shape_table import Grid, Plan, PoseList, shape_table
-from dlo_casadi.shape_table.poses import Poses
+from dlo_casadi.runtime.parallel import open_executor
 
 EXAMPLES = """\
 dlo shape-table results/cable --grid -0.8 0.8 200 -0.8 0.8 200 --output shapes.parquet

@@ -32,9 +32,9 @@ from dlo_casadi.codegen.shapes import (
     SpaceShape,
     SpaceSlope,
 )
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]

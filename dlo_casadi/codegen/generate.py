@@ -16,10 +16,10 @@ from dlo_casadi import __version__
 from dlo_casadi.codegen import plane, space
 from dlo_casadi.codegen.kernels import c_number
 from dlo_casadi.codegen.prefix import check_prefix
-from dlo_casadi.durable import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel
+from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
+from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 

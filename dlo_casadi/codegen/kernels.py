@@ -14,10 +14,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.ends import EndConditions
 from dlo_casadi.errors import DloError
-from dlo_casadi.lagrangian import SlotNumbers
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.lagrangian import SlotNumbers
+from dlo_casadi.rod.ends import EndConditions
 
 FloatArray = NDArray[np.floating]
 

@@ -12,8 +12,8 @@ from dlo_casadi.codegen.kernels import (
     size_of_code,
     table_to_c,
 )
-from dlo_casadi.guesses import resting_headings
-from dlo_casadi.model import CableModel
+from dlo_casadi.equilibrium.guesses import resting_headings
+from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.errors import DloError
-from dlo_casadi.pose import Pose
 
 FloatArray = NDArray[np.floating]
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
 
 
 def shape_record(model: CableModel) -> np.dtype[Any]:

@@ -19,7 +19,7 @@ from dlo_casadi.codegen.kernels import (
     with_helpers,
 )
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 

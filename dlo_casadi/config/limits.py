@@ -7,16 +7,11 @@ range that is allowed. What can be computed but is hardly meant is a warning of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from dlo_casadi.config.problems import Place, Problem
-from dlo_casadi.effects import EFFECTS
-from dlo_casadi.effects import Cable as EffectsCable
-from dlo_casadi.parameters import STIFFNESS_BOUNDS
-
-if TYPE_CHECKING:
-    from dlo_casadi.config.sections import Experiment
+from dlo_casadi.effects.parameter import STIFFNESS_BOUNDS
 
 
 class Range(NamedTuple):
@@ -64,13 +59,13 @@ GRAVITY = Range(0.0, 1.0e4, "m/s^2")
 # A frame whose origin is farther away is that of a map; of 1e3 m, doubles resolve 1e-13 m.
 COORDINATE = Range(-1.0e3, 1.0e3, "m")
 # A fifth of the wavelength of green light, beyond any camera. Upwards: the cable's length.
-_FINEST_STD = 1.0e-7
+FINEST_STD = 1.0e-7
 # A nanometre over a metre is what interferometers resolve.
-_FINEST_TOLERANCE = 1.0e-9
+FINEST_TOLERANCE = 1.0e-9
 # The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; taut it pulls more. A moment: a metre's arm.
 FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
 # A nanonewton is what atomic force microscopes resolve.
-_FINEST_READING = 1.0e-9
+FINEST_READING = 1.0e-9
 # A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
 PIXELS = Range(-1.0e6, 1.0e6, "px")
 FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
@@ -182,51 +177,3 @@ def implausible_camera(
     problems = [p for f in (fx, fy) for p in FOCAL_LENGTH.problems(("matrix",), f)]
     problems += implausible_pixels(("matrix",), (skew, cx, cy))
     return problems + [p for k in distortion for p in DISTORTION.problems(("distortion",), k)]
-
-
-def impossible_values(experiment: Experiment, length: float) -> Iterator[Problem]:
-    """Find what lies beyond the ranges above, for a cable of that length [m]."""
-    at = ("experiment",)
-    for place, message in implausible_gravity(experiment.gravity):
-        yield Problem((*at, *place), f"gravity: {message}")
-    std = experiment.measurement.std
-    if std is not None:
-        for place, message in Range(_FINEST_STD, length, "m").problems(
-            (*at, "measurement", "std"), std, "; without it, it is estimated from the data"
-        ):
-            yield Problem(place, f"std: {message}")
-    # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
-    torsional_stiffness = 1.0 if experiment.in_space else None
-    cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
-    declared = experiment.tolerances.model_dump()
-    taken_up = {
-        kind.tolerances[q.name]: q
-        for kind in EFFECTS.values()
-        for q in kind().parameters(cable)
-        if kind.tolerances.get(q.name) in declared
-    }
-    for key, q in taken_up.items():
-        most = min(q.upper - q.nominal, q.nominal - q.lower)
-        for place, message in Range(_FINEST_TOLERANCE, most, q.unit).problems(
-            (*at, "tolerances", key), declared[key]
-        ):
-            yield Problem(place, f"tolerances.{key}: {message}")
-    for i, pose in enumerate(experiment.poses):
-        for key in ("start", "end"):
-            for k, value in enumerate(getattr(pose, key) or ()):
-                for place, message in COORDINATE.problems((*at, "poses", i, key, k), value):
-                    yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")
-        for key, values in pose.readings.items():
-            possible = FORCE if key.endswith("force") else MOMENT
-            for value in values:
-                for place, message in possible.problems((*at, "poses", i, key), value):
-                    yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")
-    stds = experiment.measurement
-    for key, value, possible in (
-        ("force_std", stds.force_std, FORCE),
-        ("moment_std", stds.moment_std, MOMENT),
-    ):
-        if value is not None:
-            finest = possible._replace(least=_FINEST_READING)
-            for place, message in finest.problems((*at, "measurement", key), value):
-                yield Problem(place, f"{key}: {message}")

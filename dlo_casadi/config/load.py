@@ -13,11 +13,22 @@ from pydantic import ValidationError
 from dlo_casadi.config.declared_effects import wrong_effects
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.explain import explain
-from dlo_casadi.config.limits import implausible_quaternion, impossible_values
+from dlo_casadi.config.limits import (
+    COORDINATE,
+    FINEST_READING,
+    FINEST_STD,
+    FINEST_TOLERANCE,
+    FORCE,
+    MOMENT,
+    Range,
+    implausible_gravity,
+    implausible_quaternion,
+)
 from dlo_casadi.config.measuring import Tolerances
 from dlo_casadi.config.problems import Problem, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, File, Pose, SkippedPose
-from dlo_casadi.effects import UNKNOWN_MASS
+from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS
+from dlo_casadi.effects import Cable as EffectsCable
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.rod.chain import ELEMENTS
 
@@ -59,7 +70,7 @@ def load_config(path: str | Path) -> Config:
         *_contradictions(file.experiment),
         *_weightless(file),
         *wrong_effects(file),
-        *impossible_values(file.experiment, file.cable.length),
+        *_impossible_values(file.experiment, file.cable.length),
     ]:
         raise document.error(problems)
 
@@ -333,3 +344,51 @@ def _oddities(file: File) -> list[str]:
         if given and getattr(held, end) == "pinned":
             warnings.append(f"{end}_heading is not used, the {end} is pinned: {', '.join(given)}")
     return warnings
+
+
+def _impossible_values(experiment: Experiment, length: float) -> Iterator[Problem]:
+    """Find what lies beyond the ranges above, for a cable of that length [m]."""
+    at = ("experiment",)
+    for place, message in implausible_gravity(experiment.gravity):
+        yield Problem((*at, *place), f"gravity: {message}")
+    std = experiment.measurement.std
+    if std is not None:
+        for place, message in Range(FINEST_STD, length, "m").problems(
+            (*at, "measurement", "std"), std, "; without it, it is estimated from the data"
+        ):
+            yield Problem(place, f"std: {message}")
+    # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
+    torsional_stiffness = 1.0 if experiment.in_space else None
+    cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
+    declared = experiment.tolerances.model_dump()
+    taken_up = {
+        kind.tolerances[q.name]: q
+        for kind in EFFECTS.values()
+        for q in kind().parameters(cable)
+        if kind.tolerances.get(q.name) in declared
+    }
+    for key, q in taken_up.items():
+        most = min(q.upper - q.nominal, q.nominal - q.lower)
+        for place, message in Range(FINEST_TOLERANCE, most, q.unit).problems(
+            (*at, "tolerances", key), declared[key]
+        ):
+            yield Problem(place, f"tolerances.{key}: {message}")
+    for i, pose in enumerate(experiment.poses):
+        for key in ("start", "end"):
+            for k, value in enumerate(getattr(pose, key) or ()):
+                for place, message in COORDINATE.problems((*at, "poses", i, key, k), value):
+                    yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")
+        for key, values in pose.readings.items():
+            possible = FORCE if key.endswith("force") else MOMENT
+            for value in values:
+                for place, message in possible.problems((*at, "poses", i, key), value):
+                    yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")
+    stds = experiment.measurement
+    for key, value, possible in (
+        ("force_std", stds.force_std, FORCE),
+        ("moment_std", stds.moment_std, MOMENT),
+    ):
+        if value is not None:
+            finest = possible._replace(least=FINEST_READING)
+            for place, message in finest.problems((*at, "measurement", key), value):
+                yield Problem(place, f"{key}: {message}")

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from dlo_casadi.config.limits import COORDINATE, MARKER, implausible_camera, implausible_pixels
 from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean
 from dlo_casadi.config.values import NonNegative, Number, Positive, Row, Section, Vector
-from dlo_casadi.tolerances import Tolerances as Known
+from dlo_casadi.model.tolerances import Tolerances as Known
 
 _STANDARD = Known()
 

@@ -18,8 +18,8 @@ from dlo_casadi.config.measuring import Centerlines, Images, Tolerances
 from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
 from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, show
 from dlo_casadi.config.values import Moment, Number, Place, Positive, Quaternion, Section, optional
-from dlo_casadi.ends import REACTIONS
 from dlo_casadi.errors import well_formed
+from dlo_casadi.rod.ends import REACTIONS
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
 # a foam, to five times, which no metal of cables reaches.

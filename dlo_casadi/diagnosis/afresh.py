@@ -14,8 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Shapes
-from dlo_casadi.composition import END_ROLL
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.fit import (
     ROUGHNESS_START,
@@ -23,13 +21,15 @@ from dlo_casadi.estimation.fit import (
     STEPS_OF_A_RIVAL,
 )
 from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes, twists
 from dlo_casadi.estimation.starting_points import FIRST_LOOK, MORE
 from dlo_casadi.estimation.transfer import with_border_of
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.composition import END_ROLL
+from dlo_casadi.model.rest_curvature import RestScatter
 
 FloatArray = NDArray[np.floating]
 

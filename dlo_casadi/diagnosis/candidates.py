@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi.effects import EFFECTS, Effect, PointLoad, Setup
 from dlo_casadi.effects.effect import Cable
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.parallel import map_in_order
+from dlo_casadi.runtime.parallel import map_in_order
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)

@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
-from dlo_casadi.assembly import Shapes
+from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.executors import InProcess
-from dlo_casadi.parallel import map_in_order
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import CLEARLY_WORSE
 
 FloatArray = NDArray[np.floating]

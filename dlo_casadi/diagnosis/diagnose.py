@@ -16,7 +16,7 @@ from dlo_casadi.diagnosis.search import Search
 from dlo_casadi.diagnosis.selection import AddedEffect, Ranked
 from dlo_casadi.diagnosis.structure import Structure, screening_degrees, structure_of
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.executors import InProcess
+from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.thresholds import SIGNIFICANCE
 
 Verdict = Literal["complete", "effect_found", "unexplained"]

@@ -6,10 +6,10 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.diagnosis.candidates import Candidate, setup_of
 from dlo_casadi.effects import EFFECTS, Fitted, Load
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model.composition import BENDING_STIFFNESS
 from dlo_casadi.thresholds import ALIKE
 
 

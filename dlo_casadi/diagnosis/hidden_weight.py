@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.effects import Load
@@ -22,7 +21,8 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import student_95
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.executors import InProcess
+from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.runtime.executors import InProcess
 
 # Weights that are tried in turn, over the cable's own: until one does not fit.
 WEIGHTS = 0.05 * 1.6 ** np.arange(9)

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.ends import reaction_rows
-from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.prediction import Prediction, predict_each
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.pose import Pose
+from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.thresholds import APART
 
 FloatArray = NDArray[np.floating]

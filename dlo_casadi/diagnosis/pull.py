@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
@@ -18,9 +17,10 @@ from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.starting_points import DECADES, starting_points
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.executors import InProcess
-from dlo_casadi.model import CableModel
-from dlo_casadi.parallel import map_in_order
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import NORMAL_95
 
 FloatArray = NDArray[np.floating]

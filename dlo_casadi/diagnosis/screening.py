@@ -25,18 +25,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
-from dlo_casadi.assembly import Shapes
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import StateEffect
+from dlo_casadi.equilibrium.batch import Sweep
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
 from dlo_casadi.estimation.linearization import Linearization, Point
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.transfer import carried_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.executors import InProcess
-from dlo_casadi.model import CableModel
-from dlo_casadi.parallel import begin
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.thresholds import COLLINEAR, SCANS_PER_TEST
 
 FloatArray = NDArray[np.floating]

@@ -40,7 +40,7 @@ from dlo_casadi.estimation.hyperparameters import SETTLED_MODES, settle
 from dlo_casadi.estimation.mesh import fine_enough
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.parallel import map_in_order
+from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import (
     BIC_APART,
     DIFFERENT,

@@ -11,8 +11,8 @@ from scipy.special import ndtri
 
 from dlo_casadi.diagnosis.screening import survival
 from dlo_casadi.estimation.hyperparameters import rest_scatter_of
-from dlo_casadi.estimation.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.sensing.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.thresholds import KEPT_INFORMATION, KEPT_VARIANCE, LEAST_NOISE_DEGREES
 
 FloatArray = NDArray[np.floating]

@@ -3,6 +3,7 @@
 from dlo_casadi.effects.axial_stretch import AxialStretch
 from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening
+from dlo_casadi.effects.cable import Cable
 from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamp_angle import ClampAngle
 from dlo_casadi.effects.clamp_compliance import ClampCompliance
@@ -10,9 +11,9 @@ from dlo_casadi.effects.clamp_rotation import ClampRotation
 from dlo_casadi.effects.edge_bias import EdgeBias
 from dlo_casadi.effects.effect import (
     BoundaryEffect,
-    Cable,
     Effect,
     EndConditions,
+    Fitted,
     Kinematics,
     Load,
     MeasurementEffect,
@@ -35,7 +36,7 @@ from dlo_casadi.effects.plastic_set import PlasticSet
 from dlo_casadi.effects.point_force import PointForce
 from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift
 from dlo_casadi.effects.sensor_bias import SensorBias
-from dlo_casadi.effects.setup import Fitted, Setup
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.effects.side_load import SideLoad
 from dlo_casadi.effects.standoff_error import StandoffError
 from dlo_casadi.effects.stiff_section import StiffSection

@@ -7,8 +7,9 @@ from math import atan2, copysign, hypot, pi
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Effect, Params, SectionLaw
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import Effect, Params, SectionLaw
+from dlo_casadi.effects.parameter import Parameter
 
 # Ratios of the stiffnesses: a ribbon of the width w and thickness t has (w / t)^2.
 LARGEST = 100.0

@@ -7,8 +7,9 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.effect import Cable, Params, SectionLaw
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import Params, SectionLaw
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.rod.element import Cell
 
 # Gauss-Legendre on [0, 1]; ten points integrate the law to 1e-9 for |k|/c up to 5.

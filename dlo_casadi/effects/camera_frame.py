@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight, vector
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight, vector
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.rod.node import rotated, rotation
 
 _ROTATIONS = ("rotation_x", "rotation_y", "rotation_z")

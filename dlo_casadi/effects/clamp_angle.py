@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
-from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params
-from dlo_casadi.effects.setup import Fitted, Setup
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Fitted, Params
+from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.effects.setup import Setup
 
 
 @dataclass(frozen=True)

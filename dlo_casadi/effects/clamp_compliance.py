@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import casadi as ca
 
+from dlo_casadi.effects.cable import Cable
 from dlo_casadi.effects.clamp_angle import ClampEffect
-from dlo_casadi.effects.effect import Cable, Params
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.effect import Params
+from dlo_casadi.effects.parameter import Parameter
 
 
 class ClampCompliance(ClampEffect):

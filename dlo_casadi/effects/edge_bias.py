@@ -6,9 +6,10 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
-from dlo_casadi.parameters import Parameter
 
 # Harmonics of the cable's direction: light from one side shifts all of its picture, which is the
 # first; the grid of pixels has the fourth. Of the three rendered sessions of photographs, without

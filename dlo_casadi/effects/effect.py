@@ -8,65 +8,26 @@ All of that has defaults, so that most effects declare `name`, `parameters` and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import pi
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from dlo_casadi.ends import EndConditions
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.element import Cell
-
-if TYPE_CHECKING:
-    from dlo_casadi.effects.setup import Fitted, Setup
+from dlo_casadi.rod.ends import EndConditions
+from dlo_casadi.thresholds import NEAR_END
 
 Params = Mapping[str, ca.SX]
 Scan = dict[str, float]
 
 # Places along the cable at which loads at one place are tried, as shares of its length.
 PLACES = np.linspace(0.06, 0.94, 23)
-
-
-@dataclass(frozen=True)
-class Cable:
-    """What is declared of a cable.
-
-    Parameters
-    ----------
-    length : float [m]
-        Along the cable between its fixtures.
-    mass : float [kg]
-        Of that length.
-    diameter : float [m]
-    bending_stiffness : float [N m^2]
-        Crude prior of EI.
-    name : str
-    straight : bool
-        True if no rest curvature is fitted.
-    torsional_stiffness : float [N m^2], optional
-        Crude prior of GJ; a cable that has one is in space, others stay in a plane.
-    """
-
-    length: float
-    mass: float
-    diameter: float
-    bending_stiffness: float
-    name: str = "cable"
-    straight: bool = False
-    torsional_stiffness: float | None = None
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """Names of the components of a position or a force."""
-        return ("x", "y") if self.torsional_stiffness is None else ("x", "y", "z")
-
-    @property
-    def curvature_scale(self) -> float:
-        """One full turn over the length [1/m]."""
-        return 2 * pi / self.length
 
 
 def vector(params: Params, prefix: str) -> ca.SX:
@@ -407,3 +368,39 @@ class StateEffect(Effect):
     def applies(cls, setup: Setup) -> bool:
         """Where the rest curvature is free to move, from one pose to another."""
         return super().applies(setup) and setup.n_poses > 1 and setup.curved
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """An effect as a fit has found it, by its own parameters' names.
+
+    `values` and `stds` hold each parameter's value and standard deviation.
+    """
+
+    effect: Effect
+    setup: Setup
+    values: Mapping[str, float]
+    stds: Mapping[str, float]
+
+    @property
+    def near_start(self) -> bool:
+        """Whether it acts so near to the start that it may be the fixture's."""
+        place = self.effect.place(self.values)
+        return place is not None and place < NEAR_END * self.setup.cable.length
+
+    @property
+    def near_end(self) -> bool:
+        """Whether it acts so near to the end that it may be the fixture's."""
+        place = self.effect.place(self.values)
+        return place is not None and place > (1 - NEAR_END) * self.setup.cable.length
+
+    def propagated(
+        self, of: Callable[[Params], ca.SX]
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Value (k,) of an expression of the parameters, and what each std moves it by (k, n)."""
+        names = list(self.values)
+        own = ca.SX.sym("own", len(names))
+        result = of(dict(zip(names, ca.vertsplit(own), strict=True)))
+        both = ca.Function("of", [own], [result, ca.jacobian(result, own)])
+        value, slopes = both([self.values[name] for name in names])
+        return np.array(value)[:, 0], np.array(slopes) * [self.stds[name] for name in names]

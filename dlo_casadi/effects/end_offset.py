@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from dlo_casadi.effects.effect import BoundaryEffect, Cable, EndConditions, Params, vector
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vector
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
-from dlo_casadi.parameters import Parameter
 
 
 class EndOffset(BoundaryEffect):

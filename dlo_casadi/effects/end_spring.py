@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import BoundaryEffect, Cable, Params, Scan
-from dlo_casadi.effects.setup import Fitted, Setup
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import BoundaryEffect, Fitted, Params, Scan
+from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.effects.setup import Setup
 
 # Directions in which a pin may hold the cable, relative to the mean heading there [rad].
 HEADINGS = (-1.2, -0.6, 0.0, 0.6, 1.2)

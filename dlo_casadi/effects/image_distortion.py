@@ -7,9 +7,10 @@ from typing import Self
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
-from dlo_casadi.parameters import Parameter
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Kinematics, Params
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import Kinematics, Params
+from dlo_casadi.effects.parameter import Parameter
 
 
 class LengthError(Kinematics):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.effect import Cable, Params, PointForceAt, PointLoad
-from dlo_casadi.effects.setup import Fitted
-from dlo_casadi.parameters import Parameter
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import Fitted, Params, PointForceAt, PointLoad
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.thresholds import ALONG_GRAVITY
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Load, Params
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import Load, Params
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
-from dlo_casadi.parameters import Parameter
 
 # Qualified name of its parameter.
 MASS_FACTOR = "mass_error.factor"

@@ -1,16 +1,11 @@
-"""What effects are told: how a cable is held and measured, and what a fit has found."""
+"""What effects are told: how a cable is held and measured."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
-
-from dlo_casadi.effects.effect import Cable, Effect, Params
-from dlo_casadi.thresholds import NEAR_END
+from dlo_casadi.effects.cable import Cable
 
 
 @dataclass(frozen=True)
@@ -63,39 +58,3 @@ class Setup:
     def in_space(self) -> bool:
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """An effect as a fit has found it, by its own parameters' names.
-
-    `values` and `stds` hold each parameter's value and standard deviation.
-    """
-
-    effect: Effect
-    setup: Setup
-    values: Mapping[str, float]
-    stds: Mapping[str, float]
-
-    @property
-    def near_start(self) -> bool:
-        """Whether it acts so near to the start that it may be the fixture's."""
-        place = self.effect.place(self.values)
-        return place is not None and place < NEAR_END * self.setup.cable.length
-
-    @property
-    def near_end(self) -> bool:
-        """Whether it acts so near to the end that it may be the fixture's."""
-        place = self.effect.place(self.values)
-        return place is not None and place > (1 - NEAR_END) * self.setup.cable.length
-
-    def propagated(
-        self, of: Callable[[Params], ca.SX]
-    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Value (k,) of an expression of the parameters, and what each std moves it by (k, n)."""
-        names = list(self.values)
-        own = ca.SX.sym("own", len(names))
-        result = of(dict(zip(names, ca.vertsplit(own), strict=True)))
-        both = ca.Function("of", [own], [result, ca.jacobian(result, own)])
-        value, slopes = both([self.values[name] for name in names])
-        return np.array(value)[:, 0], np.array(slopes) * [self.stds[name] for name in names]

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, MeasurementEffect, Params, Sight
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
-from dlo_casadi.parameters import Parameter
 
 
 class StandoffError(MeasurementEffect):

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from dlo_casadi.effects.effect import Cable, Effect, Params, PointLoad, SpringAt, vector
+from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.effect import Effect, Params, PointLoad, SpringAt, vector
+from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
-from dlo_casadi.parameters import Parameter
 
 # How far an anchor may lie from the board's origin, in lengths of the cable: the force of one
 # that far changes by a tenth in direction and size where the cable moves by its own length.

@@ -26,14 +26,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Shapes
-from dlo_casadi.composition import BENDING_STIFFNESS
+from dlo_casadi.equilibrium.curve import ObservedChange
+from dlo_casadi.equilibrium.ipopt import run_ipopt
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Point
-from dlo_casadi.estimation.sensors import ObservedChange
-from dlo_casadi.ipopt import run_ipopt
-from dlo_casadi.whole_pose import PoseSymbols, balance, curve, readings, rest_after
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after
 
 FloatArray = NDArray[np.floating]
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.composition import END_ROLL
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.hyperparameters import (
@@ -19,17 +18,18 @@ from dlo_casadi.estimation.hyperparameters import (
     refine,
 )
 from dlo_casadi.estimation.linearization import Point
-from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
-from dlo_casadi.estimation.rest_scatter import RestScatter
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.starting_points import DECADES, ROLLS, starting_points
 from dlo_casadi.estimation.transfer import carried_feet, carried_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.composition import END_ROLL
+from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 from dlo_casadi.thresholds import DIFFERENT
-from dlo_casadi.tolerances import Tolerances
 
 FloatArray = NDArray[np.floating]
 

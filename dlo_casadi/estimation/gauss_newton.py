@@ -21,16 +21,17 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
-from dlo_casadi.assembly import Directions, Shapes
+from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.curve import Observed
+from dlo_casadi.equilibrium.spread import modes_in
 from dlo_casadi.estimation.linearization import Linearization, Normal, Point, Values
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.rest_scatter import MODES, RestScatter, modes_in
-from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model.assembly import Directions, Shapes
+from dlo_casadi.model.rest_curvature import MODES, RestScatter
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.band import Vector
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 
 FloatArray = NDArray[np.floating]
 

@@ -10,7 +10,18 @@ from numpy.typing import NDArray
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Linearization, Point
-from dlo_casadi.estimation.noise import (
+from dlo_casadi.estimation.repeats import different_poses, with_repeats
+from dlo_casadi.estimation.rest_scatter import (
+    MOST_POSES,
+    RestLikelihood,
+    ScatterEstimate,
+    ScatterSample,
+    estimate_rest_scatter,
+)
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.rest_curvature import MODES, RestScatter
+from dlo_casadi.sensing.noise import (
     NoiseModel,
     NoiseSample,
     ReadingNoise,
@@ -18,18 +29,6 @@ from dlo_casadi.estimation.noise import (
     smooth_modes,
     tell_of_noise,
 )
-from dlo_casadi.estimation.repeats import different_poses, with_repeats
-from dlo_casadi.estimation.rest_scatter import (
-    MODES,
-    MOST_POSES,
-    RestLikelihood,
-    RestScatter,
-    ScatterEstimate,
-    ScatterSample,
-    estimate_rest_scatter,
-)
-from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import CableModel
 from dlo_casadi.thresholds import DIFFERENT, SCATTERED, SCATTERED_DEGREES
 
 FloatArray = NDArray[np.floating]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Directions, Shapes
+from dlo_casadi.model.assembly import Directions, Shapes
 
 FloatArray = NDArray[np.floating]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Shapes
+from dlo_casadi.equilibrium.batch import Sweep
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SMOOTH_MODES
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.transfer import on_other_mesh
+from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.thresholds import LACKING_SHARE, MESH_SHARE
 

@@ -10,8 +10,8 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.model import CableModel
-from dlo_casadi.rest import RestCurvature
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.rest_curvature import RestCurvature
 
 FloatArray = NDArray[np.floating]
 

@@ -9,18 +9,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Given, Shapes
-from dlo_casadi.composition import END_ROLL
-from dlo_casadi.equilibrium import NEARBY, Equilibrium
+from dlo_casadi.equilibrium.chords import line_nodes
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed
+from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
+from dlo_casadi.equilibrium.pose import SIGNS, Pose, PoseBranch
+from dlo_casadi.equilibrium.solve import continued, solve_equilibria
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.estimation.chords import line_nodes
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import SIGNS, Pose, PoseBranch
-from dlo_casadi.solve import continued, solve_equilibria
+from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.composition import END_ROLL
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.thresholds import EITHER
 
 FloatArray = NDArray[np.floating]

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.rod.node import Frame, Heading
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
 from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE
 
 FloatArray = NDArray[np.floating]

@@ -29,14 +29,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import chdtrc, chdtri
 
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.rest_curvature import MODES, SMOOTHNESS, RestScatter
 from dlo_casadi.thresholds import SIGNIFICANCE
 
 FloatArray = NDArray[np.floating]
 
-# Cosines of a rest curvature, and its correlation lengths that are tried, shares of L.
-MODES = 8
-SMOOTHNESS = (0.5, 0.25, 0.12)
 # Ranges of what is systematic that are tried, shares of the RMS distance of the poses' shapes.
 RANGES = (0.25, 1.0)
 # Decrease of -2 log likelihood from which a size is not taken as zero: at that bound 5 % exceed it
@@ -47,50 +44,6 @@ TELLING = float(chdtri(1, 0.1))
 MOST_POSES = 40
 # Smallest and largest size in units of the first guess that are looked at.
 _LOWEST, _HIGHEST = np.log(1e-4), np.log(1e2)
-
-
-@dataclass(frozen=True)
-class RestScatter:
-    """Random rest curvature of every hanging.
-
-    Parameters
-    ----------
-    std : float [1/m]
-        Root mean square along the cable; 0 where the cable repeats.
-    smoothness : float
-        Correlation length as a share of the cable's.
-    dof : float
-        Degrees of freedom of chi-square with which its variance is known.
-    """
-
-    std: float = 0.0
-    smoothness: float = SMOOTHNESS[0]
-    dof: float = np.inf
-
-    @property
-    def sizes(self) -> FloatArray:
-        """Standard deviation (MODES,) [1/m] of each mode's coefficient."""
-        return self.std * np.sqrt(_shares(self.smoothness))
-
-
-def modes_of(cells: FloatArray, length: float) -> FloatArray:
-    """Means of the modes f_k over cells (n_cells, 2) [m]: (n_cells, MODES)."""
-    k = np.arange(1, MODES)
-    primitive = np.sin(np.pi / length * np.multiply.outer(cells, k)) * length / (k * np.pi)
-    waves = (primitive[:, 1] - primitive[:, 0]) / (cells[:, 1] - cells[:, 0])[:, None]
-    return np.column_stack([np.ones(len(cells)), np.sqrt(2.0) * waves])
-
-
-def modes_in(model: CableModel) -> FloatArray:
-    """The same as rest curvatures of a model's cells, axis by axis: (n_rests, axes MODES)."""
-    axes = np.eye(len(model.node.strains))[:, -len(model.node.curvatures) :]
-    return np.kron(axes, modes_of(model.chain.cells, model.cable.length))
-
-
-def _shares(smoothness: float) -> FloatArray:
-    """Shares v_k (MODES,) of the variance."""
-    share = np.exp(-((np.arange(MODES) * np.pi * smoothness) ** 2) / 2)
-    return np.asarray(share / share.sum())
 
 
 @dataclass(frozen=True)
@@ -173,7 +126,7 @@ class RestLikelihood:
         """
         m, q, r = self.m, self.random.shape[1], self.modes
         root = np.full(q, 1 / noise)
-        root[:r] *= std * np.sqrt(np.tile(_shares(smoothness), r // MODES))
+        root[:r] *= np.tile(RestScatter(std, smoothness).sizes, r // MODES)
         inside = self.random * root[:, None] * root
         cross = self.cross * root[None, :, None]
         if systematic > 0 and m > 1:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
 from dlo_casadi.estimation.linearization import Linearization, Normal, Point
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import LEAST_NOISE_DEGREES
 
 FloatArray = NDArray[np.floating]

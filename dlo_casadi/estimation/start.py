@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Directions, Shapes
-from dlo_casadi.estimation.chords import line_nodes
+from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.chords import line_nodes
+from dlo_casadi.equilibrium.curve import Observed, ObservedChange
+from dlo_casadi.equilibrium.guesses import first_nodes
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
 from dlo_casadi.estimation.linearization import Point, Values
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.sensors import Observed, ObservedChange
-from dlo_casadi.estimation.sweep import Sweep
-from dlo_casadi.guesses import first_nodes
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.assembly import Directions, Shapes
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import Vector
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 FloatArray = NDArray[np.floating]
 

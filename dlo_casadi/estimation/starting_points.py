@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.composition import END_ROLL, STIFFNESSES
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.start import (
@@ -18,6 +17,7 @@ from dlo_casadi.estimation.start import (
     measured_shapes,
     turned_either_way,
 )
+from dlo_casadi.model.composition import END_ROLL, STIFFNESSES
 
 FloatArray = NDArray[np.floating]
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from dlo_casadi.assembly import Shapes
-from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.equilibrium.batch import Sweep
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
-from dlo_casadi.estimation.sweep import Sweep
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 FloatArray = NDArray[np.floating]
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.assembly import Shapes
+from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import CableModel
-from dlo_casadi.solve import continued, solve_equilibrium
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 

@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.composition import STIFFNESS_RATIO_STD, STIFFNESSES
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.composition import STIFFNESS_RATIO_STD, STIFFNESSES
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]

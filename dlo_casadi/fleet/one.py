@@ -13,8 +13,8 @@ from dlo_casadi.fleet.columns import Row, empty_row, row_of
 from dlo_casadi.fleet.discover import Session
 from dlo_casadi.fleet.store import write_row
 from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.runtime.workers import worker_log
 from dlo_casadi.session import run_session
-from dlo_casadi.workers import worker_log
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from concurrent.futures import Executor
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from dlo_casadi.durable import make_folder, only_run, write_file
 from dlo_casadi.fleet.columns import Row, empty_row
 from dlo_casadi.fleet.discover import Session, digest_of
 from dlo_casadi.fleet.one import Job, Options, fit_one
 from dlo_casadi.fleet.overview import overview_html
 from dlo_casadi.fleet.store import parquet_library, read_row, write_row, write_table
-from dlo_casadi.parallel import Tally, map_as_completed
+from dlo_casadi.io.files import make_folder, only_run, write_file
+from dlo_casadi.runtime.parallel import Tally, map_as_completed
 
 PAGE = "index.html"
 # The table is folded anew after so many seconds, and at most for this share of the time.

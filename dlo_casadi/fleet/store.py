@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dlo_casadi import __version__
-from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet.columns import COLUMNS, SCHEMA, UNITS, Row
+from dlo_casadi.io.files import write_file
 
 if TYPE_CHECKING:
     import pyarrow

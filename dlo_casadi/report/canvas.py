@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dlo_casadi.durable import write_file
+from dlo_casadi.io.files import write_file
 from dlo_casadi.session.outcome import Outcome, Stage, StageName
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.band import EDGE
+from dlo_casadi.equilibrium.spread import EDGE
 from dlo_casadi.report.arrows import forces_read
 from dlo_casadi.report.canvas import (
     BLACK,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dlo_casadi.durable import make_folder, write_file
 from dlo_casadi.errors import MeasurementError
+from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.report.canvas import (
     BLUE,
     ORANGE,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from dlo_casadi.config import Config
-from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError
+from dlo_casadi.io.files import write_file
 from dlo_casadi.report.page import page_script, render
 from dlo_casadi.report.page_data import configuration_text, sentence
 from dlo_casadi.report.page_pictures import pictures_of_failure

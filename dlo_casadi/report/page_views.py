@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from dlo_casadi.report.canvas import before_after, label_of
 from dlo_casadi.report.page_backgrounds import PHOTOGRAPHS, Background, photograph_of
 from dlo_casadi.report.page_pictures import Line, Picture, svg
-from dlo_casadi.session.outcome import Outcome, PoseInput, Stage, ViewInput
+from dlo_casadi.sensing.pixels import ViewInput
+from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.vision import nearest_in_order
 
 FloatArray = NDArray[np.floating]

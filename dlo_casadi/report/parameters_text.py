@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -12,20 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.composition import STIFFNESSES
 from dlo_casadi.config import Config, dump_yaml
 from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.errors import DloError
-from dlo_casadi.estimation.band import Uncertainty
+from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.io.parameters import SCHEMA, Parameters, metadata_of, parameters_hash
+from dlo_casadi.model.composition import STIFFNESSES
 from dlo_casadi.report.json_report import finite
 from dlo_casadi.session.outcome import Outcome
 
 FloatArray = NDArray[np.floating]
-
-SCHEMA = "dlo-parameters/1"
-# What a prediction depends on beside the values of the parameters.
-_MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
 
 
 def parameters_text(outcome: Outcome) -> str:
@@ -36,6 +32,12 @@ def parameters_text(outcome: Outcome) -> str:
         "declared.\n"
     )
     return head + dump_yaml(parameters_dict(outcome))
+
+
+def parameters_of(outcome: Outcome) -> Parameters:
+    """The fitted cable of a run, as `load_parameters` would read it from the run's file."""
+    fit, metadata = outcome.fit, metadata_of(parameters_dict(outcome), outcome.config.path)
+    return Parameters(fit.model, fit.p, final_rest(fit), metadata)
 
 
 def parameters_dict(outcome: Outcome) -> dict[str, Any]:
@@ -63,7 +65,7 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
     """What a fit alone tells: the model, its parameters, covariance and state."""
     model = fit.model
     names, covariance = fit.named_covariance
-    uncertainty = Uncertainty.of(fit)
+    uncertainty = uncertainty_of(fit)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "cable": {
@@ -116,18 +118,6 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
     return plain
 
 
-def parameters_hash(document: Mapping[str, Any]) -> str:
-    """SHA-256 of what determines predictions; bounds and standard deviations do not.
-
-    It stands in the file as `model_hash`. A generated solver has its own: `codegen.solver_hash`.
-    """
-    content = {key: document[key] for key in _MODEL_KEYS}
-    content["values"] = {key: row["value"] for key, row in document["parameters"].items()}
-    content["coefficients"] = document["rest_curvature"]["coefficients"]
-    text = json.dumps(_as_floats(content), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def final_rest(fit: Fit) -> FloatArray:
     """Rest curvature (n_rests,) [1/m] that the session's last pose leaves behind."""
     if not fit.model.has_state:
@@ -167,14 +157,3 @@ def _file_hash(path: Path) -> str | None:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:
         return None
-
-
-def _as_floats(data: Any) -> Any:
-    """Every number as a float: 1 and 1.0 are the same model."""
-    if isinstance(data, Mapping):
-        return {str(key): _as_floats(value) for key, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [_as_floats(value) for value in data]
-    if isinstance(data, int) and not isinstance(data, bool):
-        return float(data)
-    return data

@@ -11,11 +11,9 @@ from types import TracebackType
 from typing import Self
 
 from dlo_casadi.config import Config
-from dlo_casadi.durable import FolderDraft, is_marked, make_folder, refuse_foreign, write_file
 from dlo_casadi.errors import DloError, OutputError
-from dlo_casadi.executors import InProcess
-from dlo_casadi.measurements import write_points, write_table
-from dlo_casadi.parallel import begin
+from dlo_casadi.io.files import FolderDraft, is_marked, make_folder, refuse_foreign, write_file
+from dlo_casadi.io.points import write_points, write_table
 from dlo_casadi.report.figures import write_figures
 from dlo_casadi.report.figures_poses import draw_poses
 from dlo_casadi.report.json_report import report_text
@@ -23,6 +21,8 @@ from dlo_casadi.report.overlay import write_overlays
 from dlo_casadi.report.page import GENERATOR, report_page
 from dlo_casadi.report.page_failure import write_failure_page
 from dlo_casadi.report.parameters_text import parameters_text
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.session.outcome import Outcome
 
 # What a run writes; nothing else in the folder is ever touched.

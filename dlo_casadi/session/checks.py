@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
-from dlo_casadi.ends import reaction_rows
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.session.coarse import coarse_fit, some, tells_weight
 from dlo_casadi.session.hanging import pulled_elsewhere
 from dlo_casadi.session.hanging_in_plane import hangs_elsewhere

@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.composition import BENDING_STIFFNESS
 from dlo_casadi.config import Config
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import conditions
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.tolerances import Tolerances
 
 FloatArray = NDArray[np.floating]
 

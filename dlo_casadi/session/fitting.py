@@ -15,9 +15,9 @@ from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.hyperparameters import first_reading_noise
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.mesh import fine_enough, mesh_error
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import REST_COEFFICIENTS, Declared
 
 # The search over decades of stiffness runs on this mesh; in space, where an element takes 17

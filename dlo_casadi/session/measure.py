@@ -12,12 +12,12 @@ from dlo_casadi import vision
 from dlo_casadi.config import Camera as DeclaredCamera
 from dlo_casadi.config import Config, Images
 from dlo_casadi.config import Pose as DeclaredPose
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.measurements import read_points
-from dlo_casadi.pose import Pose
-from dlo_casadi.session.outcome import PoseInput, ViewInput
-from dlo_casadi.session.pixels import pixel_std, pixels_of
+from dlo_casadi.io.points import read_points
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.pixels import ViewInput, pixel_std, pixels_of
+from dlo_casadi.session.outcome import PoseInput
 
 # Photographs read at a time: two cores take 0.66 of the time of one.
 READERS = 2

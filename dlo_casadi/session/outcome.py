@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from dlo_casadi.config import Config
-from dlo_casadi.estimation.band import COVERED
+from dlo_casadi.equilibrium.pose import PoseBranch
+from dlo_casadi.equilibrium.spread import COVERED
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.pose import PoseBranch
+from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.thresholds import DIFFERENT
-from dlo_casadi.vision import Sight
 
 FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
@@ -209,27 +209,6 @@ class Stage:
         """By name the poses that were measured in another equilibrium than the predicted one."""
         found = {name: shape.measured_branch for name, shape in self.shapes.items()}
         return {name: branch for name, branch in found.items() if branch is not None}
-
-
-@dataclass(frozen=True)
-class ViewInput:
-    """One of several photographs of a pose in space.
-
-    Parameters
-    ----------
-    name : str
-        File stem.
-    image : Path
-    sight : Sight
-        What is seen in it.
-    places : (K, 3) [m]
-        About where its pixels lie in space; nan for those that are not of the cable.
-    """
-
-    name: str
-    image: Path
-    sight: Sight
-    places: FloatArray
 
 
 @dataclass(frozen=True)

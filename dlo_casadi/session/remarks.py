@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
+from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.estimation.mesh import allowed_mesh_error
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.pose import SIGNS
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
 from dlo_casadi.thresholds import EITHER, FIXTURES, UNSEEN
 

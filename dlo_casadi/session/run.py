@@ -16,12 +16,13 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SETTLED_MODES
 from dlo_casadi.estimation.mesh import SEARCH_MESH, fine_enough, mesh_error
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.executors import InProcess
-from dlo_casadi.model import CableModel
-from dlo_casadi.parallel import begin
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.parallel import begin
+from dlo_casadi.runtime.workers import one_thread
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.declared import declared_model
@@ -61,7 +62,6 @@ from dlo_casadi.session.remarks import (
 )
 from dlo_casadi.session.simpler import not_worse, simpler_fits
 from dlo_casadi.session.stages import fit_stage, fitted_parameters
-from dlo_casadi.workers import one_thread
 
 
 def run_session(

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from dlo_casadi.config.options import EstimationOptions
-from dlo_casadi.estimation.algorithm1 import Algorithm1Result, applies, run_algorithm1
 from dlo_casadi.estimation.gauss_newton import CONVERGED
 from dlo_casadi.estimation.hyperparameters import refine
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.paper.algorithm1 import Algorithm1Result, applies, run_algorithm1
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import straight
 from dlo_casadi.session.fitting import first_mesh
 from dlo_casadi.session.outcome import SIMPLER, Stage

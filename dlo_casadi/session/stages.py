@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.composition import END_ROLL
 from dlo_casadi.effects.mass_error import MASS_FACTOR
-from dlo_casadi.equilibrium import Equilibrium
-from dlo_casadi.estimation.algorithm1 import Algorithm1Result
-from dlo_casadi.estimation.band import Uncertainty, spread_across
-from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.spread import Uncertainty, spread_across
+from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
     Prediction,
@@ -24,8 +22,11 @@ from dlo_casadi.estimation.prediction import (
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.composition import END_ROLL
+from dlo_casadi.paper.algorithm1 import Algorithm1Result
 from dlo_casadi.rod.node import Frame
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import (
     MASS,
     BranchShape,
@@ -272,7 +273,7 @@ def fit_stage(
         fitted_parameters(fit, intervals, reported),
         rest_curvature_of(fit),
         fit.chi2_of_points,
-        uncertainty=Uncertainty.of(fit),
+        uncertainty=uncertainty_of(fit),
         fitted={fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used},
     )
 

@@ -6,7 +6,7 @@ from dlo_casadi.vision.centerline import Centerline, extract_centerline
 from dlo_casadi.vision.correspondence import nearest_in_order, places_along
 from dlo_casadi.vision.image import read_image
 from dlo_casadi.vision.outline import Outline, compare_pixels, project_outline
-from dlo_casadi.vision.pictures import draw_steps, write_picture
+from dlo_casadi.vision.pictures import draw_steps, encoded
 from dlo_casadi.vision.sight import Sight, see_cable
 from dlo_casadi.vision.space_line import SpaceLine, Views, measure_views
 from dlo_casadi.vision.view import Camera, Reference, View, from_reference
@@ -29,6 +29,7 @@ __all__ = [
     "calibrate_camera",
     "compare_pixels",
     "draw_steps",
+    "encoded",
     "extract_centerline",
     "from_reference",
     "locate_board",
@@ -39,5 +40,4 @@ __all__ = [
     "project_outline",
     "read_image",
     "see_cable",
-    "write_picture",
 ]

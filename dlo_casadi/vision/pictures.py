@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dlo_casadi.durable import write_file
-from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.view import Array, View
 from dlo_casadi.vision.workings import Workings
 from dlo_casadi.vision.workplane import WorkPlane
@@ -75,18 +72,9 @@ def draw_steps(
     return pictures
 
 
-def write_picture(path: Path, picture: Picture) -> None:
-    """Write a picture in the format of the file's ending.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    done, data = cv2.imencode(path.suffix, picture)
-    if not done:
-        raise VisionError(f"{path} cannot be written: OpenCV cannot encode it")
-    write_file(path, data.tobytes())
+def encoded(picture: Picture, ending: str) -> bytes:
+    """Content of a picture's file, in the format of its ending, such as ".jpg"."""
+    return bytes(cv2.imencode(ending, picture)[1])
 
 
 def _workplane(plane: WorkPlane, start: Array, end: Array | None) -> Picture:

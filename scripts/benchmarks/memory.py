@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, LumpedMass
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
 
 HERE = Path(__file__).parent
 # Element, ends, and gravity, whose three numbers put a cable in space.

@@ -32,10 +32,10 @@ from scipy.optimize import brentq
 from benchmarks import speed
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.effects import Cable
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.solve import solve_equilibrium
 
 FloatArray = NDArray[np.floating]
 CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)

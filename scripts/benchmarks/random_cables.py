@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.space_ipopt import Ipopt
-from dlo_casadi.assembly import Given, Shapes
 from dlo_casadi.codegen import plane, space
 from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.kernels import kernels_of
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.poses import frame_poses
 from dlo_casadi.codegen.records import shape_record
-from dlo_casadi.composition import EndKind, StartKind
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium import JOINT_BOUND
-from dlo_casadi.guesses import guesses
-from dlo_casadi.initial import limited
-from dlo_casadi.ipopt import by_ipopt
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
+from dlo_casadi.equilibrium.guesses import guesses
+from dlo_casadi.equilibrium.initial_arcs import limited
+from dlo_casadi.equilibrium.ipopt import by_ipopt
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.composition import EndKind, StartKind
 
 FloatArray = NDArray[np.floating]
 

@@ -10,10 +10,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.guesses import guessed_frames
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.whole_pose import potential
+from dlo_casadi.equilibrium.guesses import guessed_frames
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
 

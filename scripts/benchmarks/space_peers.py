@@ -27,8 +27,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.peers import COURANT, missing_elastica, missing_mujoco, relax, relax_rod
 from benchmarks.space_ipopt import Ipopt
 from benchmarks.space_speed import CABLE, FINE, Timed, problem, reference
-from dlo_casadi.guesses import guessed_frames
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.guesses import guessed_frames
+from dlo_casadi.equilibrium.pose import Pose
 
 FloatArray = NDArray[np.floating]
 RADIUS = CABLE.diameter / 2
@@ -98,7 +98,7 @@ def compiled(n: int, element: str) -> Method:
 
 def ipopt(n: int, element: str) -> Method:
     """IPOPT through CasADi, of the same model; points from its frames by the Python model."""
-    from dlo_casadi.assembly import Given, Shapes
+    from dlo_casadi.model.assembly import Given, Shapes
 
     own = problem(n, element, 0.0)
     solver = Ipopt(own.model)

@@ -22,8 +22,8 @@ from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.poses import frame_poses
 from dlo_casadi.codegen.records import shape_record
 from dlo_casadi.effects import Cable
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 # Elements of the mesh against which errors are measured: of fourth order, 1e-6 m and less.

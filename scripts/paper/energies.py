@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, Equilibrium, Pose, solve_equilibrium
-from dlo_casadi.assembly import DEVIATIONS, Given
-from dlo_casadi.equilibrium import JOINT_BOUND
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.whole_pose import potential
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
+from dlo_casadi.model.assembly import Given
+from dlo_casadi.model.whole_pose import potential
+from dlo_casadi.rod.ends import deviation_names
+from dlo_casadi.rod.node import Heading
 from paper import published
 from paper.content import Claim, Part, Section, Table, Target, mm, number, rms
 
@@ -103,7 +105,9 @@ def with_bounded_heading(pose: Pose) -> float:
     headings = np.concatenate([[JOINT_BOUND], np.full(joints, np.inf)])
     found = solver(
         x0=np.clip(free.phi, -headings, headings),
-        p=np.concatenate([model.nominal, rest, pose.vector, np.zeros(len(DEVIATIONS))]),
+        p=np.concatenate(
+            [model.nominal, rest, pose.vector, np.zeros(len(deviation_names(Heading)))]
+        ),
         lbx=-headings,
         ubx=headings,
         lbg=-bound,

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, solve_equilibrium
-from dlo_casadi.estimation.algorithm1 import gravity_slopes, run_algorithm1
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.profile import (
     Interval,
@@ -18,11 +17,12 @@ from dlo_casadi.estimation.profile import (
     threshold,
 )
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.parallel import map_in_order
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.paper.algorithm1 import gravity_slopes, run_algorithm1
 from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
+from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.session.stages import rest_curvature_of
 from dlo_casadi.thresholds import NORMAL_95
-from dlo_casadi.tolerances import Tolerances
 from paper import branches, chords, published
 from paper.content import Claim, Part, Section, Table, drawing, number
 from paper.fits import FIRST, REST_COEFFICIENTS

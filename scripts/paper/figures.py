@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from paper import published
 from paper.content import Section, drawing

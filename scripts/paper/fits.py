@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel
-from dlo_casadi.estimation.algorithm1 import run_algorithm1
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.parallel import map_in_order
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.paper.algorithm1 import run_algorithm1
+from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import confirmed, minimum_by_ipopt
 from dlo_casadi.session.stages import rest_curvature_of
-from dlo_casadi.tolerances import Tolerances
 from paper import published
 from paper.replica import PLACES, Replica
 

@@ -18,23 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, DloError
-from dlo_casadi.assembly import DEVIATIONS, Shapes
+from dlo_casadi.equilibrium.batch import Sweep
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.hyperparameters import settle
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.parallel import generator_of, map_as_completed
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.report.canvas import BLACK, BLUE
+from dlo_casadi.rod.ends import deviation_names
+from dlo_casadi.rod.node import Heading
+from dlo_casadi.runtime.parallel import generator_of, map_as_completed
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.declared import nuisances
 from dlo_casadi.session.stages import rest_curvature_of
 from dlo_casadi.thresholds import NORMAL_95
-from dlo_casadi.tolerances import Tolerances
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing, number, rms
 from paper.fits import REST_COEFFICIENTS
@@ -66,7 +68,7 @@ def model_on(n: int) -> CableModel:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a set was made of; `deviation` (m, len(DEVIATIONS)) of the poses' ends."""
+    """What a set was made of; `deviation` (m, len(deviation_names(Heading))) of the poses' ends."""
 
     p: FloatArray
     coefficients: FloatArray
@@ -87,7 +89,7 @@ def draw(rng: np.random.Generator) -> Truth:
     rest_only = Unknowns(model, np.zeros(len(p), dtype=bool), p)
     factor = np.linalg.cholesky(rest_only.prior_precision(roughness))
     scaled = np.linalg.solve(factor.T, rng.standard_normal(len(factor)))
-    deviation = np.zeros((len(published.poses()), len(DEVIATIONS)))
+    deviation = np.zeros((len(published.poses()), len(deviation_names(Heading))))
     deviation[:, :2] = TOLERANCES.end * rng.standard_normal((len(deviation), 2))
     noise = NoiseModel(
         rng.uniform(1e-4, 4e-4), rng.uniform(0.0, 0.6), rng.uniform(0.02, 0.04), "gaussian"

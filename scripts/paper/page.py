@@ -15,7 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from dlo_casadi import __version__
-from dlo_casadi.durable import make_folder, write_file
+from dlo_casadi.io.files import make_folder, write_file
 from paper.content import Part
 
 SCHEMA = "dlo-paper/1"

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import Cable, CableModel
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.estimation.prediction import Prediction, predict_poses
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 from paper import published
 from paper.content import rms
 

@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, CompiledSolver, Pose
-from dlo_casadi.assembly import Given, Shapes
+from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.estimation.batch import solve_batch
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing
 from paper.fits import REST_COEFFICIENTS

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from dlo_casadi import CableModel, CompiledSolver, Pose, solve_equilibrium
-from dlo_casadi.assembly import Given, Shapes
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.initial import arc_headings
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.initial_arcs import arc_headings
+from dlo_casadi.model.assembly import Given, Shapes
 from dlo_casadi.report.canvas import BLACK, GREY, VERMILLION
 from paper import published
 from paper.content import Claim, Part, Section, Table, Target, drawing, duration, mm

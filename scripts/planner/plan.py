@@ -23,7 +23,7 @@ from scipy.interpolate import CubicSpline
 from dlo_casadi.codegen import Capsule, HalfSpace, generate
 from dlo_casadi.effects import Cable
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel
+from dlo_casadi.model.cable_model import CableModel
 
 HERE = Path(__file__).parent
 FloatArray = NDArray[np.floating]
@@ -174,7 +174,7 @@ def plan(
     if parameters is None:
         model, p, rest = example(in_space=in_space)
     else:
-        from dlo_casadi.report.parameters_file import load_parameters
+        from dlo_casadi.io.parameters import load_parameters
 
         model, p, rest, _ = load_parameters(parameters)
     scene_file = scene_file or scene_of(model)

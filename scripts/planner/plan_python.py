@@ -17,7 +17,7 @@ import numpy as np
 from plan import Scene, draw, example, obstacles_of, read_scene, scene_of
 
 from dlo_casadi.codegen import CompiledSolver, CompiledSpaceSolver
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.pose import Pose
 
 try:
     from ompl import base as ob

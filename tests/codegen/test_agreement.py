@@ -8,10 +8,10 @@ import pytest
 
 from dlo_casadi.codegen import CompiledSolver, CompiledSpaceSolver
 from dlo_casadi.effects import EFFECTS, Cable, Load, MeasurementEffect
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 

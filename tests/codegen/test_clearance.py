@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.codegen import Capsule, CompiledSolver, CompiledSpaceSolver, HalfSpace
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.errors import DloError
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 

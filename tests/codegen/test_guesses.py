@@ -10,10 +10,10 @@ import pytest
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.effects import Cable, ClampAngle, EndOffset, LengthError
-from dlo_casadi.equilibrium import JOINT_BOUND
-from dlo_casadi.guesses import guesses
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
+from dlo_casadi.equilibrium.guesses import guesses
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 

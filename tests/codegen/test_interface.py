@@ -9,10 +9,10 @@ import pytest
 
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate, library
 from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, EndOffset, ImageScale
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 

@@ -22,7 +22,7 @@ from benchmarks.random_cables import (
 from benchmarks.space_ipopt import Ipopt
 
 from dlo_casadi.codegen import STATUSES
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 

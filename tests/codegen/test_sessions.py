@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dlo_casadi.assembly import Given
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config, read_yaml
 from dlo_casadi.effects import EFFECTS, ClampAngle
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.model.assembly import Given
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import conditions
-from dlo_casadi.solve import solve_equilibrium
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 

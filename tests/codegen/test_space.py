@@ -21,11 +21,11 @@ from dlo_casadi.codegen import STATUSES, CompiledSpaceSolver, generate
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.space import coarse_elements
 from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, LumpedMass, PointForce
+from dlo_casadi.equilibrium.guesses import guessed_frames
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.guesses import guessed_frames
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 

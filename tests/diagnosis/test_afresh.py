@@ -10,13 +10,13 @@ from dlo_casadi.diagnosis.afresh import fit_afresh, origins_of, start_afresh
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.confirm import screened_afresh
 from dlo_casadi.effects import BendingAnisotropy, Cable
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model, fitted_closely
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.executors import InProcess
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 TRUE = Cable(1.0, 0.08, 0.007, bending_stiffness=0.018, torsional_stiffness=0.007)
 DECLARED = replace(TRUE, bending_stiffness=0.011, torsional_stiffness=0.007)

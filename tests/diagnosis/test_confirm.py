@@ -11,12 +11,12 @@ from dlo_casadi.diagnosis.pull import _Search
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.search import _drop
 from dlo_casadi.effects import Cable, LumpedMass, UnknownPull
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 NOISE = 3e-4
 PLAIN = CableModel(Cable(0.5, 0.03, 0.006, 0.01), 12, n_rest=5)

@@ -19,8 +19,8 @@ from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
 from dlo_casadi.effects import EFFECTS, BendingSoftening, LumpedMass
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import read_poses
 

@@ -14,13 +14,13 @@ from dlo_casadi.diagnosis.causes import start_from
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.pull import Pull
 from dlo_casadi.effects import EFFECTS, Cable
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import nuisances
-from dlo_casadi.tolerances import Tolerances
 
 CABLE = Cable(0.8, 0.2, 0.01, 0.1)
 ENDS = ((0.6, 0.0), (0.3, 0.1), (0.5, -0.3), (0.2, -0.2), (0.65, 0.2), (0.35, -0.45), (0.5, 0.35))

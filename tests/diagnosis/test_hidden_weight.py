@@ -7,13 +7,13 @@ from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.equivalents import equivalents
 from dlo_casadi.diagnosis.hidden_weight import hidden_weight
 from dlo_casadi.effects import EFFECTS, Cable, LumpedMass
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.remarks import weight_warning
-from dlo_casadi.tolerances import Tolerances
 
 EI, MASS = 0.06, 0.35
 MODEL = CableModel(Cable(0.65, 0.4, 0.015, 0.03), 10, start="clamped", end="free", n_rest=3)

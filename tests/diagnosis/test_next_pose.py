@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis.next_pose import _separation, next_reading
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.node import Heading
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 
 LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4
 

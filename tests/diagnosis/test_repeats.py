@@ -10,12 +10,12 @@ from dlo_casadi.diagnosis.crossval import CrossValidation
 from dlo_casadi.diagnosis.repeatability import limiting_spread
 from dlo_casadi.diagnosis.selection import improving
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 MODEL = CableModel(Cable(0.8, 0.03, 0.006, 0.02), 12, start="clamped", end="clamped", n_rest=5)
 NOISE = 3e-4

@@ -9,8 +9,13 @@ import pytest
 
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.algorithm1 import (
+from dlo_casadi.io.points import read_points
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.paper.algorithm1 import (
     Algorithm1Status,
     InnerProblem,
     _runs_away,
@@ -21,12 +26,7 @@ from dlo_casadi.estimation.algorithm1 import (
     gravity_slopes,
     run_algorithm1,
 )
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.measurements import read_points
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
 GRAVITY = (0.0, -9.81)  # m/s^2

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.remarks import fit_warnings
-from dlo_casadi.tolerances import Tolerances
 
 NOISE = 5e-5
 MODEL = CableModel(Cable(0.6, 0.06, 0.008, 0.05), 10, n_rest=5)

@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dlo_casadi.assembly import DEVIATIONS, Shapes
 from dlo_casadi.effects import (
     AxialStretch,
     BendingSoftening,
@@ -19,21 +18,24 @@ from dlo_casadi.effects import (
     RestCurvatureDrift,
     StiffnessGradient,
 )
+from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
-from dlo_casadi.estimation.curve import NodeCurve
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Point
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.sweep import Sweep
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.rod.ends import deviation_names
+from dlo_casadi.rod.node import Heading
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 
 CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 STD = 3e-4  # m
@@ -90,7 +92,7 @@ def solved(problem: BatchProblem, theta: np.ndarray, deviation: np.ndarray | Non
     found = predict_poses(model, p, rest, [item.pose for item in problem.measured])
     x = np.array([shape.equilibrium.x for shape in found if shape is not None])
     lam = np.array([shape.equilibrium.multipliers for shape in found if shape is not None])
-    still = np.zeros((len(x), len(DEVIATIONS)))
+    still = np.zeros((len(x), len(deviation_names(Heading))))
     shapes, converged = problem.sweep.solve(
         Shapes(x, lam, still if deviation is None else deviation), p, rest
     )
@@ -113,7 +115,7 @@ def test_poses_solved_together_are_those_solved_alone(element):
     guess = Shapes(
         np.array([eq.x for eq in alone]) + 0.02,
         np.array([eq.multipliers for eq in alone]) * 0.9,
-        np.zeros((3, len(DEVIATIONS))),
+        np.zeros((3, len(deviation_names(Heading)))),
     )
     together, converged = sweep.solve(guess, p, rest)
     assert converged.all()
@@ -134,7 +136,7 @@ def test_a_pose_that_is_lost_leaves_the_others_alone():
     guess = Shapes(
         np.array([eq.x for eq in alone]) + 0.02,
         np.array([eq.multipliers for eq in alone]),
-        np.zeros((3, len(DEVIATIONS))),
+        np.zeros((3, len(deviation_names(Heading)))),
     )
     far = replace(near[1], end=(1.5 * CABLE.length, 0.0))
     solved, converged = Sweep(model, [near[0], far, near[2]]).solve(guess, p, rest)
@@ -154,7 +156,7 @@ def test_a_drift_is_carried_in_order():
     stacked = Shapes(
         np.array([shape.equilibrium.x for shape in shapes]),
         np.array([shape.equilibrium.multipliers for shape in shapes]),
-        np.zeros((3, len(DEVIATIONS))),
+        np.zeros((3, len(deviation_names(Heading)))),
     )
     rests = sweep.rests(stacked, p, rest)
     np.testing.assert_array_equal(rests[0], rest)

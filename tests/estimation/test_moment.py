@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from dlo_casadi.effects import BendingSoftening, Cable
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.moment import law_of, measured_moment_curve
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
+from dlo_casadi.model.cable_model import CableModel
 
 CABLE = Cable(length=0.25, mass=0.0173, diameter=0.001, bending_stiffness=8e-4)
 WEIGHT = CABLE.mass * 9.81 / CABLE.length

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.noise import (
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import (
     NoiseModel,
     NoiseSample,
     correlation,
@@ -14,9 +16,7 @@ from dlo_casadi.estimation.noise import (
     restricted_deviance,
     smooth_modes,
 )
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.sensors import Centerline, Observed, ObservedChange
-from dlo_casadi.pose import Pose
+from dlo_casadi.sensing.sensors import Centerline
 
 CURVATURE, LENGTH = 4.0, 0.9  # 1/m, m: turns by 3.6 rad
 RADIUS = 1 / CURVATURE

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
-from dlo_casadi.estimation.band import Uncertainty, spread_across
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.spread import spread_across
+from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
 from dlo_casadi.estimation.repeats import (
     different_poses,
@@ -17,8 +17,9 @@ from dlo_casadi.estimation.repeats import (
     repeatability,
     with_repeats,
 )
-from dlo_casadi.pose import Pose
 from dlo_casadi.report.parameters_text import fit_dict
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import fit_declared
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -100,7 +101,7 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     floor = repeatability([replace(item, held_out=False) for item in measured], 1.5)
     assert rms_distance(predictions, measured, held_out=True) < 1.5 * floor
     # The band is as wide as hangings differ, of which a distance in a plane has up to two parts.
-    uncertainty = Uncertainty.of(fit)
+    uncertainty = uncertainty_of(fit)
     assert floor / 2 < uncertainty.hanging < floor
     (found,) = (item.equilibrium for item in predictions[left_out : left_out + 1])
     at = (poses[left_out], found, uncertainty, np.array([0.4, 0.7]))

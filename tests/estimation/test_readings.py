@@ -5,19 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.assembly import Directions, Given
 from dlo_casadi.effects import Cable, SensorBias, Setup, StartSpring
-from dlo_casadi.ends import REACTIONS, reaction_rows
-from dlo_casadi.estimation.curve import NodeCurve
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.noise import NoiseModel, ReadingNoise
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.sensors import Observed
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.solve import solve_equilibrium
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.model.assembly import Directions, Given
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.rod.ends import REACTIONS, reaction_rows
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 
 CABLE = Cable(0.8, 0.2, 0.012, 0.04)
 IN_SPACE = replace(CABLE, torsional_stiffness=0.02)

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.sensors import Centerline, Markers, Observed, ObservedChange
-from dlo_casadi.pose import Pose
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
+from dlo_casadi.sensing.sensors import Centerline, Markers
 
 LENGTH, RADIUS, RISE = 0.9, 0.1, 0.6  # m, m, advance along the axis per arc length
 

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.composition import END_ROLL, STIFFNESSES
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation import starting_points
 from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way, twists
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
-from dlo_casadi.tolerances import Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.composition import END_ROLL, STIFFNESSES
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 
 CABLE = Cable(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03)
 HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}

@@ -14,10 +14,10 @@ import pyarrow.parquet as pq
 from distributed import LocalCluster
 from tiny_sessions import QUICK, without_times
 
-from dlo_casadi import executors
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import find_sessions, fit_fleet
-from dlo_casadi.parallel import generator_of, map_as_completed, map_in_order, open_executor
+from dlo_casadi.runtime import executors
+from dlo_casadi.runtime.parallel import generator_of, map_as_completed, map_in_order, open_executor
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +82,7 @@ def test_a_worker_killed_in_the_middle_changes_no_digit(cluster, fleet, expected
             os.kill(killed[0], signal.SIGKILL)
 
     sessions = find_sessions(fleet)[1]
+    (tmp_path / "logs").mkdir()
     with open_executor(scheduler=cluster.scheduler_address, logs=tmp_path / "logs") as executor:
         fit_fleet(sessions, tmp_path, executor, QUICK, progress=kill_one)
     assert killed

@@ -19,15 +19,15 @@ import pyarrow.parquet as pq
 from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import main
-from dlo_casadi.durable import only_run
 from dlo_casadi.errors import DloError
-from dlo_casadi.executors import InProcess
 from dlo_casadi.fleet import find_sessions, fit_fleet
 from dlo_casadi.fleet.columns import COLUMNS, empty_row, row_of
 from dlo_casadi.fleet.one import Job, fit_one
 from dlo_casadi.fleet.outliers import judge, robust_z
 from dlo_casadi.fleet.overview import overview_html
-from dlo_casadi.parallel import open_executor
+from dlo_casadi.io.files import only_run
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.parallel import open_executor
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "fit_many.py"
 KEYS = [
@@ -88,6 +88,7 @@ def test_a_killed_worker_of_the_pool_changes_nothing(fleet, expected, tmp_path):
             os.kill(killed[0], signal.SIGKILL)
 
     sessions = find_sessions(fleet)[1]
+    (tmp_path / "logs").mkdir()
     with open_executor(jobs=2, logs=tmp_path / "logs") as executor:
         fit_fleet(sessions, tmp_path, executor, QUICK, progress=kill_one)
     assert rows_of(tmp_path) == expected

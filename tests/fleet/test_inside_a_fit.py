@@ -10,8 +10,8 @@ from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import EFFECTS, RestCurvatureDrift
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.parallel import open_executor
 from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.runtime.parallel import open_executor
 from dlo_casadi.session import run_session
 
 

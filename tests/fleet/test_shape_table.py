@@ -16,16 +16,19 @@ from tiny_sessions import write_session
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.executors import InProcess
-from dlo_casadi.model import CableModel
-from dlo_casadi.parallel import open_executor
-from dlo_casadi.pose import Pose
+from dlo_casadi.fleet import shape_solve
+from dlo_casadi.fleet.shape_poses import Grid, PoseList
+from dlo_casadi.fleet.shape_solve import Plan
+from dlo_casadi.fleet.shape_table import shape_table
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_text import parameters_text
+from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.parallel import open_executor
 from dlo_casadi.session import run_session
-from dlo_casadi.shape_table import Grid, Plan, PoseList, shape_table, solve
-from dlo_casadi.solve import solve_equilibrium
 
 CABLE = Cable(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
 REST = np.zeros(10)
@@ -49,7 +52,7 @@ def parameters(tmp_path_factory):
 @pytest.fixture
 def small_chunks(monkeypatch):
     """Some ten poses a chunk."""
-    monkeypatch.setattr(solve, "CHUNK_BYTES", 4000)
+    monkeypatch.setattr(shape_solve, "CHUNK_BYTES", 4000)
 
 
 def test_rows_are_predictions_in_the_order_of_the_grid(parameters, tmp_path, capsys):

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from small_sessions import BENCH
 
-from dlo_casadi.durable import write_file
 from dlo_casadi.errors import DloError, OutputError
-from dlo_casadi.measurements import read_points
-from dlo_casadi.parallel import open_executor
+from dlo_casadi.io.files import write_file
+from dlo_casadi.io.points import read_points
 from dlo_casadi.report import writer
 from dlo_casadi.report.page import GENERATOR
 from dlo_casadi.report.writer import OWNED, ResultsFolder
+from dlo_casadi.runtime.parallel import open_executor
 
 
 @pytest.fixture

@@ -7,17 +7,17 @@ import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.stiffness import fit_stiffness
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.remarks import branch_warnings
 from dlo_casadi.session.stages import initial_stage
-from dlo_casadi.solve import continued, solve_equilibrium
-from dlo_casadi.tolerances import Tolerances
 
 EI, STD = 0.028, 1e-3
 MODEL = CableModel(Cable(0.5, 0.3, 0.012, EI), 12, start="clamped", end="free", n_rest=5)

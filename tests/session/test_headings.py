@@ -5,7 +5,7 @@ import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.measurements import write_points
+from dlo_casadi.io.points import write_points
 from dlo_casadi.session.checks import lines_of, without_implausible
 from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import read_inputs

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.estimation.curve import NodeCurve
-from dlo_casadi.estimation.noise import NoiseModel
-from dlo_casadi.estimation.observation import MeasuredPose
-from dlo_casadi.estimation.sensors import Observed, ObservedChange
-from dlo_casadi.pose import Pose
-from dlo_casadi.session.outcome import ViewInput
-from dlo_casadi.session.pixels import Pixels, pixel_std, pixels_of
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
+from dlo_casadi.sensing.pixels import Pixels, ViewInput, pixel_std, pixels_of
 from dlo_casadi.vision import Camera, Sight, Viewpoint, project_outline
 
 LENGTH, DIAMETER = 0.9, 0.008

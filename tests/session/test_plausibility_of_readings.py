@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import Cable
-from dlo_casadi.ends import reaction_rows
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.session.checks import find_suspicions
 from dlo_casadi.session.declared import declared_model, straight
 from dlo_casadi.session.measure import conditions, read_inputs

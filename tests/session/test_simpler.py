@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dlo_casadi.config import load_config
-from dlo_casadi.estimation.observation import MeasuredPose
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import read_poses
 from dlo_casadi.session.simpler import simpler_fits

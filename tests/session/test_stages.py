@@ -7,20 +7,20 @@ import pytest
 
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.observation import MeasuredPose
 from dlo_casadi.estimation.prediction import (
     measured_branches,
     predict_poses,
     predicted_shapes,
 )
-from dlo_casadi.model import CableModel
-from dlo_casadi.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler
 from dlo_casadi.session.simpler import not_worse
 from dlo_casadi.session.stages import fit_stage, initial_stage, pose_shape
-from dlo_casadi.tolerances import Tolerances
 
 # Stiff beside its weight, EI / (w L^3) = 3: its bow is stable upwards, and lower downwards.
 MODEL = CableModel(Cable(0.5, 0.02, 0.006, 0.08), 12, n_rest=0)

@@ -1,0 +1,192 @@
+"""A curve through nodes, where points are closest to it, and what sensors see of a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.floating]
+
+# Polynomial coefficients (powers of u, weights) of the interpolants' derivatives by u.
+_HERMITE = np.array(
+    [
+        [[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]],
+        [[0, 0, 1, 0], [-6, 6, -4, -2], [6, -6, 3, 3], [0, 0, 0, 0]],
+        [[-6, 6, -4, -2], [12, -12, 6, 6], [0, 0, 0, 0], [0, 0, 0, 0]],
+    ],
+    dtype=float,
+)
+_LINEAR = np.array(
+    [
+        [[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+        [[-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+        [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+    ],
+    dtype=float,
+)
+
+
+@dataclass(frozen=True)
+class NodeCurve:
+    """A curve given by its nodes and, of smooth elements, the slopes dr/ds there.
+
+    Between nodes with slopes the curve is the cubic Hermite interpolant, which
+    differs from an arc of curvature k by less than h^4 k^3 / 384; others are joined by chords.
+    """
+
+    length: float
+    nodes: FloatArray
+    slopes: FloatArray | None
+
+    @classmethod
+    def of(cls, length: float, z: FloatArray) -> Self:
+        """Curve of places, and slopes where there are any: (n + 1, d or 2 d), d = 2 or 3."""
+        if z.shape[1] < 4:
+            return cls(length, z, None)
+        d = z.shape[1] // 2
+        return cls(length, z[:, :d], z[:, d:])
+
+    @property
+    def numbers(self) -> FloatArray:
+        """Nodes and slopes as one array (n + 1, d or 2 d)."""
+        return self.nodes if self.slopes is None else np.hstack([self.nodes, self.slopes])
+
+    @property
+    def n(self) -> int:
+        """Number of elements."""
+        return len(self.nodes) - 1
+
+    @property
+    def d(self) -> int:
+        """Number of coordinates of a point: 2 or 3."""
+        return self.nodes.shape[1]
+
+    def _local(self, s: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """Element index (K,) and the fraction (K,) of its length at s [m]."""
+        u = s * (self.n / self.length)
+        e = np.minimum(u.astype(np.intp), self.n - 1)
+        return e, u - e
+
+    def weights(self, s: FloatArray, derivative: int = 0) -> tuple[NDArray[np.intp], FloatArray]:
+        """Element index (K,) and weights (K, 4) of [r_e, r_(e+1), h t_e, h t_(e+1)] at s [m]."""
+        e, u = self._local(s)
+        h = self.length / self.n
+        powers = u[:, None] ** np.arange(4)
+        table = (_HERMITE if self.slopes is not None else _LINEAR)[derivative]
+        return e, powers @ table / h**derivative
+
+    @cached_property
+    def _handles(self) -> FloatArray:
+        """Per element [r_e, r_(e+1), h t_e, h t_(e+1)] (n, 4, d)."""
+        if self.slopes is None:
+            zero = np.zeros((self.n, self.d))
+            return np.stack([self.nodes[:-1], self.nodes[1:], zero, zero], axis=1)
+        slopes = self.slopes * (self.length / self.n)
+        return np.stack([self.nodes[:-1], self.nodes[1:], slopes[:-1], slopes[1:]], axis=1)
+
+    def frame(self, s: FloatArray, derivatives: int) -> list[FloatArray]:
+        """Position (K, d) [m] and its first derivatives by s at arc lengths s."""
+        e, u = self._local(s)
+        powers = u[:, None] ** np.arange(4)
+        handles = self._handles[e]
+        scale = self.n / self.length
+        table = _HERMITE if self.slopes is not None else _LINEAR
+        return [
+            np.einsum("kw,kwd->kd", powers @ table[d], handles) * scale**d
+            for d in range(derivatives + 1)
+        ]
+
+    def at(self, s: FloatArray, derivative: int = 0) -> FloatArray:
+        """Positions (K, d) [m] at arc lengths s, or derivatives by s."""
+        return self.frame(s, derivative)[derivative]
+
+    def moved(self, s: FloatArray, slopes: FloatArray) -> FloatArray:
+        """Change (K, d, q) [m] of positions at fixed s for one (n + 1, d or 2 d, q) of it."""
+        e, w = self.weights(s)
+        w = w[:, :, None, None]
+        out = w[:, 0] * slopes[e, : self.d] + w[:, 1] * slopes[e + 1, : self.d]
+        if self.slopes is not None:
+            h = self.length / self.n
+            out += h * (w[:, 2] * slopes[e, self.d :] + w[:, 3] * slopes[e + 1, self.d :])
+        return np.asarray(out)
+
+    def feet(self, points: FloatArray, guess: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] of the points' feet, by Newton steps from a guess.
+
+        Solves t . (x - r(s)) = 0; a foot stays within [0, L].
+        """
+        s = guess.copy()
+        limit = 0.5 * self.length / self.n
+        for _ in range(12):
+            position, t, bend = self.frame(s, 2)
+            gap = points - position
+            square = (t * t).sum(axis=1)
+            curvature = np.maximum(square - (bend * gap).sum(axis=1), 0.2 * square)
+            step = np.clip((t * gap).sum(axis=1) / curvature, -limit, limit)
+            new = np.clip(s + step, 0.0, self.length)
+            done = np.abs(new - s).max() < 1e-8 * self.length
+            s = new
+            if done:
+                break
+        return s
+
+    def nearest(self, points: FloatArray, per_element: int = 8) -> FloatArray:
+        """Arc lengths (K,) [m] of the nearest places on the whole curve."""
+        grid = np.linspace(0.0, self.length, self.n * per_element + 1)
+        line = self.at(grid)
+        # Square distances but for those of the points from the origin.
+        square = (line**2).sum(axis=1) - 2 * points @ line.T
+        return self.feet(points, grid[square.argmin(axis=1)])
+
+    def normals(self, s: FloatArray) -> FloatArray:
+        """Unit normals (K, d - 1, d): in the plane to the left of the direction of travel.
+
+        In space the pair turns with the tangent from point to point, without twist: errors of
+        neighbouring points are then compared in the same directions.
+        """
+        t = self.at(s, 1)
+        t = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
+        if self.d == 2:
+            return np.stack([-t[:, 1], t[:, 0]], axis=1)[:, None]
+        first = np.eye(3)[np.abs(t).argmin(axis=1)]
+        first = first - (first * t).sum(axis=1, keepdims=True) * t
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        second = np.cross(t, first)
+        # The first normal of each point, carried to the next by the smallest rotation.
+        before, ahead, near = first[:-1], t[1:], 1 + (t[:-1] * t[1:]).sum(axis=1)
+        share = (ahead * before).sum(axis=1) / np.maximum(near, 1e-12)
+        carried = before - share[:, None] * (t[:-1] + ahead)
+        turn = np.arctan2((carried * second[1:]).sum(axis=1), (carried * first[1:]).sum(axis=1))
+        angle = np.concatenate([[0.0], np.cumsum(turn)])[:, None]
+        cos, sin = np.cos(angle), np.sin(angle)
+        return np.stack([cos * first + sin * second, cos * second - sin * first], axis=1)
+
+    def distances(self, points: FloatArray) -> FloatArray:
+        """Distance (K,) [m] of each point to the nearest place on the curve."""
+        return np.linalg.norm(points - self.at(self.nearest(points)), axis=1)
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a model says of one pose: its curve, and `readings` (n_reactions,) [N, N m].
+
+    Readings are what forces and moments on the fixtures a sensor would show, see `ends.REACTIONS`.
+    """
+
+    curve: NodeCurve
+    readings: FloatArray
+
+
+@dataclass(frozen=True)
+class ObservedChange:
+    """How that changes along q directions.
+
+    `curve` (n + 1, d or 2 d, q), `readings` (n_reactions, q).
+    """
+
+    curve: FloatArray
+    readings: FloatArray

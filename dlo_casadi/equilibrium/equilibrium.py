@@ -1,0 +1,195 @@
+"""What there is to say of a cable's shape in one pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.equilibrium.pose import SIGNS, Branch
+from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.ends import reaction_rows
+
+FloatArray = NDArray[np.floating]
+
+# No joint bends by more than this between neighbouring headings (Eq. 8; joints only).
+JOINT_BOUND = np.pi / 2
+# Largest violation of an end condition [m or rad] of an accepted equilibrium.
+END_TOLERANCE = 1e-8
+# Largest imbalance of an accepted equilibrium, relative to the tangent matrix.
+BALANCE = 1e-12
+# Shapes that lie within this are the same one [rad].
+NEARBY = 0.05
+
+
+class Status(Enum):
+    """Outcome of a solve, one sentence each."""
+
+    STABLE = "stable equilibrium"
+    UNSTABLE = "stationary, but not a minimum of the energy"
+    FAILED = "no equilibrium found"
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """Shape of the cable in one pose.
+
+    Parameters
+    ----------
+    x : (n_nodes, coordinates)
+        States of the nodes: of a planar cable, absolute headings [rad].
+    points : (n + 1, dimension) [m]
+        Nodes from start to end.
+    energy : float [J]
+    lam : (dimension,) [N]
+        Force of the cable on whatever holds its end; zero at a free end.
+    lam_start : (dimension,) [N]
+        Force of the cable on whatever holds its start.
+    moments : (2, increment) [N m]
+        Of the cable on its clamps (start, end), in space about the world's axes; zero at pins.
+        In a plane (2,).
+    multipliers : (n_border,)
+        Of the end conditions, places and pulls of springs: in the order of `model.border_names`.
+    bound_multipliers : (n_nodes - 1,) [N m]
+        Of the joint bounds; zero where a joint bends freely.
+    curvature : (axes n_cells,) [1/m]
+        Mean curvature of each bending cell, in space about the axis y, then about z.
+    twist : (n_cells,) [1/m]
+        Mean twist of each cell; zero in a plane.
+    min_bend_radius : float [m]
+        Smallest radius of curvature along the cable: of the cells' mean curvatures, continued
+        linearly to both ends; of second order in the cells' length.
+    residual : float
+        Largest violation of an end condition [m or rad].
+    status : Status
+    iterations : int
+    tipping : float or None [rad]
+        By how much the clamp of a cable with a free end must turn until the lowest equilibrium on
+        the other branch is as low; None if no stable one was found there, or none looked for.
+    """
+
+    x: FloatArray
+    points: FloatArray
+    energy: float
+    lam: FloatArray
+    lam_start: FloatArray
+    moments: FloatArray
+    multipliers: FloatArray
+    bound_multipliers: FloatArray
+    curvature: FloatArray
+    twist: FloatArray
+    min_bend_radius: float
+    residual: float
+    status: Status
+    iterations: int
+    tipping: float | None = None
+
+    @property
+    def shapes(self) -> Shapes:
+        """As stacked unknowns of one pose, its ends where they are declared."""
+        return Shapes.declared(self.x[None], self.multipliers[None])
+
+    @property
+    def phi(self) -> FloatArray:
+        """Absolute headings (n_nodes,) [rad] of a planar cable."""
+        return self.x[:, 0]
+
+    @property
+    def theta(self) -> FloatArray:
+        """Relative joint angles; the first is the heading of the first link [rad]."""
+        return np.concatenate([self.phi[:1], np.diff(self.phi)])
+
+    @property
+    def turn(self) -> float:
+        """Last minus first heading [rad], counter-clockwise positive."""
+        return float(self.phi[-1] - self.phi[0])
+
+    def turns(self, branch: Branch | None) -> bool:
+        """Whether the cable turns as the branch says; always for None."""
+        return branch is None or SIGNS[branch] * self.turn > 0
+
+    @property
+    def stable(self) -> bool:
+        """Whether the energy has a strict minimum here under the end conditions."""
+        return self.status is Status.STABLE
+
+
+def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
+    """Smallest radius [m] of curvatures that are means over cells (n, 2), see `Equilibrium`."""
+    widths = np.diff(cells, axis=1).ravel()
+    if len(curvature) > len(cells):
+        curvature = np.linalg.norm(curvature.reshape((-1, len(cells))), axis=0)
+    largest = float(np.abs(curvature).max())
+    for inner in (1, -2) if len(curvature) > 1 else ():
+        outer = 0 if inner == 1 else -1
+        share = widths[outer] / (widths[outer] + widths[inner])
+        at_end = curvature[outer] + share * (curvature[outer] - curvature[inner])
+        largest = max(largest, abs(float(at_end)))
+    return 1 / max(largest, 1e-300)
+
+
+def equilibria_of(
+    model: CableModel,
+    shapes: Shapes,
+    given: Given,
+    *,
+    statuses: Sequence[Status],
+    iterations: NDArray[np.intp],
+    bound_multipliers: FloatArray | None = None,
+) -> list[Equilibrium]:
+    """What there is to say of each of m shapes.
+
+    Parameters
+    ----------
+    shapes : Shapes
+    given : Given
+    statuses : sequence of Status
+    iterations : (m,) int
+    bound_multipliers : (m, n_nodes - 1) [N m], optional
+        Zero if they are not given.
+    """
+    assembly, chain = model.assembly, model.chain
+    total, force, _ = assembly.balance(shapes, given)
+    energies = total - assembly.work(shapes, force)
+    residuals = np.abs(force.y[..., 0]).max(axis=1, initial=0.0)
+    strains = assembly.strain(shapes, given)
+    on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(model.node)
+    points = assembly.nodes(shapes, given)
+    if bound_multipliers is None:
+        bound_multipliers = np.zeros((len(shapes.x), chain.n_nodes - 1))
+    out = []
+    for j, status in enumerate(statuses):
+        curvature = chain.curvatures(strains[j]).ravel()
+        out.append(
+            Equilibrium(
+                x=shapes.x[j],
+                points=points[j],
+                energy=float(energies[j]),
+                lam=on_fixtures[j, rows["end_force"]],
+                lam_start=on_fixtures[j, rows["start_force"]],
+                moments=clamp_moments(model, shapes.x[j], shapes.lam[j]),
+                multipliers=shapes.lam[j],
+                bound_multipliers=bound_multipliers[j],
+                curvature=curvature,
+                twist=strains[j, : chain.n_cells] if model.in_space else np.zeros(chain.n_cells),
+                min_bend_radius=smallest_radius(curvature, chain.cells),
+                residual=float(residuals[j]),
+                status=status,
+                iterations=int(iterations[j]),
+            )
+        )
+    return out
+
+
+def clamp_moments(model: CableModel, x: FloatArray, lam: FloatArray) -> FloatArray:
+    """Moments [N m] on the clamps (start, end): (2,), in space (2, 3) about the world's axes."""
+    node, named = model.node, dict(zip(model.border_names, lam, strict=True))
+    moments = [
+        node.to_world(frame, np.array([named.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
+        for side, frame in (("start", x[0]), ("end", x[-1]))
+    ]
+    return np.squeeze(np.array(moments))

@@ -1,0 +1,230 @@
+"""Lines and markers as CSV files: points along a cable in metres, from its start to its end."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from dlo_casadi.config.problems import show
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.io.files import write_file
+
+AXES = ["x_m", "y_m", "z_m"]
+PLACE = "s_m"
+
+_LONGEST = 100.0
+"""Length of a centre-line [m] from which on it is not in metres."""
+
+_LARGEST = 20_000_000
+"""Bytes of a file: half a million points, measured to take two seconds."""
+
+_SAME_POINT = 1e-9
+"""Distance [m] below which two points in a row are one."""
+
+_COUNTS = {2: "two", 3: "three", 4: "four"}
+
+
+@dataclass(frozen=True)
+class MeasuredPoints:
+    """Points (K, d) [m] from start to end; of markers also the arc lengths `s` (K,) [m]."""
+
+    points: npt.NDArray[np.float64]
+    s: npt.NDArray[np.float64] | None = None
+
+
+def read_points(
+    path: str | Path,
+    start: Sequence[float],
+    end: Sequence[float] | None = None,
+    length: float = math.inf,
+) -> MeasuredPoints:
+    """Read a measured line, or markers at known arc lengths, and put them in order.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV file, one point a line [m]. With the header `x_m,y_m` (in space `x_m,y_m,z_m`) a line,
+        in order along the cable; with `s_m,x_m,y_m` (`s_m,x_m,y_m,z_m`) markers at the arc length
+        s_m from the start.
+    start : (d,) [m]
+        Where the start of the cable is held, d = 2 or 3.
+    end : (d,) [m], optional
+        Where its end is held.
+    length : float [m]
+        Of the cable: no marker lies beyond it.
+
+    Returns
+    -------
+    MeasuredPoints
+        From start to end, K >= 2, without repeated points. A line that runs from end to start is
+        put right: the first point is the one nearer to `start` (with `end` given, the order with
+        the smaller sum of both distances, which also tells the order of a part of a loop).
+
+    Raises
+    ------
+    MeasurementError
+        If the file cannot be read so; the message names the file and the line.
+    """
+    source = Path(path)
+    table, marked = _parse(source, len(start))
+    if len(table) == 0:
+        raise MeasurementError("has a header but no points", pose=source.name)
+    if marked:
+        return _markers(source, table, length)
+    step = np.linalg.norm(np.diff(table, axis=0), axis=1)
+    points = table[np.concatenate(([True], step > _SAME_POINT))]
+    _check_points(source, points)
+    return MeasuredPoints(points[::-1].copy() if _runs_backwards(points, start, end) else points)
+
+
+def _markers(source: Path, table: npt.NDArray[np.float64], length: float) -> MeasuredPoints:
+    """Markers in the order of their arc lengths, the first column."""
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    s, points = table[:, 0], table[:, 1:]
+    twice = s[1:][np.diff(s) <= _SAME_POINT]
+    if len(twice):
+        raise MeasurementError(f"{PLACE} {twice[0]:g} m stands twice", pose=source.name)
+    outside = s[(s < 0) | (s > length + _SAME_POINT)]
+    if len(outside):
+        raise MeasurementError(
+            f"{PLACE} {outside[0]:g} m is not between 0 and cable.length {length:g} m: arc length "
+            "from the start, in metres?",
+            pose=source.name,
+        )
+    _check_points(source, points)
+    return MeasuredPoints(points, s)
+
+
+def _check_points(source: Path, points: npt.NDArray[np.float64]) -> None:
+    """Raise if there are too few points, or if they are not in metres."""
+    if len(points) == 1:
+        raise MeasurementError("holds one point only; a pose takes two or more", pose=source.name)
+    along = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    if along > _LONGEST:
+        raise MeasurementError(
+            f"the centre-line is {along:.4g} m long: are the points in metres? If "
+            "they are in millimetres, divide them by 1000",
+            pose=source.name,
+        )
+
+
+def write_points(path: str | Path, points: npt.ArrayLike, s: npt.ArrayLike | None = None) -> None:
+    """Write a line, or markers at arc lengths s, as CSV, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; an older one is replaced only once the new one is complete.
+    points : (K, d) [m]
+        From start to end, d = 2 or 3.
+    s : (K,) [m], optional
+
+    Raises
+    ------
+    MeasurementError
+        If the points have another shape or are not finite.
+    OutputError
+        If the file cannot be written.
+    """
+    target = Path(path)
+    array = np.asarray(points, dtype=float)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise MeasurementError(
+            f"points of shape {array.shape}; (K, 2) or (K, 3) expected", pose=target.name
+        )
+    if not np.all(np.isfinite(array)):
+        bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise MeasurementError(f"point {bad} is {array[bad]}, not finite", pose=target.name)
+    header = AXES[: array.shape[1]]
+    if s is not None:
+        header, array = [PLACE, *header], np.column_stack([np.asarray(s, dtype=float), array])
+    write_table(target, header, array)
+
+
+def write_table(path: Path, header: Sequence[str], rows: npt.NDArray[np.float64]) -> None:
+    """Write numbers (K, columns) under their names as CSV, whole or not at all."""
+    lines = [",".join(header), *(",".join(map(repr, row)) for row in rows.tolist())]
+    write_file(path, "\n".join(lines) + "\n")
+
+
+def _parse(source: Path, dimension: int) -> tuple[npt.NDArray[np.float64], bool]:
+    """Read header and numbers (K, columns), K >= 0, and whether arc lengths are the first."""
+    try:
+        with source.open("rb") as file:
+            content = file.read(_LARGEST + 1)
+        lines = content.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise MeasurementError("is not a text file", pose=source.name) from None
+    except OSError as error:
+        raise MeasurementError(f"cannot be read: {error.strerror}", pose=source.name) from None
+    if len(content) > _LARGEST:
+        raise MeasurementError(
+            f"is larger than {_LARGEST} bytes; keep every tenth point, a few hundred suffice",
+            pose=source.name,
+        )
+
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            cells = next(csv.reader([line]), [])
+        except csv.Error as error:
+            raise MeasurementError(
+                f"line {number}: {error}; one point a line belongs here", pose=source.name
+            ) from None
+        if any(cell.strip() for cell in cells) or len(cells) > 1:
+            rows.append((number, [cell.strip() for cell in cells]))
+    axes = AXES[:dimension]
+    line, markers = ",".join(axes), ",".join([PLACE, *axes])
+    if not rows:
+        raise MeasurementError(f"is empty; a header {line} and points belong here", source.name)
+    number, header = rows[0]
+    if header not in (axes, [PLACE, *axes]):
+        raise MeasurementError(
+            f"line {number}: the header must be {line} (metres), or {markers} of markers at known "
+            f"arc lengths, found {show(lines[number - 1])}",
+            pose=source.name,
+        )
+    table = [_numbers(source, *row, header) for row in rows[1:]]
+    return np.array(table).reshape(-1, len(header)), header[0] == PLACE
+
+
+def _numbers(source: Path, number: int, cells: list[str], header: list[str]) -> list[float]:
+    if len(cells) != len(header):
+        names = ",".join(name.removesuffix("_m") for name in header)
+        raise MeasurementError(
+            f"line {number}: {_COUNTS[len(header)]} numbers {names} belong here, found "
+            f"{len(cells)}: {show(','.join(cells))}",
+            pose=source.name,
+        )
+    values = []
+    for cell in cells:
+        try:
+            values.append(float(cell))
+        except ValueError:
+            raise MeasurementError(
+                f"line {number}: {show(cell)} is not a number", pose=source.name
+            ) from None
+        if not math.isfinite(values[-1]):
+            raise MeasurementError(
+                f"line {number}: {show(cell)} is not a finite number; leave out the points that "
+                "were not measured, gaps are allowed",
+                pose=source.name,
+            )
+    return values
+
+
+def _runs_backwards(
+    points: npt.NDArray[np.float64], start: Sequence[float], end: Sequence[float] | None
+) -> bool:
+    first, last = points[0], points[-1]
+    forward, backward = math.dist(first, start), math.dist(last, start)
+    if end is not None:
+        forward += math.dist(last, end)
+        backward += math.dist(first, end)
+    return backward < forward

@@ -1,0 +1,374 @@
+"""A model's functions evaluated for many poses at once, and put together into band matrices.
+
+One CasADi function of a slot is mapped over the slots of a pose; its blocks are added up to the
+gradient of the Lagrangian, its Hessian (block-tridiagonal, with the multipliers as border), and
+the derivatives of both and of the measured curve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.rod.band import BandMatrix, Vector
+from dlo_casadi.rod.ends import deviation_names
+from dlo_casadi.rod.node import Frame, Heading
+
+if TYPE_CHECKING:
+    from dlo_casadi.model.cable_model import CableModel
+
+FloatArray = NDArray[np.floating]
+
+_NODES = {node.coordinates: node for node in (Heading, Frame)}
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Stacked unknowns of m poses.
+
+    Parameters
+    ----------
+    x : (m, n_nodes, coordinates)
+        States of the nodes: of a planar cable, headings [rad].
+    lam : (m, n_border)
+        Multipliers of the end conditions; places and pulls of springs.
+    deviation : (m, n_deviations)
+        What is different in every pose, see `deviation_names`.
+    """
+
+    x: FloatArray
+    lam: FloatArray
+    deviation: FloatArray
+
+    @classmethod
+    def declared(cls, x: FloatArray, lam: FloatArray) -> Shapes:
+        """Shapes whose ends are where they are declared to be."""
+        return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]])))))
+
+    def subset(self, index: Any) -> Shapes:
+        """Shapes of some of the poses."""
+        return Shapes(self.x[index], self.lam[index], self.deviation[index])
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the equilibria of m poses depend on.
+
+    `p` (m, n_parameters), `rest` (m, n_rests) [1/m], `poses` (m, n_pose) as declared.
+    """
+
+    p: FloatArray
+    rest: FloatArray
+    poses: FloatArray
+
+    @classmethod
+    def of(cls, p: FloatArray, rest: FloatArray, poses: FloatArray) -> Given:
+        """Parameters and rest curvature of each pose, or the same for all."""
+        m = len(poses)
+        return cls(
+            np.broadcast_to(p, (m, p.shape[-1])), np.broadcast_to(rest, (m, rest.shape[-1])), poses
+        )
+
+    def subset(self, index: Any) -> Given:
+        """Those of some of the poses."""
+        return Given(self.p[index], self.rest[index], self.poses[index])
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Directions of all that shapes depend on, q of them, of m poses.
+
+    `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q),
+    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q). `tangent`: the tangent matrices by
+    which the shapes' directions were found, if they were.
+    """
+
+    x: FloatArray
+    lam: FloatArray
+    p: FloatArray
+    rest: FloatArray
+    deviation: FloatArray
+    tangent: BandMatrix | None = None
+
+    def and_step(self, step: Vector) -> Directions:
+        """These directions and, last, a step of the shapes alone (one column)."""
+        p, rest, deviation = (
+            np.pad(part, [(0, 0), (0, 0), (0, 1)]) for part in (self.p, self.rest, self.deviation)
+        )
+        x = np.concatenate([self.x, step.x], axis=-1)
+        return Directions(x, np.concatenate([self.lam, step.y], axis=-1), p, rest, deviation)
+
+
+class _Mapped:
+    """A CasADi function of a slot (or node), mapped over a pose and called pose by pose.
+
+    It reads and writes NumPy's memory: converting to CasADi's matrices costs several times the
+    evaluation itself.
+    """
+
+    def __init__(self, function: ca.Function, count: int) -> None:
+        self._shapes = [
+            (count, function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
+        ]
+        mapped = function.map(count) if count > 1 else function
+        # Any: CasADi's stubs do not know that a buffer takes NumPy's memory.
+        self._buffer: Any
+        self._buffer, self._run = mapped.buffer()
+
+    def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
+        """Arguments (m, count, rows) -> outputs (m, count, rows, columns)."""
+        given = [np.ascontiguousarray(block, dtype=float) for block in arguments]
+        m = len(given[0])
+        outputs = [np.zeros((m, *shape)) for shape in self._shapes]
+        for j in range(m):
+            for i, block in enumerate(given):
+                self._buffer.set_arg(i, memoryview(block[j]))
+            for i, out in enumerate(outputs):
+                self._buffer.set_res(i, memoryview(out[j]))
+            self._run()
+        return [out.transpose(0, 1, 3, 2) for out in outputs]
+
+
+class Assembly:
+    """A model evaluated over poses.
+
+    Parameters
+    ----------
+    model : CableModel
+    """
+
+    def __init__(self, model: CableModel) -> None:
+        self.model = model
+        self.chain, self.node = model.chain, model.chain.kind.node
+        self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
+        self._slots = self.chain.n_slots
+        # Numbers that tell the rest strains inside a slot.
+        self.n_inside = 3 * len(self.node.strains)
+        self._next = np.minimum(np.arange(self._slots) + 1, self.n - 1)
+        self._functions: dict[str, _Mapped] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without compiled functions: another process makes its own."""
+        return {**self.__dict__, "_functions": {}}
+
+    # ---- calls ---------------------------------------------------------------------------------
+
+    def _mapped(self, name: str, count: int) -> _Mapped:
+        if name not in self._functions:
+            self._functions[name] = _Mapped(getattr(self.model, name), count)
+        return self._functions[name]
+
+    def _call_slots(self, name: str, shapes: Shapes, given: Given) -> list[FloatArray]:
+        """A function of a slot for all slots: outputs (m, n_slots, rows, columns)."""
+        m = len(shapes.x)
+        both = np.concatenate([shapes.x[:, : self._slots], shapes.x[:, self._next]], axis=2)
+        own = self.chain.rest_inside(given.rest[..., None])[..., 0]
+        alike = (shapes.lam, given.p, shapes.deviation)
+        lam, p, deviation = (
+            np.broadcast_to(one[:, None], (m, self._slots, one.shape[1])) for one in alike
+        )
+        place = np.broadcast_to(self.chain.layout.slots, (m, *self.chain.layout.slots.shape))
+        return self._mapped(name, self._slots)(both, lam, p, own, place, deviation)
+
+    def _call_ends(self, name: str, shapes: Shapes, given: Given) -> list[FloatArray]:
+        """A function of both ends: outputs (m, rows, columns)."""
+        both = np.concatenate([shapes.x[:, :1], shapes.x[:, -1:]], axis=2)
+        others = (shapes.lam, given.p, given.poses, shapes.deviation)
+        rows = [both, *(one[:, None] for one in others)]
+        return [out[:, 0] for out in self._mapped(name, 1)(*rows)]
+
+    def _added(self, slots: FloatArray, ends: FloatArray) -> Vector:
+        """Rows (2b + k, q) of the slots and the ends, added up to nodes and border."""
+        m, b = len(slots), self.b
+        x = np.zeros((m, max(self._slots + 1, self.n), b, slots.shape[3]))
+        x[:, : self._slots] += slots[:, :, :b]
+        x[:, 1 : self._slots + 1] += slots[:, :, b : 2 * b]
+        x = x[:, : self.n]
+        x[:, 0] += ends[:, :b]
+        x[:, -1] += ends[:, b : 2 * b]
+        return Vector(x, slots[:, :, 2 * b :].sum(axis=1) + ends[:, 2 * b :])
+
+    # ---- balance -------------------------------------------------------------------------------
+
+    def balance(self, shapes: Shapes, given: Given) -> tuple[FloatArray, Vector, BandMatrix]:
+        """Lagrangian (m,) [J], its gradient by increments and multipliers, and its Hessian."""
+        value, slope, bend = self._call_slots("slot", shapes, given)
+        end_value, end_slope, end_bend = self._call_ends("at_ends", shapes, given)
+        total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
+        return total, self._added(slope, end_slope), self._band(bend, end_bend)
+
+    def imbalance(self, shapes: Shapes, given: Given) -> Vector:
+        """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""
+        (slope,) = self._call_slots("slot_slope", shapes, given)
+        _, end_slope, _ = self._call_ends("at_ends", shapes, given)
+        return self._added(slope, end_slope)
+
+    def _band(self, bend: FloatArray, ends: FloatArray) -> BandMatrix:
+        m, b, k, n = len(bend), self.b, self.k, self.n
+        size = max(self._slots + 1, n)
+        diagonal = np.zeros((m, size, b, b))
+        diagonal[:, : self._slots] += bend[:, :, :b, :b]
+        diagonal[:, 1 : self._slots + 1] += bend[:, :, b : 2 * b, b : 2 * b]
+        diagonal = diagonal[:, :n]
+        diagonal[:, 0] += ends[:, :b, :b]
+        diagonal[:, -1] += ends[:, b : 2 * b, b : 2 * b]
+        border = np.zeros((m, size, b, k))
+        border[:, : self._slots] += bend[:, :, :b, 2 * b :]
+        border[:, 1 : self._slots + 1] += bend[:, :, b : 2 * b, 2 * b :]
+        border = border[:, :n]
+        border[:, 0] += ends[:, :b, 2 * b :]
+        border[:, -1] += ends[:, b : 2 * b, 2 * b :]
+        corner = bend[:, :, 2 * b :, 2 * b :].sum(axis=1) + ends[:, 2 * b :, 2 * b :]
+        return BandMatrix(diagonal, bend[:, : n - 1, :b, b : 2 * b].copy(), border, corner)
+
+    def energy(self, shapes: Shapes, given: Given) -> FloatArray:
+        """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers."""
+        total, slope, _ = self.balance(shapes, given)
+        return total - self.work(shapes, slope)
+
+    def work(self, shapes: Shapes, slope: Vector) -> FloatArray:
+        """Work (m,) [J] of the multipliers in the Lagrangian, whose gradient is given."""
+        own = shapes.lam * slope.y[:, :, 0] * self.model.are_multipliers
+        return np.asarray(own.sum(axis=1))
+
+    def imbalance_by(self, shapes: Shapes, given: Given, along: Directions) -> Vector:
+        """Change of the gradient at fixed nodes and multipliers, along p, rest and deviation."""
+        (slots,) = self._call_slots("slot_sensitivity", shapes, given)
+        (ends,) = self._call_ends("end_sensitivity", shapes, given)
+        n_p = along.p.shape[1]
+        moved = slots[..., :n_p] @ along.p[:, None]
+        n_r = n_p + self.n_inside
+        moved += slots[..., n_p:n_r] @ self.chain.rest_inside(along.rest)
+        moved += slots[..., n_r:] @ along.deviation[:, None]
+        at_ends = ends[..., :n_p] @ along.p + ends[..., n_p:] @ along.deviation
+        return self._added(moved, at_ends)
+
+    # ---- the curve ------------------------------------------------------------------------------
+
+    def _stations(self, advance: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Places (m, n + 1, d, ...) and rates (m, n + 1, rates, ...) of element boundaries."""
+        steps, d = advance[:, self.chain.layout.advancing], self.node.dimension
+        places = np.concatenate([start[:, None], steps[:, :, :d]], axis=1).cumsum(axis=1)
+        rates = steps[:, :, d:]
+        mean = (rates[:, 1:] + rates[:, :-1]) / 2
+        return places, np.concatenate([rates[:, :1], mean, rates[:, -1:]], axis=1)
+
+    def nodes(self, shapes: Shapes, given: Given) -> FloatArray:
+        """True places (m, n + 1, dimension) [m] of the element boundaries."""
+        (advance,) = self._call_slots("slot_curve", shapes, given)
+        return self._stations(advance[..., 0], given.poses[:, : self.node.dimension])[0]
+
+    def curve(self, shapes: Shapes, given: Given) -> FloatArray:
+        """Measured places, and slopes dr/ds of smooth elements, (m, n + 1, d or 2 d)."""
+        (advance,) = self._call_slots("slot_curve", shapes, given)
+        (rows,) = self._call_stations("station", advance[..., 0], shapes, given)
+        return rows[..., 0]
+
+    def _call_stations(
+        self, name: str, advance: FloatArray, shapes: Shapes, given: Given
+    ) -> list[FloatArray]:
+        m, count = len(shapes.x), self.chain.n + 1
+        places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
+        x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
+        p, ends = (
+            np.broadcast_to(a[:, None], (m, count, a.shape[1])) for a in (given.p, given.poses)
+        )
+        return self._mapped(name, count)(places, rates, x, p, ends)
+
+    def curve_slopes(self, shapes: Shapes, given: Given) -> CurveSlopes:
+        """`curve` and what its derivatives are made of."""
+        advance, by_moving, by_others = self._call_slots("slot_curve_slopes", shapes, given)
+        rows, by_station, by_p = self._call_stations(
+            "station_slopes", advance[..., 0], shapes, given
+        )
+        return CurveSlopes(self, rows[..., 0], by_moving, by_others, by_station, by_p)
+
+    def reactions(self, shapes: Shapes, given: Given) -> FloatArray:
+        """Forces and moments (m, n_reactions) of the cable on its fixtures, `ends.REACTIONS`."""
+        return self._call_ends("reactions", shapes, given)[0][..., 0]
+
+    def readings(self, shapes: Shapes, given: Given) -> FloatArray:
+        """`reactions` as sensors show them."""
+        return self._call_ends("readings", shapes, given)[0][..., 0]
+
+    def readings_along(self, shapes: Shapes, given: Given, along: Directions) -> FloatArray:
+        """Change (m, n_reactions, q) of `readings` along directions."""
+        by_ends, by_p, by_deviation = self._call_ends("reading_slopes", shapes, given)
+        moved = np.concatenate([along.x[:, 0], along.x[:, -1], along.lam], axis=1)
+        return np.asarray(by_ends @ moved + by_p @ along.p + by_deviation @ along.deviation)
+
+    # ---- state and strain ------------------------------------------------------------------------
+
+    def strain(self, shapes: Shapes, given: Given) -> FloatArray:
+        """Mean strains (m, n_rests) [1/m] of the cells, one strain after the other."""
+        (rows,) = self._call_slots("slot_strain", shapes, given)
+        return self._stacked(rows[..., 0][:, self.chain.layout.bends])
+
+    @staticmethod
+    def _stacked(cells: FloatArray) -> FloatArray:
+        """Values (m, n_cells, strains, ...) of cells as (m, n_rests, ...), strain after strain."""
+        by_strain = np.moveaxis(cells, 2, 1)
+        m, n_cells, strains, *columns = cells.shape
+        return by_strain.reshape((m, n_cells * strains, *columns))
+
+    def state_after(self, shapes: Shapes, given: Given) -> tuple[FloatArray, ...]:
+        """Rest strains (m, n_rests) that poses leave; their slopes by both nodes, rest and p.
+
+        The slopes are (m, n_rests, 2b), (m, n_rests, strains) by the cell's own rest strains, and
+        (m, n_rests, n_parameters).
+        """
+        bends = self.chain.layout.bends
+        after, *slopes = self._call_slots("slot_state", shapes, given)
+        stacked = [self._stacked(part[:, bends]) for part in slopes]
+        return (self._stacked(after[..., 0][:, bends]), *stacked)
+
+    def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
+        """Whether poses hand on the rest curvature that they find, to first order."""
+        same = np.repeat(np.eye(len(self.node.strains)), self.chain.n_cells, axis=0)
+        return bool(np.all(slopes[2] == same))
+
+    def state_along(
+        self, slopes: tuple[FloatArray, ...], x: FloatArray, rest: FloatArray, p: FloatArray
+    ) -> FloatArray:
+        """Change (m, n_rests, q) of what poses leave behind, along nodes, rest and p."""
+        bends, strains = self.chain.layout.bends, len(self.node.strains)
+        _, by_x, by_rest, by_p = slopes
+        both = np.concatenate([x[:, bends], x[:, bends + 1]], axis=2)
+        own = np.stack(self.chain.by_strain(rest), axis=2)
+        moved = (by_x[:, :, None] @ np.tile(both, (1, strains, 1, 1)))[:, :, 0]
+        moved += (by_rest[:, :, None] @ np.tile(own, (1, strains, 1, 1)))[:, :, 0]
+        return np.asarray(moved + by_p @ p)
+
+
+@dataclass(frozen=True)
+class CurveSlopes:
+    """Measured curves `z` (m, n + 1, d or 2 d) and their derivatives, slot by slot."""
+
+    assembly: Assembly
+    z: FloatArray
+    by_moving: FloatArray
+    by_others: FloatArray
+    by_station: FloatArray
+    by_p: FloatArray
+
+    def along(self, directions: Directions) -> FloatArray:
+        """Change (m, n + 1, d or 2 d, q) of the measured curves."""
+        a, d = self.assembly, directions
+        n_p, b = d.p.shape[1], a.b
+        nodes = np.concatenate([d.x[:, : a._slots], d.x[:, a._next]], axis=2)
+        steps = self.by_moving[..., : 2 * b] @ nodes
+        steps += self.by_moving[..., 2 * b :] @ d.lam[:, None]
+        steps += self.by_others[..., :n_p] @ d.p[:, None]
+        n_r = n_p + a.n_inside
+        steps += self.by_others[..., n_p:n_r] @ a.chain.rest_inside(d.rest)
+        steps += self.by_others[..., n_r:] @ d.deviation[:, None]
+        start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))
+        places, rates = a._stations(steps, start)
+        shape = (len(steps), a.chain.n + 1, 2 * b, steps.shape[3])
+        own = d.x[:, a.chain.layout.stations].reshape(shape)
+        moved = self.by_station @ np.concatenate([places, rates, own], axis=2)
+        return np.asarray(moved + self.by_p @ d.p[:, None])

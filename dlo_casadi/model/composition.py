@@ -1,0 +1,239 @@
+"""What a cable's model is made of: the cable, its mesh, its boundaries and its effects, counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.effects import Cable, Effect, Load
+from dlo_casadi.effects.parameter import STIFFNESS_BOUNDS, Parameter
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.rest_curvature import RestCurvature
+from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
+from dlo_casadi.rod.ends import EndConditions, deviation_names
+from dlo_casadi.rod.node import Node
+
+StartKind = Literal["pinned", "clamped"]
+EndKind = Literal["pinned", "clamped", "free"]
+FloatArray = NDArray[np.floating]
+
+BENDING_STIFFNESS = "bending_stiffness"
+# ln(1000): a prior of the stiffness may be off by three decades.
+STIFFNESS_PRIOR_STD = float(np.log(1e3))
+# ln(3): GJ over EI is 1 / (1 + nu) in a solid round rod; strands and jackets make it less or more.
+STIFFNESS_RATIO_STD = float(np.log(3.0))
+# Nobody knows how a cable's own twist was gripped: tolerances.roll by default [rad].
+ROLL_STD = 1.0
+TORSIONAL_STIFFNESS = "torsional_stiffness"
+STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
+# Elements of `CableModel.coarse`.
+COARSE_MESH = 10
+# Roll of the end clamp about the cable against what is declared [rad]: rest twist, see design.
+END_ROLL = "end_roll"
+# Numbers that tell where the camera of a pose stood, see `Pose.vector`.
+SIGHT_SIZE = 3
+
+
+def _stiffness(name: str, nominal: float) -> Parameter:
+    lower, upper = STIFFNESS_BOUNDS
+    std = STIFFNESS_PRIOR_STD
+    return Parameter(name, "N m^2", nominal, lower=lower, upper=upper, prior_std=std, log=True)
+
+
+@dataclass(frozen=True)
+class Composition:
+    """What a `model.CableModel` is made of, see there."""
+
+    cable: Cable
+    n: int = 40
+    element: str = DEFAULT_ELEMENT
+    start: StartKind = "pinned"
+    end: EndKind = "pinned"
+    gravity: tuple[float, ...] = (0.0, -9.81)
+    effects: tuple[Effect, ...] = ()
+    n_rest: int = 9
+    priors: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(self.gravity) != len(self.cable.axes):
+            raise DloError(
+                f"gravity has {len(self.gravity)} numbers, but the cable "
+                f"{'has no' if len(self.gravity) == 3 else 'has a'} torsional stiffness: in space "
+                "give both, in a plane neither"
+            )
+        labels = [effect.label for effect in self.effects]
+        for effect in self.effects:
+            if labels.count(effect.label) > 1:
+                raise DloError(
+                    f"two effects are both labelled {effect.label!r}; give one another label, "
+                    f"e.g. {type(effect).__name__}(label='{effect.label}_2')"
+                )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What the model was made of: CasADi's expressions are built anew in another process."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The chain of n elements."""
+        held = (self.start == "clamped", self.end == "clamped")
+        return Chain(self.cable.length, self.n, self.element, *held, in_space=self.in_space)
+
+    @property
+    def in_space(self) -> bool:
+        """Whether the cable may leave the plane."""
+        return len(self.gravity) == 3
+
+    @property
+    def node(self) -> type[Node]:
+        """What the nodes carry."""
+        return self.chain.kind.node
+
+    @property
+    def n_pose(self) -> int:
+        """Numbers that declare one pose, see `pose.Pose.vector`."""
+        return EndConditions.size(self.node) + SIGHT_SIZE
+
+    @property
+    def deviation_names(self) -> tuple[str, ...]:
+        """What may be different in every pose."""
+        return deviation_names(self.node)
+
+    @cached_property
+    def rest(self) -> RestCurvature:
+        """Basis of the rest curvature."""
+        return RestCurvature(self.cable.length, 0 if self.cable.straight else self.n_rest)
+
+    @cached_property
+    def rest_basis(self) -> FloatArray:
+        """Rest curvature per coefficient (n_rests, n_coefficients): kappa_0 = rest_basis @ c.
+
+        In space the coefficients about the axis z follow those about y; the rest twist is none.
+        """
+        means, strains = self.rest.cell_means(self.chain.cells), len(self.node.strains)
+        return np.kron(np.eye(strains)[:, -len(self.node.curvatures) :], means)
+
+    @property
+    def roughness(self) -> FloatArray:
+        """Second differences of the rest coefficients, about each axis."""
+        return np.kron(np.eye(len(self.node.curvatures)), self.rest.roughness)
+
+    @property
+    def n_coefficients(self) -> int:
+        """Number of rest coefficients."""
+        return self.rest.n_coefficients * len(self.node.curvatures)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Stiffnesses, in space the roll of the end, then the effects' with qualified names."""
+        listed = [_stiffness(BENDING_STIFFNESS, self.cable.bending_stiffness)]
+        if self.cable.torsional_stiffness is not None:
+            torsion = _stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness)
+            # Known by its ratio to the bending stiffness, see `Unknowns.prior_precision`.
+            listed.append(torsion.with_prior(np.inf))
+            if self.start == self.end == "clamped":
+                std = self.priors.get(END_ROLL, ROLL_STD)
+                listed.append(
+                    Parameter(END_ROLL, "rad", scale=0.1, lower=-9.0, upper=9.0, prior_std=std)
+                )
+        for effect in self.effects:
+            for parameter in effect.parameters(self.cable):
+                name = f"{effect.label}.{parameter.name}"
+                std = self.priors.get(name, parameter.prior_std)
+                listed.append(replace(parameter, name=name, prior_std=std))
+        return tuple(listed)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Qualified names of the parameters, in the order of the vector `p`."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def stiffness_indices(self) -> list[int]:
+        """Where the stiffnesses stand in the vector `p`, bending first."""
+        return [k for k, name in enumerate(self.names) if name in STIFFNESSES]
+
+    @cached_property
+    def nominal(self) -> FloatArray:
+        """Parameter vector `p` at the nominal values."""
+        return np.array([parameter.nominal for parameter in self.parameters])
+
+    def with_effect(self, effect: Effect, priors: dict[str, float] | None = None) -> Self:
+        """Return this model with one more effect."""
+        return replace(
+            self, effects=(*self.effects, effect), priors={**self.priors, **(priors or {})}
+        )
+
+    def without_effect(self, label: str) -> Self:
+        """Return this model without the effect of that label."""
+        kept = tuple(effect for effect in self.effects if effect.label != label)
+        priors = {k: v for k, v in self.priors.items() if not k.startswith(f"{label}.")}
+        return replace(self, effects=kept, priors=priors)
+
+    def with_mesh(self, n: int, element: str | None = None) -> Self:
+        """Return the same model on another mesh."""
+        return replace(self, n=n, element=element or self.element)
+
+    @cached_property
+    def coarse(self) -> Self:
+        """The same model on a coarse mesh, kept with its functions."""
+        return self.with_mesh(COARSE_MESH)
+
+    @cached_property
+    def n_conditions(self) -> int:
+        """Number of end conditions."""
+        return len(self.condition_names)
+
+    @property
+    def n_springs(self) -> int:
+        """Number of springs from places of the cable."""
+        return sum(effect.n_springs for effect in self.effects if isinstance(effect, Load))
+
+    @property
+    def n_border(self) -> int:
+        """Number of unknowns of the whole pose: `border_names`."""
+        return len(self.border_names)
+
+    @cached_property
+    def border_names(self) -> tuple[str, ...]:
+        """Names of the unknowns beside the nodes: end conditions' multipliers, then springs'.
+
+        A spring's place y [m] is an unknown of its own, held on the cable by its pull [N]: so that
+        no node knows more than its neighbours, see `SpringAt`.
+        """
+        own = [f"{what}_{axis}" for what in ("place", "pull") for axis in self.node.axes]
+        springs = [f"spring_{k}.{name}" for k in range(self.n_springs) for name in own]
+        return (*self.condition_names, *springs)
+
+    @property
+    def n_multipliers(self) -> int:
+        """How many of the border are multipliers: negative eigenvalues of a minimum's tangent."""
+        return self.n_conditions + self.node.dimension * self.n_springs
+
+    @cached_property
+    def are_multipliers(self) -> NDArray[np.bool_]:
+        """Which of the border's unknowns are multipliers (n_border,); the others are places."""
+        return np.array([".place_" not in name for name in self.border_names], dtype=bool)
+
+    @cached_property
+    def condition_names(self) -> tuple[str, ...]:
+        """Names of the end conditions: end position, then frames of clamps."""
+        axes, turns = self.node.axes, self.node.turns
+        names = [] if self.end == "free" else [f"end_position_{axis}" for axis in axes]
+        names += [f"start_{turn}" for turn in turns] if self.start == "clamped" else []
+        names += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
+        return tuple(names)
+
+    @cached_property
+    def deviations(self) -> tuple[str, ...]:
+        """Which deviations of a pose can matter for these boundaries."""
+        axes, turns = self.node.axes, self.node.turns
+        used = [] if self.end == "free" else [f"end_{axis}" for axis in axes]
+        used += [f"start_{turn}" for turn in turns] if self.start == "clamped" else []
+        used += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
+        used += [name for effect in self.effects for name in effect.per_pose(self.cable)]
+        return tuple(used)

@@ -1,0 +1,82 @@
+"""Where the ends of a cable are held: the record of positions and frames behind a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+
+from dlo_casadi.rod.node import Node, quaternion_product
+
+# What the cable does to its fixtures, and a sensor there measures, in the order of `reactions`.
+REACTIONS = ("start_force", "start_moment", "end_force", "end_moment")
+
+
+def reaction_rows(node: type[Node]) -> dict[str, slice]:
+    """Where each of REACTIONS stands in their vector: forces (dimension,), moments (increment,)."""
+    sizes = [node.dimension, node.increment] * 2
+    ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
+    return {
+        name: slice(end - size, end) for name, size, end in zip(REACTIONS, sizes, ends, strict=True)
+    }
+
+
+def deviation_names(node: type[Node]) -> tuple[str, ...]:
+    """What may be different in every pose, in the order of `deviation`.
+
+    Where the ends deviate from what is declared [m, rad], and a force of unknown cause [N].
+    """
+    parts = (("end", node.axes), ("start", node.turns), ("end", node.turns), ("pull", node.axes))
+    return tuple(f"{what}_{name}" for what, names in parts for name in names)
+
+
+@dataclass(frozen=True)
+class EndConditions:
+    """Where and how the ends are held: symbols of one pose.
+
+    `start`, `end` (dimension,) [m]; `start_frame`, `end_frame` (coordinates,): the clamps as a
+    node would carry them, in a plane their headings [rad]. `node` is what the nodes carry.
+    """
+
+    start: ca.SX
+    end: ca.SX
+    start_frame: ca.SX
+    end_frame: ca.SX
+    node: type[Node]
+
+    @staticmethod
+    def size(node: type[Node]) -> int:
+        """Numbers that declare both ends."""
+        return 2 * (node.dimension + node.coordinates)
+
+    @classmethod
+    def of(cls, values: ca.SX, node: type[Node]) -> EndConditions:
+        """From start, end, start frame, end frame in one vector."""
+        d, c = node.dimension, node.coordinates
+        start, end, first, last = ca.vertsplit(values, [0, d, 2 * d, 2 * d + c, 2 * (d + c)])
+        return cls(start, end, first, last, node)
+
+    @property
+    def vector(self) -> ca.SX:
+        """As given to `of`."""
+        return ca.vertcat(self.start, self.end, self.start_frame, self.end_frame)
+
+    def changed(self, **values: Any) -> EndConditions:
+        """Return a copy with some conditions replaced."""
+        return replace(self, **values)
+
+    def rolled(self, angle: ca.SX) -> EndConditions:
+        """Return a copy whose end clamp in space is turned about its x axis [rad]."""
+        roll = (ca.sin(angle / 2), ca.SX(0), ca.SX(0), ca.cos(angle / 2))
+        rolled = quaternion_product(ca.vertsplit(self.end_frame), roll)
+        return replace(self, end_frame=ca.vertcat(*rolled))
+
+    def turned(self, start: ca.SX | None = None, end: ca.SX | None = None) -> EndConditions:
+        """Return a copy whose clamps are turned by increments about their own axes."""
+        first, last = self.start_frame, self.end_frame
+        if start is not None:
+            first = self.node.retract(first, start)
+        if end is not None:
+            last = self.node.retract(last, end)
+        return replace(self, start_frame=first, end_frame=last)

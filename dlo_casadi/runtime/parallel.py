@@ -1,0 +1,346 @@
+"""Everything that repeats: one function over many items, wherever the tasks run."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import threading
+import time
+import traceback
+from collections.abc import Callable, Generator, Iterable, Sequence, Sized
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, Generic, TypeVar, cast
+
+import numpy as np
+
+from dlo_casadi.errors import DloError
+from dlo_casadi.runtime.executors import open_executor
+from dlo_casadi.runtime.workers import one_thread, worker_log, worker_name
+
+__all__ = [
+    "Finished",
+    "LostTaskError",
+    "Tally",
+    "begin",
+    "generator_of",
+    "map_as_completed",
+    "map_in_order",
+    "one_thread",
+    "open_executor",
+]
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# Times that a task that was lost with a worker is given to another, the last time alone.
+RETRIES = 2
+# 90 % of a normal distribution lie within so many standard deviations.
+NINETY = 1.645
+
+
+class LostTaskError(DloError):
+    """A task whose worker was killed each time that it ran."""
+
+
+@dataclass(frozen=True)
+class Finished(Generic[Item, Result]):
+    """One task that has ended.
+
+    Parameters
+    ----------
+    index : int
+        Place of the item among the items.
+    item : object
+    result : object or None
+    error : BaseException or None
+        What the function raised instead, or a `LostTaskError`.
+    seconds : float
+        That it took, on its worker.
+    worker : str
+        Machine and process; empty if it was lost.
+    """
+
+    index: int
+    item: Item
+    result: Result | None
+    error: BaseException | None
+    seconds: float
+    worker: str
+
+    @property
+    def value(self) -> Result:
+        """The result; what the function raised is raised here."""
+        if self.error is not None:
+            raise self.error
+        return cast(Result, self.result)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How far the tasks have come.
+
+    Parameters
+    ----------
+    done, failed : int
+        Failed ones are among the done.
+    total : int or None
+    elapsed : float [s]
+    remaining : (float, float) or None [s]
+        90 % interval, from the durations so far; None until two tasks are done.
+    """
+
+    done: int
+    failed: int
+    total: int | None
+    elapsed: float
+    remaining: tuple[float, float] | None
+
+
+def map_as_completed(
+    executor: Executor,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    *,
+    total: int | None = None,
+    in_flight: int | None = None,
+    retries: int = RETRIES,
+    progress: Callable[[Tally], None] | None = None,
+) -> Generator[Finished[Item, Result]]:
+    """Apply a function to all items; yield each as soon as it has ended.
+
+    What the function raises ends its own item alone. A task that is lost with a killed worker
+    is given to another, in its last repetition with no task beside it; one that is lost every
+    time ends with a `LostTaskError`. Where this process is one of the executor's workers it does
+    tasks between those that it hands out, and those that are lost. Each task has one thread of
+    BLAS, OpenMP and OpenCV, so that its numbers do not depend on where it runs.
+
+    Parameters
+    ----------
+    executor : Executor
+        Any; `open_executor` makes those that are logged and survive a killed worker.
+    function : callable
+        Of one item. Both, and what it returns, must be picklable unless all run in this process.
+    items : iterable
+        Taken only as tasks are submitted.
+    total : int, optional
+        Number of items, if it cannot be asked.
+    in_flight : int, optional
+        Most tasks under way; by default two for each worker.
+    retries : int
+        Times that a lost task is repeated, the last of them alone; with 0 its first loss, to which
+        any task beside it may have led, ends it.
+    progress : callable, optional
+        Called after each task.
+    """
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    tally = _Count(total, executor)
+    losses = getattr(executor, "losses", (BrokenExecutor,))
+    logs = getattr(executor, "logs", None)
+    waiting = iter(enumerate(items))
+    again: list[_Task[Item]] = []
+    suspects: list[_Task[Item]] = []
+    under_way: dict[Future[Any], _Task[Item]] = {}
+    here, workers, taken = getattr(executor, "here", False), getattr(executor, "workers", 1), 0
+
+    def room() -> int:
+        # Asked anew each time: workers of a cluster come and go.
+        most = in_flight or int(getattr(executor, "capacity", 2))
+        if here and total is not None:
+            # The fewer are left, the fewer wait for a worker that this process could do.
+            left = total - taken
+            most = min(most, (workers - 1) * max(1, left // (2 * workers))) if left > 1 else 0
+        return max(0, most - len(under_way))
+
+    def submit(task: _Task[Item]) -> None:
+        future = executor.submit(_run, function, task.item, task.index, _text(logs))
+        under_way[future] = task
+
+    def done_here(task: _Task[Item]) -> tuple[Result | None, Exception | None, float, str]:
+        return _run(function, task.item, task.index, None)
+
+    def ended(task: Finished[Item, Result]) -> Finished[Item, Result]:
+        tally.add(task)
+        if progress is not None:
+            progress(tally.now())
+        return task
+
+    try:
+        while True:
+            while again and room():
+                submit(again.pop())
+            for index, item in islice(waiting, room()):
+                submit(_Task(index, item))
+                taken += 1
+            own = list(islice(waiting, int(here)))
+            for index, item in own:
+                taken += 1
+                yield ended(Finished(index, item, *done_here(_Task(index, item))))
+            if not under_way:
+                if own:
+                    continue
+                if not suspects:
+                    return
+                submit(suspects.pop())
+            # Who has just done a task goes on with the next, and does not wait for the others.
+            patience = 0.0 if own else None
+            for future in wait(under_way, patience, FIRST_COMPLETED).done:
+                task = under_way.pop(future)
+                if future.cancelled():
+                    raise LostTaskError("the executor was shut down with tasks under way")
+                error = future.exception()
+                if here and isinstance(error, losses):
+                    yield ended(Finished(task.index, task.item, *done_here(task)))
+                    continue
+                if isinstance(error, losses):
+                    task.lost += 1
+                    if task.lost < retries:
+                        again.append(task)
+                        continue
+                    if task.lost == retries:
+                        # With no other beside it, nobody else can be to blame for the next loss.
+                        suspects.append(task)
+                        continue
+                    times = f"{task.lost} times, at last alone" if retries else "once"
+                    error = LostTaskError(
+                        f"task {task.index} was lost {times}: its worker was killed.\n"
+                        "  Try: more memory; see the workers' logs."
+                    )
+                if error is None:
+                    result, error, seconds, worker = future.result()
+                else:
+                    result, seconds, worker = None, 0.0, ""
+                yield ended(Finished(task.index, task.item, result, error, seconds, worker))
+    finally:
+        for future in under_way:
+            future.cancel()
+
+
+def map_in_order(
+    executor: Executor, function: Callable[[Item], Result], items: Sequence[Item], **options: Any
+) -> list[Result]:
+    """Results of all items in their order; the first item's error, if any, is raised.
+
+    Parameters
+    ----------
+    options
+        As of `map_as_completed`.
+    """
+    ended = list(map_as_completed(executor, function, items, **options))
+    return [item.value for item in sorted(ended, key=lambda item: item.index)]
+
+
+def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Callable[[], Result]:
+    """Begin one call beside others; what is returned waits for it, and raises what it raised.
+
+    Where the executor has no worker but this process, it is made when the result is asked for, and
+    where the worker is killed, again. As each task of `map_as_completed` it has one thread.
+    """
+    call = partial(_run, _called, (function, args), 0)
+    begun: Future[Any] | None = None
+    if getattr(executor, "workers", 1) > 1:
+        begun = executor.submit(call, _text(getattr(executor, "logs", None)))
+    losses = getattr(executor, "losses", (BrokenExecutor,))
+
+    def result() -> Result:
+        try:
+            found, error, _, _ = call(None) if begun is None else begun.result()
+        except losses:
+            found, error, _, _ = call(None)
+        if error is not None:
+            raise error
+        return cast(Result, found)
+
+    return result
+
+
+def _called(call: tuple[Callable[..., Result], tuple[Any, ...]]) -> Result:
+    function, args = call
+    return function(*args)
+
+
+def generator_of(seed: int, index: int) -> np.random.Generator:
+    """Random numbers of one task: they depend on its index, not on where or when it runs."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+
+
+# ---- on a worker -------------------------------------------------------------------------------
+
+# CasADi's expressions are not made for threads: a worker does one task at a time.
+_one_at_a_time = threading.RLock()
+
+
+def _run(
+    function: Callable[[Item], Result], item: Item, index: int, logs: str | None
+) -> tuple[Result | None, Exception | None, float, str]:
+    """Run one task, timed and logged; an exception is returned."""
+    # Tasks within a task have no log of their own.
+    log = worker_log(logs) if logs is not None else logging.getLogger("dlo_casadi.unlogged")
+    with _one_at_a_time, one_thread():
+        begin = time.perf_counter()
+        log.info("task %d begins: %.200r", index, item)
+        try:
+            result = function(item)
+        except Exception as error:
+            log.info("task %d failed", index, exc_info=True)
+            if multiprocessing.parent_process() is not None and not isinstance(error, DloError):
+                error.add_note(traceback.format_exc())  # the stack does not come along
+            return None, error, time.perf_counter() - begin, worker_name()
+        seconds = time.perf_counter() - begin
+        log.info("task %d done in %.3f s", index, seconds)
+        return result, None, seconds, worker_name()
+
+
+# ---- bookkeeping -------------------------------------------------------------------------------
+
+
+@dataclass
+class _Task(Generic[Item]):
+    index: int
+    item: Item
+    lost: int = 0
+
+
+class _Count:
+    """Counts tasks and their durations."""
+
+    def __init__(self, total: int | None, executor: Executor) -> None:
+        self._begin = time.perf_counter()
+        self._total = total
+        self._executor = executor
+        self._failed = 0
+        self._seconds: list[float] = []
+
+    def add(self, task: Finished[Any, Any]) -> None:
+        """One more has ended."""
+        self._failed += task.error is not None
+        self._seconds.append(task.seconds)
+
+    def now(self) -> Tally:
+        """Numbers at this moment."""
+        elapsed = time.perf_counter() - self._begin
+        done = len(self._seconds)
+        return Tally(done, self._failed, self._total, elapsed, self._remaining(elapsed))
+
+    def _remaining(self, elapsed: float) -> tuple[float, float] | None:
+        """Time of the tasks left: a sum of so many, whose mean itself is known from those done.
+
+        (k mean +- 1.645 s sqrt(k + k^2 / m)) / workers  with k left and m done.
+        """
+        m = len(self._seconds)
+        if self._total is None or m < 2:
+            return None
+        seconds = np.array(self._seconds)
+        workers = getattr(self._executor, "workers", max(1.0, float(seconds.sum()) / elapsed))
+        k = self._total - m
+        middle = k * float(seconds.mean())
+        spread = NINETY * float(seconds.std(ddof=1)) * (k + k**2 / m) ** 0.5
+        return max(0.0, middle - spread) / workers, (middle + spread) / workers
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)

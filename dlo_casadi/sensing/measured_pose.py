@@ -1,0 +1,232 @@
+"""A measured pose: its end conditions, and what its sensors say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.rod.node import Frame, Heading
+from dlo_casadi.sensing.noise import NoiseModel
+from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench
+
+FloatArray = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class MeasuredPose:
+    """One pose with what was measured of it: the residuals of its sensors, one after the other.
+
+    Parameters
+    ----------
+    pose : Pose
+        End conditions as declared.
+    sensors : tuple of Sensor
+        Those of points first; empty if the pose could not be read.
+    held_out : bool
+        Whether the pose is kept for the final test.
+    line : (M, d) [m], optional
+        The cable's line that the sensors show together, where their points are no line by
+        themselves; without points where they show none.
+    """
+
+    pose: Pose
+    sensors: tuple[Sensor, ...] = ()
+    held_out: bool = False
+    line: FloatArray | None = None
+
+    @classmethod
+    def of_points(
+        cls,
+        pose: Pose,
+        points: FloatArray,
+        weight: FloatArray | None = None,
+        held_out: bool = False,
+        s: FloatArray | None = None,
+    ) -> Self:
+        """A pose with one line of points (K, d) [m], or markers where arc lengths s are known.
+
+        Without points the pose could not be read. `weight` (K,) is one by default.
+        """
+        if not len(points):
+            return cls(pose, (), held_out)
+        weight = np.ones(len(points)) if weight is None else weight
+        sensor = Centerline(points, weight) if s is None else Markers(points, weight, s)
+        return cls(pose, (sensor,), held_out)
+
+    def with_readings(self, readings: Mapping[str, Sequence[float]]) -> Self:
+        """The same pose with forces and moments on its fixtures, by names of `ends.REACTIONS`.
+
+        A pose that could not be read stays so.
+        """
+        if not readings or not self.readable:
+            return self
+        node = Frame if len(self.pose.start) == 3 else Heading
+        known = {name: np.array(value, dtype=float) for name, value in readings.items()}
+        return replace(self, sensors=(*self.sensors, Wrench(known, node)))
+
+    @property
+    def readable(self) -> bool:
+        """Whether there is anything to compare with."""
+        return len(self.sensors) > 0
+
+    @property
+    def has_line(self) -> bool:
+        """Whether it is known where in space points of the cable lie."""
+        return self.readable and (self.line is None or len(self.line) > 0)
+
+    @cached_property
+    def traced(self) -> MeasuredPose:
+        """The same pose with its line alone; about where its points lie if they show none."""
+        if self.line is None:
+            return self
+        line = self.line if len(self.line) else self.points
+        return MeasuredPose.of_points(self.pose, line, held_out=self.held_out)
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """All measured points (K, d) [m]."""
+        found = [sensor.points for sensor in self.sensors if len(sensor.points)]
+        return np.concatenate(found) if found else np.zeros((0, len(self.pose.start)))
+
+    @cached_property
+    def relative_std(self) -> FloatArray:
+        """Relative standard deviation of each point (K,)."""
+        return np.concatenate([sensor.weight for sensor in self.sensors])
+
+    @property
+    def n_residuals(self) -> int:
+        """Number R of residuals."""
+        return len(self.kinds)
+
+    @cached_property
+    def point_of(self) -> NDArray[np.intp]:
+        """Index of the point to which each residual of points belongs: they come first."""
+        per_point = [np.full(len(x.points), x.per_point) for x in self.sensors]
+        return np.repeat(np.arange(len(self.points)), np.concatenate(per_point))
+
+    @cached_property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
+        return np.concatenate([sensor.kinds for sensor in self.sensors])
+
+    @property
+    def on_points(self) -> NDArray[np.bool_]:
+        """Which residuals (R,) are of points; the others are of readings."""
+        return np.asarray(self.kinds == "point")
+
+    @property
+    def reactions(self) -> tuple[str, ...]:
+        """Which forces and moments on the fixtures were measured, of `ends.REACTIONS`."""
+        return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.measured)
+
+    def readings_beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """These, measured and as a model says, by their names."""
+        found = (x.beside(seen) for x in self.sensors if isinstance(x, Wrench))
+        return {name: pair for parts in found for name, pair in parts.items()}
+
+    @property
+    def slices(self) -> list[tuple[Sensor, slice, slice]]:
+        """Each sensor of points, which of the points and which of the residuals are its."""
+        out, point, row = [], 0, 0
+        for sensor in self.sensors:
+            count, rows = len(sensor.points), len(sensor.kinds)
+            if count:
+                out.append((sensor, slice(point, point + count), slice(row, row + rows)))
+            point, row = point + count, row + rows
+        return out
+
+    def slow_rows(self, modes: FloatArray) -> FloatArray:
+        """Displacements (K, count) along the cable, in each of the residuals' directions.
+
+        Beside them what the residuals of a sensor share. Of what is measured at no point each
+        residual is a mode of its own.
+        """
+        blocks = [
+            np.hstack([np.kron(modes[points], np.eye(x.per_point)), _scaled(x.together)])
+            for x, points, _ in self.slices
+        ]
+        if others := int((~self.on_points).sum()):
+            blocks.append(np.eye(others))
+        return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
+
+    def _parts(self, per_point: FloatArray) -> list[FloatArray]:
+        """Values of the points (K, ...), sensor by sensor."""
+        return np.split(per_point, np.cumsum([len(x.points) for x in self.sensors])[:-1])
+
+    def places(self, length: float) -> FloatArray:
+        """First guess of the points' arc lengths (K,) [m], without a curve."""
+        return np.concatenate([sensor.places(self.pose, length) for sensor in self.sensors])
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] at which the points are compared with this curve."""
+        parts = zip(self.sensors, self._parts(places), strict=True)
+        return np.concatenate([sensor.located(seen, s) for sensor, s in parts])
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
+        parts = zip(self.sensors, self._parts(places), self._parts(moved), strict=True)
+        return np.concatenate([sensor.components(curve, s, way) for sensor, s, way in parts])
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,)."""
+        parts = zip(self.sensors, self._parts(places), strict=True)
+        return np.concatenate([sensor.residual(seen, s) for sensor, s in parts])
+
+    def linearized(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) and its change (R, q) along directions."""
+        parts = zip(self.sensors, self._parts(places), strict=True)
+        found = [sensor.linearized(seen, s, along) for sensor, s in parts]
+        residual, change = (np.concatenate(part) for part in zip(*found, strict=True))
+        return residual, change
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) with W cov W^T = 1; sensors are independent."""
+        parts = zip(self.sensors, self._parts(places), strict=True)
+        blocks = [sensor.whitening(noise, s) for sensor, s in parts]
+        return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """Arc lengths (K,) [m] at which the points belong on a curve that may be far off."""
+        return np.concatenate([sensor.nearest(curve) for sensor in self.sensors])
+
+    def distances(self, curve: NodeCurve) -> FloatArray:
+        """Distance [m] of each point of the line from where a curve has it.
+
+        Of photographs that show none together: of each pixel, across its line of sight.
+        """
+        if not self.has_line:
+            return self.misses(curve)
+        item = self.traced
+        return np.linalg.norm(item.points - curve.at(item.nearest(curve)), axis=1)
+
+    def misses(self, curve: NodeCurve) -> FloatArray:
+        """Size (K,) [m] of the residuals of each point of a sensor."""
+        seen, places = Observed(curve, np.zeros(0)), self.nearest(curve)
+        rows = [sensor.residual(seen, places[points]) for sensor, points, _ in self.slices]
+        return np.sqrt(np.bincount(self.point_of, np.concatenate(rows) ** 2))
+
+    def misread(self, seen: Observed, noise: NoiseModel) -> FloatArray:
+        """Errors of the readings [m] as `NoiseModel.units` have them; empty without any."""
+        rows = [x.residual(seen, np.zeros(0)) for x in self.sensors if not len(x.points)]
+        kinds = self.kinds[~self.on_points]
+        return np.concatenate([np.zeros(0), *rows]) * noise.units(kinds)
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same pose with other relative standard deviations (K,) of its points."""
+        parts = zip(self.sensors, self._parts(weight), strict=True)
+        return replace(self, sensors=tuple(sensor.weighing(w) for sensor, w in parts))
+
+
+def _scaled(columns: FloatArray) -> FloatArray:
+    """Columns (R, c) whose largest entry is one."""
+    return columns / np.abs(columns).max(axis=0, initial=1e-300)

@@ -1,0 +1,243 @@
+"""A photograph of a cable in space as a sensor: pixels compared across the projected cable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from dlo_casadi.equilibrium.chords import chord_places
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.sensing.noise import NoiseModel
+from dlo_casadi.sensing.sensors import OfPoints
+from dlo_casadi.vision import Sight, Viewpoint, compare_pixels, nearest_in_order
+
+FloatArray = NDArray[np.floating]
+
+_NEWTON_STEPS = 12
+_SETTLED = 1e-5  # of the length: a residual feels half the bend times the square of that
+_PER_ELEMENT = 8
+# Standard deviations of the average along the cable. On rendered photographs pixels are 0.014 px
+# RMS off the true curve, but 0.1 px within two of an end, and 0.03 px within three.
+_REACH = 3.0
+# Times the median: stretches that share an outline are known to 0.2 to 0.4 px, and off by as much.
+_UNSURE = 2.0
+# Sine of the angle between cable and line of sight. In ten rendered poses pixels are off the fitted
+# line's neighbourhood by 0.04 mm RMS below it, by 0.02 mm up to twice it and 0.014 mm above.
+_STEEP = 0.4
+_SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
+
+
+@dataclass(frozen=True)
+class ViewInput:
+    """One of several photographs of a pose in space.
+
+    Parameters
+    ----------
+    name : str
+        File stem.
+    image : Path
+    sight : Sight
+        What is seen in it.
+    places : (K, 3) [m]
+        About where its pixels lie in space; nan for those that are not of the cable.
+    """
+
+    name: str
+    image: Path
+    sight: Sight
+    places: FloatArray
+
+
+@dataclass(frozen=True)
+class Pixels(OfPoints):
+    """Pixels of one photograph, compared with the middle of the outline that a curve would have.
+
+        d_k = c n_k . (u_k - m(r(s_k)))                                      [m]
+
+    with the pixel u, the middle m of the projected outline, its normal n, and c the size of a pixel
+    at the cable's distance: the distance across the line of sight, in the units of other sensors.
+    The places s_k are nearest in the picture; there d does not change to first order with s.
+
+    Where the camera stands is known from the board's markers only so well: its error, a rotation
+    and a shift, moves all pixels of a photograph together and is part of their covariance.
+
+    Parameters
+    ----------
+    viewpoint : Viewpoint
+        Where the camera stands.
+    pixels : (K, 2) [px]
+        As photographed, from start to end.
+    diameter : scalar [m]
+        Of the cable.
+    points : (K, 3) [m]
+        About where they lie.
+    weight : (K,)
+        Relative standard deviations.
+    size : scalar [m/px]
+        Of a pixel at the cable.
+    together : (K, 6) [m]
+        What a standard deviation of each error of the camera's place does to the residuals.
+    grain : scalar [m]
+        Length over which the average along the cable correlates the pixels' errors: what else is
+        correlated, such as by light that changes along the cable, is left to the noise model.
+    on_line : bool
+        Whether the points are of a line in space, and no guess.
+    """
+
+    viewpoint: Viewpoint
+    pixels: FloatArray
+    diameter: float
+    points: FloatArray
+    weight: FloatArray
+    size: float
+    together: FloatArray
+    grain: float = 0.0
+    on_line: bool = False
+
+    marked = False
+    per_point = 1
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """First guess of the pixels' arc lengths (K,) [m]: running chord length, scaled to L."""
+        return chord_places(self.points, pose, length)
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] that are seen nearest to the pixels, near those given."""
+        return self._nearest(seen.curve, places)
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """Arc lengths (K,) [m] at which the pixels belong on a curve that may be far off.
+
+        Those nearest in space; of one photograph alone those nearest in it, in order.
+        """
+        if self.on_line:
+            return self._nearest(curve, curve.nearest(self.points))
+        grid = np.linspace(0.0, curve.length, _PER_ELEMENT * curve.n + 1)
+        seen = self.viewpoint.to_pixels(curve.at(grid))
+        away = np.linalg.norm(self.pixels[:, None] - seen[None], axis=2)
+        found = nearest_in_order(away / (_SURE_PX + np.median(away.min(axis=1))))
+        known = np.flatnonzero(found >= 0)
+        guess = np.interp(np.arange(len(found)), known, grid[found[known]])
+        return self._nearest(curve, guess)
+
+    def _nearest(self, curve: NodeCurve, guess: FloatArray) -> FloatArray:
+        """Gauss-Newton steps on the distance in the picture, within [0, L]."""
+        s, limit = guess.copy(), 0.5 * curve.length / curve.n
+        for _ in range(_NEWTON_STEPS):
+            position, tangent = curve.frame(s, 1)
+            seen, slopes = self.viewpoint.project(position)
+            along = np.einsum("kij,kj->ki", slopes, tangent)
+            ahead = np.sum((self.pixels - seen) * along, axis=1)
+            step = ahead / np.maximum(np.sum(along**2, axis=1), 1e-12)
+            new = np.clip(s + np.clip(step, -limit, limit), 0.0, curve.length)
+            done = np.abs(new - s).max() < _SETTLED * curve.length
+            s = new
+            if done:
+                break
+        return s
+
+    def _compared(self, curve: NodeCurve, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals (K,) [m] and their slopes (K, 3) by the curve's points."""
+        position, tangent = curve.frame(places, 1)
+        tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
+        away, slopes = compare_pixels(self.viewpoint, self.pixels, position, tangent, self.diameter)
+        return self.size * away, self.size * slopes
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """What the residual has of displacements (K, 3, q) [m] of what is measured: (K, q)."""
+        return np.asarray(-np.einsum("kd,kdq->kq", self._compared(curve, places)[1], moved))
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (K,) [m]."""
+        return self._compared(seen.curve, places)[0]
+
+    def linearized(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (K,) [m] and its change (K, q) along directions."""
+        away, slopes = self._compared(seen.curve, places)
+        moved = seen.curve.moved(places, along.curve)
+        return away, np.einsum("kd,kdq->kq", slopes, moved)
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (K, K) [1/m] with W cov W^T = 1, errors of the camera's place among them."""
+        white = noise.whitening(places, self.weight, self.grain)
+        seen = white @ self.together
+        factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
+        return np.asarray(solve_triangular(factor, white, lower=True))
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same pixels with other relative standard deviations."""
+        return replace(self, weight=weight)
+
+
+def pixel_std(views: Sequence[ViewInput]) -> float:
+    """Median standard deviation [m] of the pixels of photographs, at the cable's distance."""
+    return float(np.median(np.concatenate([view.sight.std * _size(view) for view in views])))
+
+
+def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | None:
+    """The sensor of a photograph; None if none of its pixels is of the cable.
+
+    Pixels share their errors with their neighbours over the length of the average along the
+    cable: of those nearer to each other than its integral one is taken. None is taken where the
+    average reaches over an end of the line, into what holds the cable, to where another stretch
+    hides an edge, or to where the cable runs along the line of sight.
+
+    Parameters
+    ----------
+    view : ViewInput
+        With a sight.
+    std : scalar [m]
+        Standard deviation of a pixel of weight one.
+    """
+    sight = view.sight
+    every = max(1, int(np.ceil(sight.correlation / sight.spacing)))
+    steps = np.linalg.norm(np.diff(sight.pixels, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    sure = sight.whole & (sight.std < _UNSURE * np.median(sight.std))
+    sure &= _across(view) > _STEEP
+    foreign = np.concatenate([[0.0], along[~sure], along[-1:]])
+    away = np.abs(along[:, None] - foreign).min(axis=1) > _REACH * sight.correlation / np.sqrt(
+        np.pi
+    )
+    kept = np.flatnonzero(away & sure)[::every]
+    if len(kept) < 2:
+        return None
+    size, pixels, points = _size(view), sight.pixels[kept], view.places[kept]
+    tangent = np.gradient(pixels, axis=0)
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    viewpoint = sight.viewpoint
+    by_shift = np.einsum("ki,kij->kj", normal, viewpoint.project(points)[1])
+    by_shift = by_shift @ viewpoint.rotation.T
+    by_turn = np.cross(viewpoint.in_camera(points), by_shift)
+    error = np.linalg.cholesky(viewpoint.covariance)
+    together = size * np.column_stack([by_turn, by_shift]) @ error
+    weight = sight.std[kept] * size / std
+    # Of an average with a Gaussian, whose errors are correlated over sqrt(2) of its own length.
+    grain = np.sqrt(2.0 / np.pi) * sight.correlation * size
+    return Pixels(viewpoint, pixels, sight.diameter, points, weight, size, together, grain, on_line)
+
+
+def _across(view: ViewInput) -> FloatArray:
+    """Sine (K,) of the angle between cable and line of sight; 0 where no place is known."""
+    places = view.sight.viewpoint.in_camera(view.places)
+    along = np.gradient(places, axis=0)
+    sizes = np.linalg.norm(along, axis=1) * np.linalg.norm(places, axis=1)
+    sine = np.linalg.norm(np.cross(along, places), axis=1) / np.maximum(sizes, 1e-300)
+    return np.asarray(np.nan_to_num(sine))
+
+
+def _size(view: ViewInput) -> float:
+    """Size [m] of a pixel of a photograph at the cable, the median."""
+    viewpoint = view.sight.viewpoint
+    depth = viewpoint.in_camera(view.places)[:, 2]
+    return float(np.nanmedian(depth)) / viewpoint.camera.focal

@@ -1,0 +1,325 @@
+"""Sensors: what is measured of a pose, and how it is compared with what a model says.
+
+A sensor's residual is what was measured minus what the model says of it. Its own unknowns, such
+as the places of points along the cable, follow the curve (`located`); derivatives are those at
+fixed own unknowns.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.equilibrium.chords import chord_places
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.rod.node import Node
+from dlo_casadi.sensing.noise import NoiseModel
+
+FloatArray = NDArray[np.floating]
+
+
+class Sensor(Protocol):
+    """One measurement of one pose: `per_point` residuals of each of its K points, point by point.
+
+    Or of no point at all (K = 0), but of R residuals beside the curve.
+    """
+
+    @property
+    def points(self) -> FloatArray:
+        """As measured (K, d) [m]."""
+        ...
+
+    @property
+    def weight(self) -> FloatArray:
+        """Relative standard deviations (K,) of the points."""
+        ...
+
+    @property
+    def per_point(self) -> int:
+        """Residuals of a point."""
+        ...
+
+    @property
+    def grain(self) -> float:
+        """Length [m] over which points share the errors that are white otherwise."""
+        ...
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
+        ...
+
+    @property
+    def marked(self) -> bool:
+        """Whether the arc lengths of all its points are known."""
+        ...
+
+    @property
+    def together(self) -> FloatArray:
+        """Errors (R, c) that its residuals share, a standard deviation of each."""
+        ...
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """First guess of the points' arc lengths (K,) [m], without a curve."""
+        ...
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] at which the points are compared with this curve."""
+        ...
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
+        ...
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,)."""
+        ...
+
+    def linearized(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) and its change (R, q) along directions."""
+        ...
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) with W cov W^T = 1."""
+        ...
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """Arc lengths (K,) [m] at which the points belong on a curve that may be far off."""
+        ...
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same with other relative standard deviations."""
+        ...
+
+
+class OfPoints(ABC):
+    """What sensors of points have in common."""
+
+    points: FloatArray
+
+    @property
+    def grain(self) -> float:
+        """None: points err by themselves."""
+        return 0.0
+
+    @property
+    @abstractmethod
+    def per_point(self) -> int:
+        """Residuals of a point."""
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: a point."""
+        return np.full(len(self.points) * self.per_point, "point")
+
+
+@dataclass(frozen=True)
+class _Points(OfPoints):
+    """Points in the board's or the world's frame, compared where they are on the curve."""
+
+    points: FloatArray
+    weight: FloatArray
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,) [m]."""
+        gap = self.points - seen.curve.at(places)
+        return self.components(seen.curve, places, gap[..., None])[:, 0]
+
+    def linearized(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) [m] and its change (R, q) along directions."""
+        gap = self.points - seen.curve.at(places)
+        moved = -seen.curve.moved(places, along.curve)
+        both = self.components(seen.curve, places, np.dstack([gap, moved]))
+        return both[:, 0], both[:, 1:]
+
+    @abstractmethod
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
+
+    @property
+    def together(self) -> FloatArray:
+        """None: the errors of points have no common cause."""
+        return np.zeros((len(self.points) * self.per_point, 0))
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) [1/m] with W cov W^T = 1; the errors of a point are independent."""
+        return np.kron(noise.whitening(places, self.weight), np.eye(self.per_point))
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same points with other relative standard deviations."""
+        return replace(self, weight=weight)
+
+
+@dataclass(frozen=True)
+class Centerline(_Points):
+    """Points somewhere along the cable, compared across its tangent: d - 1 residuals each.
+
+    The arc lengths of their closest points on the curve are the sensor's own unknowns. There the
+    normal distance does not change to first order with s, so that derivatives at fixed s are exact.
+
+    Parameters
+    ----------
+    points : (K, d) [m]
+        In order from start to end.
+    weight : (K,)
+        Relative standard deviations.
+    """
+
+    marked = False
+
+    @property
+    def per_point(self) -> int:
+        """Residuals of a point."""
+        return self.points.shape[1] - 1
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L."""
+        return chord_places(self.points, pose, length)
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] of the closest points, near those given."""
+        return seen.curve.feet(self.points, places)
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """Components along the normals, (K (d - 1), q)."""
+        along = np.einsum("knd,kdq->knq", curve.normals(places), moved)
+        return along.reshape((-1, moved.shape[2]))
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """Arc lengths (K,) [m] of the nearest places on the whole curve."""
+        return curve.nearest(self.points)
+
+
+@dataclass(frozen=True)
+class Markers(_Points):
+    """Points at known arc lengths, compared in all directions: d residuals each.
+
+    Where the cable's length is an unknown, the known arc lengths are shares of the declared one.
+
+    Parameters
+    ----------
+    points : (K, d) [m]
+    weight : (K,)
+        Relative standard deviations.
+    s : (K,) [m]
+        Arc lengths from the start, of the declared length.
+    """
+
+    s: FloatArray
+    marked = True
+
+    @property
+    def per_point(self) -> int:
+        """Residuals of a point."""
+        return self.points.shape[1]
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """All components, (K d, q)."""
+        return moved.reshape((-1, moved.shape[2]))
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s
+
+
+@dataclass(frozen=True)
+class Wrench:
+    """Forces and moments on the fixtures, component by component: R residuals [N], [N m].
+
+    Parameters
+    ----------
+    measured : dict
+        Of the cable on whatever holds it, in world axes, moments about the fixture, by their names,
+        of `ends.REACTIONS`: (dimension,) [N], (increment,) [N m].
+    node : type of Node
+    """
+
+    measured: dict[str, FloatArray]
+    node: type[Node]
+    per_point = 0
+    marked = True
+    grain = 0.0
+
+    @property
+    def _rows(self) -> dict[str, slice]:
+        """Where those that were measured stand among the model's readings."""
+        return {name: at for name, at in reaction_rows(self.node).items() if name in self.measured}
+
+    def beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Measured and the model's, by their names."""
+        return {name: (self.measured[name], seen.readings[at]) for name, at in self._rows.items()}
+
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """What each residual (R,) is of: a force or a moment."""
+        return np.concatenate(
+            [np.full(at.stop - at.start, name.split("_")[1]) for name, at in self._rows.items()]
+        )
+
+    @property
+    def points(self) -> FloatArray:
+        """None."""
+        return np.zeros((0, 1))
+
+    @property
+    def weight(self) -> FloatArray:
+        """None."""
+        return np.zeros(0)
+
+    @property
+    def together(self) -> FloatArray:
+        """None: their bias is the session's."""
+        return np.zeros((len(self.kinds), 0))
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """None (0,)."""
+        return np.zeros(0)
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """None (0,)."""
+        return places
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """None (0,)."""
+        return np.zeros(0)
+
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """Zeros (R, q): no point of theirs moves."""
+        return np.zeros((len(self.kinds), moved.shape[2]))
+
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,)."""
+        return np.concatenate([known - model for known, model in self.beside(seen).values()])
+
+    def linearized(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) and its change (R, q) along directions."""
+        change = -np.concatenate([along.readings[at] for at in self._rows.values()])
+        return self.residual(seen, places), change
+
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) with W cov W^T = 1; all components are independent."""
+        return np.diag(noise.units(self.kinds) / noise.std)
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same readings."""
+        return self
