@@ -21,7 +21,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import EDGE, spread_across
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.io.parameters import Parameters, load_parameters
-from dlo_casadi.model.assembly import Given
+from dlo_casadi.model.assembly import Given, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.drawing import prediction_figure
 from dlo_casadi.report.notebook import shape_html, shape_text
@@ -349,7 +349,7 @@ def _curve(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, eq: Equilibrium
 ) -> CableCurve:
     """The curve as the session's camera would measure it."""
-    z = model.assembly.curve(eq.shapes, Given.of(p, rest, pose.vector[None]))[0]
+    z = assembly_of(model).curve(eq.shapes, Given.of(p, rest, pose.vector[None]))[0]
     return CableCurve.of(model.cable.length, z)
 
 

@@ -41,7 +41,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
@@ -105,7 +105,7 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
 def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[Shapes, Given]:
     """One pose, straight and unloaded or without any symmetry."""
     pose = POSE_IN_SPACE if model.in_space else POSE
-    a, scale = model.assembly, 0.0 if headings == "straight" else 1.0
+    a, scale = assembly_of(model), 0.0 if headings == "straight" else 1.0
     shapes = any_shapes(a, scale=1.5 * scale)
     given = Given.of(p, scale * any_rest(a)[0], pose[None])
     # Springs rest at the origin: their unknowns are those of no other model.
@@ -115,7 +115,7 @@ def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[S
 
 def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[str, np.ndarray]:
     """All that the other stages ask for, derivatives by all but the effect's own parameters."""
-    a, (shapes, given) = model.assembly, posed(model, p, headings)
+    a, (shapes, given) = assembly_of(model), posed(model, p, headings)
     total, slope, matrix = a.balance(shapes, given)
     along = directions(a, 1, "x", "lam", "p", "rest", "deviation")
     kept = ~along.p[0, own_indices(model)].any(axis=0)
@@ -165,9 +165,9 @@ def test_gradients_and_hessians_are_finite(name, where, element, headings, value
     p = own_parameters(model, values)
     shapes, given = posed(model, p, headings)
     blocks = outputs(model, p, headings)
-    own = directions(model.assembly, 1, "p")
-    blocks["gradient by p"] = model.assembly.imbalance_by(shapes, given, own).rows
-    blocks["curve by p"] = model.assembly.curve_slopes(shapes, given).along(own)
+    own = directions(assembly_of(model), 1, "p")
+    blocks["gradient by p"] = assembly_of(model).imbalance_by(shapes, given, own).rows
+    blocks["curve by p"] = assembly_of(model).curve_slopes(shapes, given).along(own)
     for what, block in blocks.items():
         assert np.all(np.isfinite(block)), what
 
@@ -200,7 +200,7 @@ def test_every_effect_does_something(name, where, element):
 def test_derivatives_by_parameters_against_finite_differences(name, where, element):
     """Of the balance, the measured curve and the state."""
     model = with_effect(name, where, element)
-    a, (shapes, given) = model.assembly, posed(model, own_parameters(model, "off"))
+    a, (shapes, given) = assembly_of(model), posed(model, own_parameters(model, "off"))
     along = directions(a, 1, "p")
     d = np.array([1e-5 * (q.nominal if q.log else q.scale) for q in model.parameters])
     after = a.state_after(shapes, given)
@@ -251,7 +251,7 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, where, element):
     lam[:, :d] = lam[:, :d] @ turn.T
     there = Shapes.declared(turned_nodes(shapes.x), lam)
     moved = replace(given, poses=pose[None])
-    a, b = model.assembly, turned.assembly
+    a, b = assembly_of(model), assembly_of(turned)
     fall = -CABLE.mass * np.array(gravity) @ shift  # the weight has been moved, too
     # Rounding of a few dozen terms of order one.
     energy = b.energy(there, moved) - fall
@@ -269,7 +269,7 @@ def energies(effects: tuple[Effect, ...], p: list[float], gravity=(0.0, -9.81), 
     """Energy [J] and nodes of a random shape that hangs on these loads alone."""
     model = CableModel(CABLE, n=5, element=element, effects=effects, gravity=gravity)
     where = posed(model, np.array([CABLE.bending_stiffness, *p]))
-    return model.assembly.energy(*where)[0], model.assembly.nodes(*where)[0]
+    return assembly_of(model).energy(*where)[0], assembly_of(model).nodes(*where)[0]
 
 
 # Loads bow quadratic elements at given headings: not for those.
@@ -374,7 +374,7 @@ def test_an_unknown_pull_is_another_force_in_every_pose(element):
     model = CableModel(CABLE, n=5, element=element, effects=(UnknownPull(),))
     shapes, given = posed(model, np.array([0.05, 0.3, 0.1, 0.48]))
     shapes.deviation[0, 4:] = [0.1, -0.8]
-    found = model.assembly.energy(shapes, given)[0]
+    found = assembly_of(model).energy(shapes, given)[0]
     direct, _ = energies((PointForce(),), [0.4, -0.7, 0.48], element=element)
     assert found == pytest.approx(direct, abs=1e-12)
 
@@ -450,8 +450,8 @@ def test_springs_pull_towards_their_heading():
         model = CableModel(CABLE, n=5, effects=(kind(),))
         bare = CableModel(CABLE, n=5)
         shapes, given = posed(model, np.array([0.05, 0.7, -0.4]))
-        with_it = model.assembly.energy(shapes, given)[0]
-        without = bare.assembly.energy(shapes, replace(given, p=given.p[:, :1]))[0]
+        with_it = assembly_of(model).energy(shapes, given)[0]
+        without = assembly_of(bare).energy(shapes, replace(given, p=given.p[:, :1]))[0]
         exact = 0.7 * (shapes.x[0, index, 0] + 0.4) ** 2 / 2
         assert with_it - without == pytest.approx(exact, abs=1e-12)
 

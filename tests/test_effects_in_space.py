@@ -27,7 +27,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 
 FLAT = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
@@ -115,7 +115,7 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
     ]
     planar, spatial = (
         (a.energy(s, g), a.curve(s, g), a.state_after(s, g)[0], a.balance(s, g)[1].rows)
-        for a, s, g in zip((m.assembly for m in models), shapes, given, strict=True)
+        for a, s, g in zip((assembly_of(m) for m in models), shapes, given, strict=True)
     )
     n = models[0].chain.n_cells
     # Rounding of a few dozen terms; forces and moments as far as the planar shape balances.

@@ -21,8 +21,9 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
@@ -93,7 +94,7 @@ def test_section_laws_multiply(element):
     def bending(effects, own) -> np.ndarray:
         """Second derivative of the weightless energy by headings and rest curvature."""
         model = CableModel(CABLE, 6, element, gravity=(0.0, 0.0), effects=effects)
-        a = model.assembly
+        a = assembly_of(model)
         shapes = replace(any_shapes(a), lam=np.zeros((1, a.k)))
         where = given(model, np.array([0.02, *own]), any_rest(a)[0])
         return a.imbalance_by(shapes, where, directions(a, 1, "rest")).x
@@ -114,16 +115,18 @@ def test_dead_load_is_all_that_hangs_on_the_cable(element):
     p = np.array([0.02, 0.1, 0.5, 0.3, -0.4, 0.7, 0.25, 0.2])
     gravity = 9.81 * np.array([np.sin(0.2), -np.cos(0.2)])
     exact = (CABLE.mass + 0.1) * gravity + [0.3, -0.4] + 0.25 * np.array([CABLE.length, 0.0])
-    np.testing.assert_allclose(np.array(model.dead_load(p)).ravel(), exact, rtol=1e-13)
+    np.testing.assert_allclose(
+        np.array(functions_of(model).dead_load(p)).ravel(), exact, rtol=1e-13
+    )
 
 
 @pytest.mark.parametrize("element", ["arc", "link"])
 def test_weight_hangs_on_the_centre_of_gravity(element):
     """V = -m g . (1/L) int r ds, with r(s) from headings by fine sums; arcs bend no other way."""
     heavy, light = (CableModel(CABLE, 5, element, gravity=g) for g in ((2.0, -9.0), (0.0, 0.0)))
-    a = heavy.assembly
+    a = assembly_of(heavy)
     shapes, where = any_shapes(a), given(heavy, heavy.nominal, np.zeros(a.chain.n_cells))
-    energy = [m.assembly.energy(shapes, where)[0] for m in (heavy, light)]
+    energy = [assembly_of(m).energy(shapes, where)[0] for m in (heavy, light)]
     s = (np.arange(20000) + 0.5) * CABLE.length / 20000
     phi = shapes.x[0, :, 0]
     if element == "arc":
@@ -149,7 +152,7 @@ def test_condensed_stretch_equals_the_minimisation_over_axial_strains(element):
     pose = Pose((0.0, 0.0), (1.1, -0.2))
     found = solve_equilibrium(model, p, rest, pose)
     assert found.stable
-    a, where = model.assembly, Given.of(p, rest, pose.vector[None])
+    a, where = assembly_of(model), Given.of(p, rest, pose.vector[None])
     shapes = Shapes.declared(found.x[None], found.multipliers[None])
     # Newton's last step leaves the rounding of terms of order one.
     assert np.abs(a.balance(shapes, where)[1].rows).max() < 1e-11

@@ -13,7 +13,7 @@ from dlo_casadi.equilibrium.initial_frames import same_sign
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 
 LENGTH, EI, GJ = 0.8, 0.02, 0.015
@@ -155,11 +155,11 @@ def test_the_twist_at_which_a_ring_leaves_its_plane():
         # The exact ring is an equilibrium, stable or not: Newton's method stays there.
         shapes = Shapes.declared(x[None], lam)
         for _ in range(6):
-            _, force, matrix = m.assembly.balance(shapes, given)
+            _, force, matrix = assembly_of(m).balance(shapes, given)
             step = matrix.factor().solve(type(force)(-force.x, -force.y))
             moved = m.node.moved(shapes.x, step.x[..., 0])
             shapes = Shapes(moved, shapes.lam + step.y[..., 0], shapes.deviation)
-        _, force, matrix = m.assembly.balance(shapes, given)
+        _, force, matrix = assembly_of(m).balance(shapes, given)
         assert np.abs(force.x).max() < 1e-9
         return least_second_variation(m, matrix)
 
@@ -182,11 +182,11 @@ def test_the_twist_at_which_a_straight_cable_between_clamps_buckles():
         place = Pose((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
         given = Given.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
         free = Shapes.declared(x[None], np.zeros((1, m.n_border)))
-        _, force, matrix = m.assembly.balance(free, given)
+        _, force, matrix = assembly_of(m).balance(free, given)
         # Of the axial force, which the straight cable leaves open, least squares takes none.
         rows = matrix.dense()[0][: force.x.size]
         lam = np.linalg.lstsq(rows[:, force.x.size :], -force.x.ravel(), rcond=None)[0]
-        _, force, matrix = m.assembly.balance(Shapes.declared(x[None], lam[None]), given)
+        _, force, matrix = assembly_of(m).balance(Shapes.declared(x[None], lam[None]), given)
         assert np.abs(force.x).max() < 1e-12
         return least_second_variation(m, matrix)
 
@@ -221,20 +221,20 @@ def test_derivatives_by_increments():
     x = same_sign(Rotation.from_rotvec(0.4 * rng.normal(size=(5, 3)).cumsum(axis=0)).as_quat())
     given = Given.of(m.nominal, curved(m), OUT_OF_PLANE.vector[None])
     shapes = Shapes.declared(x[None], rng.normal(size=(1, m.n_border)))
-    _, force, matrix = m.assembly.balance(shapes, given)
+    _, force, matrix = assembly_of(m).balance(shapes, given)
     d = 1e-5
 
     def moved(node, axis, sign):
         step = np.zeros((1, 5, 3))
         step[0, node, axis] = sign * d
         there = Shapes(m.node.moved(shapes.x, step), shapes.lam, shapes.deviation)
-        return m.assembly.balance(there, given)[0][0]
+        return assembly_of(m).balance(there, given)[0][0]
 
     for node in range(5):
         for axis in range(3):
             slope = (moved(node, axis, 1) - moved(node, axis, -1)) / (2 * d)
             assert slope == pytest.approx(force.x[0, node, axis, 0], abs=1e-7)
-    np.testing.assert_allclose(m.assembly.imbalance(shapes, given).rows, force.rows, atol=1e-12)
+    np.testing.assert_allclose(assembly_of(m).imbalance(shapes, given).rows, force.rows, atol=1e-12)
     dense = matrix.dense()[0]
     np.testing.assert_allclose(dense, dense.T, atol=1e-10)
 
@@ -265,9 +265,9 @@ def test_descents_from_far_away_are_minima():
     given = Given.of(
         m.nominal, np.zeros(m.chain.n_rests), np.repeat(OUT_OF_PLANE.vector[None], 4, axis=0)
     )
-    found = descend(m.assembly, Shapes.declared(x, np.zeros((4, m.n_border))), given)
+    found = descend(assembly_of(m), Shapes.declared(x, np.zeros((4, m.n_border))), given)
     assert found.converged.any()
-    _, force, matrix = m.assembly.balance(found.shapes, given)
+    _, force, matrix = assembly_of(m).balance(found.shapes, given)
     assert np.abs(force.x[found.converged]).max() < 1e-9
     assert np.all(matrix.negative()[found.converged] == m.n_multipliers)
 

@@ -15,7 +15,7 @@ from dlo_casadi.effects import (
     LumpedMass,
     RestCurvatureDrift,
 )
-from dlo_casadi.model.assembly import Given
+from dlo_casadi.model.assembly import Given, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, potential, rest_after
 from dlo_casadi.rod.chain import ELEMENTS
@@ -41,7 +41,7 @@ def model_of(element: str, boundary: tuple[str, str]) -> tuple[CableModel, np.nd
 @BOUNDARIES
 def test_expressions_are_what_the_assembly_says(element, boundary):
     model, p = model_of(element, boundary)
-    a, s = model.assembly, PoseSymbols.of(model)
+    a, s = assembly_of(model), PoseSymbols.of(model)
     shapes, rest = any_shapes(a), any_rest(a)[0]
     given = Given.of(p, rest, ENDS[None])
     arguments = [s.x, s.lam, s.p, s.rest, s.pose, s.deviation]
@@ -75,7 +75,7 @@ def test_minimum_over_what_is_inside_is_the_lagrangian(element, effect, own, hel
     a time: the Lagrangian leaves out their product.
     """
     model = CableModel(CABLE, 4, element, held, held, effects=(effect,))
-    a, problem, p = model.assembly, potential(model), np.array([0.02, *own])
+    a, problem, p = assembly_of(model), potential(model), np.array([0.02, *own])
     shapes, rest = any_shapes(a, scale=0.05), any_rest(a)[0]
     shapes.lam[0, :2] = [-9.0, 0.0]  # N; the cable pulls its end back
     total = problem.energy + ca.dot(ca.DM(shapes.lam[0]), problem.conditions)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.lagrangian import SlotNumbers
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.lagrangian import SlotNumbers, lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
 
 FloatArray = NDArray[np.floating]
@@ -165,7 +166,7 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
     kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
     # A force on a single place pulls at all of a slot, at nothing of it, or it stands in there.
-    shares = np.array([np.array(model.shares(p, place)).ravel() for place in places])
+    shares = np.array([np.array(lagrangian_of(model).shares(p, place)).ravel() for place in places])
     inside = (shares > 0) & (shares < 1)
     alone = np.arange(len(own))[:, None] * inside
     told = (
@@ -206,7 +207,7 @@ def _kernel(
         ca.vertcat(*values[1:]),
         place,
         ca.SX.zeros(len(model.deviation_names)),
-        model.shares(p, ca.DM(first) if inline else place),
+        lagrangian_of(model).shares(p, ca.DM(first) if inline else place),
     )
     derivatives = _in_space if model.in_space else _in_plane
     return Kernel(members, own[:, varies], partial(derivatives, model, numbers, row))
@@ -218,7 +219,9 @@ def _in_plane(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Functio
     position = ca.SX.zeros(0) if model.end == "free" else lam
     multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
     arguments = [x, multipliers, numbers.p, numbers.rest, numbers.place, numbers.deviation]
-    both: Any = model.slot_by_share(*arguments, numbers.shares)  # CasADi's stubs: one result
+    both: Any = functions_of(model).slot_by_share(
+        *arguments, numbers.shares
+    )  # CasADi's stubs: one result
     value, advance = both
     if model.end == "free":
         # lam is zero there; its derivative is the way from slot to slot all the same.
@@ -251,7 +254,7 @@ def _told_in_space(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SlotNumbers
         Hessian by first-first, first-last, last-last, first-lam, last-lam, lam-lam: rows one after
         another (9,), of symmetric blocks the upper triangle column by column (6,).
     """
-    found = model.in_frame(x, lam, numbers).derivatives()
+    found = lagrangian_of(model).in_frame(x, lam, numbers).derivatives()
     found = found.about(found.turn, found.turn)
     (first, between, last), (first_lam, last_lam) = found.bends, found.mixed
     return [
@@ -282,7 +285,9 @@ def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
     x, lam = ca.SX.sym("x", 2 * node.coordinates), ca.SX.zeros(model.n_conditions)
     pose = np.zeros(model.n_pose)
     pose[2 * node.dimension : EndConditions.size(node)] = 2 * node.identity
-    value, _, _ = model.at_ends(x, lam, p, pose, ca.DM.zeros(len(model.deviation_names)))
+    value, _, _ = functions_of(model).at_ends(
+        x, lam, p, pose, ca.DM.zeros(len(model.deviation_names))
+    )
     if not ca.depends_on(value, x):
         return None
     return _derivatives(value, [x, _symbols(p)], x)

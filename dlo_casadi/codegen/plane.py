@@ -14,6 +14,8 @@ from dlo_casadi.codegen.kernels import (
 )
 from dlo_casadi.equilibrium.guesses import resting_headings
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.lagrangian import lagrangian_of
 
 FloatArray = NDArray[np.floating]
 
@@ -44,23 +46,30 @@ TEXTS = {
 def _extra(model: CableModel, p: FloatArray) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
-    offsets, length = model.held(p, 0, 0)
+    offsets, length = lagrangian_of(model).held(p, 0, 0)
     compliance = clamp_compliances(model, p)
     hold = [1 / c if c > 0 else 0.0 for c in compliance]
-    dead_load, turns = np.array(model.dead_load(p)).ravel(), np.array(offsets).ravel()[2:]
+    dead_load, turns = (
+        np.array(functions_of(model).dead_load(p)).ravel(),
+        np.array(offsets).ravel()[2:],
+    )
     return [float(length), down, *dead_load, *turns, *hold]
 
 
 def clamp_compliances(model: CableModel, p: FloatArray) -> list[float]:
     """Turn of the start and end clamp per moment on it [rad/(N m)]."""
-    found = zip(model.compliant, np.array(model.compliances(p)).ravel(), strict=True)
+    found = zip(
+        lagrangian_of(model).compliant,
+        np.array(lagrangian_of(model).compliances(p)).ravel(),
+        strict=True,
+    )
     named = {model.condition_names[k]: float(c) for k, c in found}
     return [named.get(f"{side}_heading", 0.0) for side in ("start", "end")]
 
 
 def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray, kernels: Kernels) -> list[float]:
     """The solver's table: numbers of the kernels, nodes, widths of the cells, rest, the others."""
-    stretch = float(model.held(p, 0, 0)[1]) / model.cable.length
+    stretch = float(lagrangian_of(model).held(p, 0, 0)[1]) / model.cable.length
     return [
         *kernels.table,
         *(model.chain.places / model.cable.length),
@@ -90,7 +99,7 @@ def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> 
     return {
         "N_HEADINGS": str(count),
         "HEADINGS_ARE": chain.kind.nodes_are,
-        "LENGTH": c_number(float(model.held(p, 0, 0)[1])),
+        "LENGTH": c_number(float(lagrangian_of(model).held(p, 0, 0)[1])),
         "WORKSPACE": str(_ARRAYS * (count + 1)),
         "ELEMENTS": str(chain.n_slots),
         "FIRST": str(chain.layout.advancing[0]),

@@ -20,6 +20,8 @@ from dlo_casadi.codegen.kernels import (
 )
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.lagrangian import lagrangian_of
 
 FloatArray = NDArray[np.floating]
 
@@ -71,7 +73,7 @@ def _clamps(model: CableModel, p: FloatArray) -> FloatArray:
     """Frames (8,) of the true clamps in the declared ones, and the end's offset ahead (3,)."""
 
     def held(ends: FloatArray) -> FloatArray:
-        return np.array(model.held(p, ends, 0)[0]).ravel()
+        return np.array(lagrangian_of(model).held(p, ends, 0)[0]).ravel()
 
     still = np.concatenate([np.zeros(6), model.node.identity, model.node.identity])
     found = held(still)
@@ -92,14 +94,14 @@ def _clamps(model: CableModel, p: FloatArray) -> FloatArray:
 
 def _extra(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
-    length = float(model.held(p, 0, 0)[1])
+    length = float(lagrangian_of(model).held(p, 0, 0)[1])
     widths = np.diff(model.chain.cells, axis=1).ravel()
     bends = model.chain.curvatures(rest) * widths
     return [
         length,
         length / model.n,
         *model.gravity,
-        *np.array(model.dead_load(p)).ravel(),
+        *np.array(functions_of(model).dead_load(p)).ravel(),
         *_clamps(model, p),
         *bends.T.ravel(),
     ]
@@ -139,7 +141,7 @@ def _most_steps(model: CableModel) -> int:
 def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> dict[str, str]:
     """What the marks of the templates stand for."""
     meshes, count = meshes_of(model, p, rest, inline), coarse_elements(model)
-    if meshes["kernel"].ends is not None or model.compliant:
+    if meshes["kernel"].ends is not None or lagrangian_of(model).compliant:
         raise DloError(
             "no solver can be generated for a cable in space whose ends are held by springs, or by "
             "clamps that give way\n"
@@ -158,7 +160,7 @@ def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> 
         at += len(kernels.table)
     numbers = numbers_of(model, p, rest, meshes)
     return {
-        "LENGTH": c_number(float(model.held(p, 0, 0)[1])),
+        "LENGTH": c_number(float(lagrangian_of(model).held(p, 0, 0)[1])),
         "WORKSPACE": str(_NUMBERS * (model.n + 1) + 4 * _COARSE_SHAPES * (count + 1)),
         "COARSE": str(count),
         "REACHES": str(int(not model.extensible)),

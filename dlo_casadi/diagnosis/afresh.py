@@ -27,8 +27,7 @@ from dlo_casadi.estimation.starting_points import FIRST_LOOK, MORE
 from dlo_casadi.estimation.transfer import with_border_of
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.composition import END_ROLL
+from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.rest_curvature import RestScatter
 
 FloatArray = NDArray[np.floating]

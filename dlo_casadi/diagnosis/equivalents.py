@@ -9,7 +9,7 @@ import numpy as np
 from dlo_casadi.diagnosis.candidates import Candidate, setup_of
 from dlo_casadi.effects import EFFECTS, Fitted, Load
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.thresholds import ALIKE
 
 

@@ -21,7 +21,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import student_95
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.runtime.executors import InProcess
 
 # Weights that are tried in turn, over the cable's own: until one does not fit.

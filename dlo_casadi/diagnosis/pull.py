@@ -17,8 +17,7 @@ from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.starting_points import DECADES, starting_points
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import NORMAL_95

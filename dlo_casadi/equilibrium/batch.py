@@ -18,7 +18,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.descent import descend
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Assembly, CurveSlopes, Directions, Given, Shapes
+from dlo_casadi.model.assembly import Assembly, CurveSlopes, Directions, Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 
@@ -71,7 +71,7 @@ class Sweep:
         self.model = model
         self.poses = tuple(poses)
         self.m = len(self.poses)
-        self.assembly = model.assembly
+        self.assembly = assembly_of(model)
         self.node = self.assembly.node
         self._ends = np.array([pose.vector for pose in self.poses])
         self.used_deviations = [model.deviation_names.index(name) for name in model.deviations]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.pose import SIGNS, Branch
-from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
 
@@ -152,7 +152,7 @@ def equilibria_of(
     bound_multipliers : (m, n_nodes - 1) [N m], optional
         Zero if they are not given.
     """
-    assembly, chain = model.assembly, model.chain
+    assembly, chain = assembly_of(model), model.chain
     total, force, _ = assembly.balance(shapes, given)
     energies = total - assembly.work(shapes, force)
     residuals = np.abs(force.y[..., 0]).max(axis=1, initial=0.0)

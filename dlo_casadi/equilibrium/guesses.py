@@ -9,6 +9,7 @@ from dlo_casadi.equilibrium.initial_arcs import arc_headings, arc_into_clamps, l
 from dlo_casadi.equilibrium.initial_frames import guessed_frames_of
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import Chain
 
 FloatArray = NDArray[np.floating]
@@ -61,7 +62,7 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
     rest : (n_rests,) [1/m]
     """
     chain = model.chain
-    ends, length = model.held(p, pose.ends, 0)
+    ends, length = lagrangian_of(model).held(p, pose.ends, 0)
     start, end, headings = np.array(ends).reshape(3, 2)
     u, chord = chain.places / chain.length, (end - start) / float(length)
     held = tuple(side == "clamped" for side in (model.start, model.end))
@@ -104,7 +105,7 @@ def guessed_frames(
     the one the other way round. With a free end: the rest shape, the cable fallen down, and
     straight on.
     """
-    ends, length = model.held(p, pose.ends, 0)
+    ends, length = lagrangian_of(model).held(p, pose.ends, 0)
     values = np.array(ends).ravel()
     start, end, first, last = np.split(values, [3, 6, 10])
     held = tuple(side == "clamped" for side in (model.start, model.end))

@@ -23,7 +23,7 @@ from dlo_casadi.equilibrium.equilibrium import (
     equilibria_of,
 )
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -200,7 +200,7 @@ def _bordered(
     given: Given,
 ) -> tuple[Vector, BandMatrix]:
     """Imbalance and tangent with the joints that are held as further conditions."""
-    _, force, matrix = model.assembly.balance(shapes, given)
+    _, force, matrix = assembly_of(model).balance(shapes, given)
     arms = np.zeros((1, model.chain.n_nodes, 1, len(held)))
     arms[0, held, 0, np.arange(len(held))] = -1.0
     arms[0, held + 1, 0, np.arange(len(held))] = 1.0

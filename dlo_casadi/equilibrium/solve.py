@@ -21,9 +21,9 @@ from dlo_casadi.equilibrium.guesses import first_nodes
 from dlo_casadi.equilibrium.ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import SIGNS, Pose
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model.assembly import Given, Shapes
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.composition import COARSE_MESH
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.cable_model import COARSE_MESH, CableModel
+from dlo_casadi.model.lagrangian import lagrangian_of
 
 FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.intp]
@@ -50,7 +50,7 @@ def check_pose(model: CableModel, p: FloatArray, pose: Pose) -> None:
         )
     if pose.end is None or model.extensible:
         return
-    ends, true_length = model.held(p, pose.ends, 0)
+    ends, true_length = lagrangian_of(model).held(p, pose.ends, 0)
     start, end = np.array(ends).ravel()[: 2 * model.node.dimension].reshape(2, -1)
     distance, length = float(np.linalg.norm(end - start)), float(true_length)
     if distance >= length:
@@ -240,7 +240,7 @@ def _descended(
 ) -> list[list[Equilibrium]]:
     """Equilibria of each pose to which the energy descends from shapes, `of` which pose each."""
     given = Given.of(p, rest, np.array([poses[j].vector for j in of]))
-    minima = descend(model.assembly, shapes, given)
+    minima = descend(assembly_of(model), shapes, given)
     inside = np.ones(len(of), dtype=bool)
     if not model.in_space:
         inside = np.abs(np.diff(minima.shapes.x[..., 0], axis=1)).max(axis=1) < JOINT_BOUND
@@ -278,8 +278,10 @@ def _likely(
     own = np.concatenate(means)
     of, shapes = _first(coarse, p, own, poses, [None] * len(poses))
     given = Given.of(p, own, np.array([poses[j].vector for j in of]))
-    found = descend(coarse.assembly, shapes, given)
-    twists = _twists(coarse, coarse.assembly.strain(found.shapes, given)[:, : coarse.chain.n_cells])
+    found = descend(assembly_of(coarse), shapes, given)
+    twists = _twists(
+        coarse, assembly_of(coarse).strain(found.shapes, given)[:, : coarse.chain.n_cells]
+    )
     held = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
     kept: list[int] = []
     for j in range(len(poses)):

@@ -32,7 +32,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after
 
 FloatArray = NDArray[np.floating]

@@ -27,6 +27,7 @@ from dlo_casadi.equilibrium.spread import modes_in
 from dlo_casadi.estimation.linearization import Linearization, Normal, Point, Values
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Directions, Shapes
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.rest_curvature import MODES, RestScatter
 from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.band import Vector
@@ -122,8 +123,8 @@ class BatchProblem:
     def observed_size(self) -> int:
         """Numbers that residuals depend on: those of a measured curve, and of readings."""
         model = self.unknowns.model
-        curve = (model.chain.n + 1) * int(model.station.size1_out(0))
-        return curve + int(model.readings.size1_out(0))
+        curve = (model.chain.n + 1) * int(functions_of(model).station.size1_out(0))
+        return curve + int(functions_of(model).readings.size1_out(0))
 
     def whitening(self, j: int) -> FloatArray:
         """Whitening matrix (R_j, R_j) of pose j, as of the last `refresh`."""

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.model.rest_curvature import RestCurvature
 
 FloatArray = NDArray[np.floating]
@@ -100,4 +101,4 @@ def law_of(model: CableModel, p: FloatArray, bend: FloatArray) -> FloatArray:
 
     Laws that depend on the place count with the middle of the cable.
     """
-    return np.array([float(model.section_moment(value, p)) for value in bend])
+    return np.array([float(lagrangian_of(model).section_moment(value, p)) for value in bend])

@@ -16,9 +16,8 @@ from dlo_casadi.equilibrium.pose import SIGNS, Pose, PoseBranch
 from dlo_casadi.equilibrium.solve import continued, solve_equilibria
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.model.assembly import Given, Shapes
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.composition import END_ROLL
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.thresholds import EITHER
 
@@ -139,7 +138,7 @@ def predict_poses(
         last = pose, found.equilibrium.x
         if model.has_state:
             held = Given.of(p, rest, pose.vector[None])
-            rest = model.assembly.state_after(found.equilibrium.shapes, held)[0][0]
+            rest = assembly_of(model).state_after(found.equilibrium.shapes, held)[0][0]
     return out
 
 
@@ -156,7 +155,7 @@ def _seen(
     x, lam = zip(*((eq.x, eq.multipliers) for eq in equilibria), strict=True)
     shapes = Shapes.declared(np.array(x), np.array(lam))
     given = Given.of(p, rest, np.array([pose.vector for pose in poses]))
-    length, assembly = model.cable.length, model.assembly
+    length, assembly = model.cable.length, assembly_of(model)
     curves, readings = assembly.curve(shapes, given), assembly.readings(shapes, given)
     return [
         Prediction(eq, Observed(NodeCurve.of(length, z), shown), rest)

@@ -12,7 +12,7 @@ from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.composition import BENDING_STIFFNESS, STIFFNESSES
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES
 from dlo_casadi.thresholds import IDENTIFIABLE, SYSTEMATIC_SHARE
 
 FloatArray = NDArray[np.floating]

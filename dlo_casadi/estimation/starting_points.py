@@ -17,7 +17,7 @@ from dlo_casadi.estimation.start import (
     measured_shapes,
     turned_either_way,
 )
-from dlo_casadi.model.composition import END_ROLL, STIFFNESSES
+from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES
 
 FloatArray = NDArray[np.floating]
 

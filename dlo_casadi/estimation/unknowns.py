@@ -8,8 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.composition import STIFFNESS_RATIO_STD, STIFFNESSES
+from dlo_casadi.model.cable_model import STIFFNESS_RATIO_STD, STIFFNESSES, CableModel
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]

@@ -8,18 +8,19 @@ the derivatives of both and of the measured curve.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame, Heading
-
-if TYPE_CHECKING:
-    from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -159,7 +160,7 @@ class Assembly:
 
     def _mapped(self, name: str, count: int) -> _Mapped:
         if name not in self._functions:
-            self._functions[name] = _Mapped(getattr(self.model, name), count)
+            self._functions[name] = _Mapped(getattr(functions_of(self.model), name), count)
         return self._functions[name]
 
     def _call_slots(self, name: str, shapes: Shapes, given: Given) -> list[FloatArray]:
@@ -342,6 +343,12 @@ class Assembly:
         moved = (by_x[:, :, None] @ np.tile(both, (1, strains, 1, 1)))[:, :, 0]
         moved += (by_rest[:, :, None] @ np.tile(own, (1, strains, 1, 1)))[:, :, 0]
         return np.asarray(moved + by_p @ p)
+
+
+@lru_cache(maxsize=MODELS)
+def assembly_of(model: CableModel) -> Assembly:
+    """A model's functions evaluated for many poses, made once."""
+    return Assembly(model)
 
 
 @dataclass(frozen=True)

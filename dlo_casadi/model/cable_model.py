@@ -1,25 +1,52 @@
-"""CableModel: a chain and its effects, composed slot by slot into one Lagrangian.
-
-Every stage differentiates the same expressions, see `lagrangian`: all that a slot, an end or a
-node adds is one CasADi function each, mapped over the cable, see `assembly`.
-"""
+"""CableModel: a cable, its mesh, its boundaries and its effects, and what follows by counting."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal, Self
 
-import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from dlo_casadi.effects import Load, MeasurementEffect, StateEffect
-from dlo_casadi.model.assembly import Assembly
-from dlo_casadi.model.lagrangian import Lagrangian, SlotNumbers
-from dlo_casadi.rod.element import Slot
-from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.rod.in_frame import SlotDerivatives, SlotInFrame
+from dlo_casadi.effects import Cable, Effect, Kinematics, Load, StateEffect
+from dlo_casadi.effects.parameter import STIFFNESS_BOUNDS, Parameter
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.rest_curvature import RestCurvature
+from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
+from dlo_casadi.rod.ends import EndConditions, deviation_names
+from dlo_casadi.rod.node import Node
+
+StartKind = Literal["pinned", "clamped"]
+EndKind = Literal["pinned", "clamped", "free"]
+FloatArray = NDArray[np.floating]
+
+BENDING_STIFFNESS = "bending_stiffness"
+# ln(1000): a prior of the stiffness may be off by three decades.
+STIFFNESS_PRIOR_STD = float(np.log(1e3))
+# ln(3): GJ over EI is 1 / (1 + nu) in a solid round rod; strands and jackets make it less or more.
+STIFFNESS_RATIO_STD = float(np.log(3.0))
+# Nobody knows how a cable's own twist was gripped: tolerances.roll by default [rad].
+ROLL_STD = 1.0
+TORSIONAL_STIFFNESS = "torsional_stiffness"
+STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
+# Elements of `CableModel.coarse`.
+COARSE_MESH = 10
+# Roll of the end clamp about the cable against what is declared [rad]: rest twist, see design.
+END_ROLL = "end_roll"
+# Numbers that tell where the camera of a pose stood, see `Pose.vector`.
+SIGHT_SIZE = 3
 
 
-class CableModel(Lagrangian):
+def _stiffness(name: str, nominal: float) -> Parameter:
+    lower, upper = STIFFNESS_BOUNDS
+    std = STIFFNESS_PRIOR_STD
+    return Parameter(name, "N m^2", nominal, lower=lower, upper=upper, prior_std=std, log=True)
+
+
+@dataclass(frozen=True)
+class CableModel:
     """An elastic cable between two fixtures, in a plane or in space.
 
     Parameters
@@ -46,336 +73,214 @@ class CableModel(Lagrangian):
     Immutable: `model.with_effect(effect)` returns another model.
     """
 
-    @property
-    def _slot_arguments(self) -> list[ca.SX]:
-        x, _ = self._nodes
-        return [x, self._lam, self._p, self._rest, self._place, self._deviation]
+    cable: Cable
+    n: int = 40
+    element: str = DEFAULT_ELEMENT
+    start: StartKind = "pinned"
+    end: EndKind = "pinned"
+    gravity: tuple[float, ...] = (0.0, -9.81)
+    effects: tuple[Effect, ...] = ()
+    n_rest: int = 9
+    priors: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        if len(self.gravity) != len(self.cable.axes):
+            raise DloError(
+                f"gravity has {len(self.gravity)} numbers, but the cable "
+                f"{'has no' if len(self.gravity) == 3 else 'has a'} torsional stiffness: in space "
+                "give both, in a plane neither"
+            )
+        labels = [effect.label for effect in self.effects]
+        for effect in self.effects:
+            if labels.count(effect.label) > 1:
+                raise DloError(
+                    f"two effects are both labelled {effect.label!r}; give one another label, "
+                    f"e.g. {type(effect).__name__}(label='{effect.label}_2')"
+                )
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The chain of n elements."""
+        held = (self.start == "clamped", self.end == "clamped")
+        return Chain(self.cable.length, self.n, self.element, *held, in_space=self.in_space)
 
     @property
-    def _end_arguments(self) -> list[ca.SX]:
-        x, _ = self._nodes
-        return [x, self._lam, self._p, self._pose, self._deviation]
+    def in_space(self) -> bool:
+        """Whether the cable may leave the plane."""
+        return len(self.gravity) == 3
 
-    def _here(
-        self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
-    ) -> ca.Function:
-        """A function at increments of zero, its outputs dense.
+    @property
+    def node(self) -> type[Node]:
+        """What the nodes carry."""
+        return self.chain.kind.node
 
-        What is evaluated often is worth the search for common subexpressions: it takes away a
-        fifth of the operations, and of many effects' derivatives longer than the evaluation.
+    @property
+    def n_pose(self) -> int:
+        """Numbers that declare one pose, see `pose.Pose.vector`."""
+        return EndConditions.size(self.node) + SIGHT_SIZE
+
+    @property
+    def deviation_names(self) -> tuple[str, ...]:
+        """What may be different in every pose."""
+        return deviation_names(self.node)
+
+    @cached_property
+    def rest(self) -> RestCurvature:
+        """Basis of the rest curvature."""
+        return RestCurvature(self.cable.length, 0 if self.cable.straight else self.n_rest)
+
+    @cached_property
+    def rest_basis(self) -> FloatArray:
+        """Rest curvature per coefficient (n_rests, n_coefficients): kappa_0 = rest_basis @ c.
+
+        In space the coefficients about the axis z follow those about y; the rest twist is none.
         """
-        local, step = self._local
-        _, delta = self._nodes
-        symbols = [step, delta, local]
-        values = [ca.SX.zeros(step.shape), ca.SX.zeros(delta.shape), self._local_of_nodes]
-        found = ca.substitute(outputs, symbols, values)
-        found = ca.cse(found) if often else found
-        return ca.Function(name, arguments, [ca.densify(one) for one in found])
+        means, strains = self.rest.cell_means(self.chain.cells), len(self.node.strains)
+        return np.kron(np.eye(strains)[:, -len(self.node.curvatures) :], means)
 
     @property
-    def _by_slot(self) -> ca.SX:
-        """What the Lagrangian of a slot is differentiated by: local increments, multipliers."""
-        return ca.vertcat(self._local[1], self._lam)
+    def roughness(self) -> FloatArray:
+        """Second differences of the rest coefficients, about each axis."""
+        return np.kron(np.eye(len(self.node.curvatures)), self.rest.roughness)
 
     @property
-    def _by_ends(self) -> ca.SX:
-        """What that of the ends is differentiated by: increments of the nodes, multipliers."""
-        return ca.vertcat(self._nodes[1], self._lam)
+    def n_coefficients(self) -> int:
+        """Number of rest coefficients."""
+        return self.rest.n_coefficients * len(self.node.curvatures)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Stiffnesses, in space the roll of the end, then the effects' with qualified names."""
+        listed = [_stiffness(BENDING_STIFFNESS, self.cable.bending_stiffness)]
+        if self.cable.torsional_stiffness is not None:
+            torsion = _stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness)
+            # Known by its ratio to the bending stiffness, see `Unknowns.prior_precision`.
+            listed.append(torsion.with_prior(np.inf))
+            if self.start == self.end == "clamped":
+                std = self.priors.get(END_ROLL, ROLL_STD)
+                listed.append(
+                    Parameter(END_ROLL, "rad", scale=0.1, lower=-9.0, upper=9.0, prior_std=std)
+                )
+        for effect in self.effects:
+            for parameter in effect.parameters(self.cable):
+                name = f"{effect.label}.{parameter.name}"
+                std = self.priors.get(name, parameter.prior_std)
+                listed.append(replace(parameter, name=name, prior_std=std))
+        return tuple(listed)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Qualified names of the parameters, in the order of the vector `p`."""
+        return tuple(parameter.name for parameter in self.parameters)
 
     @property
-    def _to_local(self) -> ca.SX:
-        """Derivative of local increments and multipliers by the nodes' and multipliers."""
-        return ca.diagcat(self._local_slope, ca.SX.eye(self.n_border))
+    def stiffness_indices(self) -> list[int]:
+        """Where the stiffnesses stand in the vector `p`, bending first."""
+        return [k for k, name in enumerate(self.names) if name in STIFFNESSES]
 
     @cached_property
-    def slot(self) -> ca.Function:
-        """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
-        if self.in_space:
-            found, spread = self._about_nodes, self._of_pulls
-            outputs = [found.value, spread @ found.gradient, spread @ found.hessian @ spread.T]
-            return self._here("slot", self._slot_arguments, outputs)
-        value = self._terms.lagrangian
-        hessian, gradient = ca.hessian(value, self._by_slot)
-        return self._here("slot", self._slot_arguments, [value, gradient, hessian])
+    def nominal(self) -> FloatArray:
+        """Parameter vector `p` at the nominal values."""
+        return np.array([parameter.nominal for parameter in self.parameters])
 
-    @cached_property
-    def slot_slope(self) -> ca.Function:
-        """As `slot` -> its gradient alone, for a small part of the operations."""
-        if self.in_space:
-            gradient = self._of_pulls @ self._about_nodes.gradient
-        else:
-            gradient = ca.gradient(self._terms.lagrangian, self._by_slot)
-        return self._here("slot_slope", self._slot_arguments, [gradient])
+    def with_effect(self, effect: Effect, priors: dict[str, float] | None = None) -> Self:
+        """Return this model with one more effect."""
+        return replace(
+            self, effects=(*self.effects, effect), priors={**self.priors, **(priors or {})}
+        )
 
-    @cached_property
-    def slot_by_share(self) -> ca.Function:
-        """(x, lam, p, rest, place, deviation, shares) -> L_e and advance: see `shares`."""
-        terms = self._terms_by_share
-        arguments = [*self._slot_arguments, self._shares]
-        return self._here("slot_by_share", arguments, [terms.lagrangian, terms.advance])
+    def without_effect(self, label: str) -> Self:
+        """Return this model without the effect of that label."""
+        kept = tuple(effect for effect in self.effects if effect.label != label)
+        priors = {k: v for k, v in self.priors.items() if not k.startswith(f"{label}.")}
+        return replace(self, effects=kept, priors=priors)
+
+    def with_mesh(self, n: int, element: str | None = None) -> Self:
+        """Return the same model on another mesh."""
+        return replace(self, n=n, element=element or self.element)
+
+    @property
+    def extensible(self) -> bool:
+        """Whether some effect lets the cable stretch under tension."""
+        return any(item.extensible for item in self.effects if isinstance(item, Kinematics))
+
+    @property
+    def yields(self) -> bool:
+        """Whether the end moves with the force on it while the nodes stay."""
+        return self.extensible or self.chain.kind.n_inner > 0
 
     @property
     def n_inner(self) -> int:
-        """Number of unknowns of a slot in `slot_potential` beside its nodes."""
+        """Number of unknowns inside a slot beside its nodes: axial strain, and the element's."""
         return int(self.extensible) + self.chain.kind.n_inner
-
-    @cached_property
-    def slot_potential(self) -> ca.Function:
-        """(x, lam, p, rest, place, deviation, inner) -> energy [J] to minimise, and conditions.
-
-        The slot's share (n_border,) of the conditions on places is the slope by the multipliers.
-        The unknowns inside are, for an extensible cable, a_e with the axial strain sqrt(C) a_e and
-        the energy h a_e^2 / 2, and the element's own.
-        """
-        kind, unknowns = self.chain.kind, ca.SX.sym("unknowns", self.n_inner)
-        ratio, axial = self._stretch, ca.SX(0)
-        if self.extensible:
-            axial = unknowns[0]
-            ratio = ratio + ca.sqrt(self._compliance) * axial
-        inner = ca.SX.sym("inner", kind.n_inner)
-        slot = self._slot(ratio, inner, inner**2)
-        energy = kind.expanded(slot, self._slot_energy(slot), self._bending_energy)
-        energy += self.chain.h * axial**2 / 2
-        own = ca.reshape(unknowns[self.n_inner - kind.n_inner :], inner.shape)
-        reached = ca.gradient(self._pull(slot), self._lam)
-        outputs = ca.substitute([energy, reached], [inner], [own])
-        arguments = [*self._slot_arguments, unknowns]
-        return self._here("slot_potential", arguments, self._with_shares(outputs))
-
-    @cached_property
-    def _framed(self) -> SlotInFrame:
-        """The slot in space, at this model's own symbols."""
-        starts = [] if self.end == "free" else [0]
-        starts += [self.n_conditions + 6 * k + 3 for k in range(self.n_springs)]
-        pulls = [self._lam[k : k + 3] for k in starts]
-        if self.end == "free":
-            pulls = [ca.SX.zeros(3), *pulls]
-        shares = ca.SX(self.shares(self._p, self._place))
-        numbers = SlotNumbers(self._p, self._rest, self._place, self._deviation, shares)
-        return self.in_frame(self._nodes[0], ca.horzcat(*pulls), numbers)
-
-    @cached_property
-    def _about_nodes(self) -> SlotDerivatives:
-        """Derivatives by rotations about the nodes' own axes."""
-        framed = self._framed
-        return framed.derivatives().about(*framed.node_turns)
-
-    @property
-    def _of_pulls(self) -> ca.DM:
-        """Matrix from both nodes and the pulls to both nodes and all multipliers."""
-        rows = np.zeros((2 * self.node.increment + self.n_border, 6 + 3 * (1 + self.n_springs)))
-        rows[:6, :6] = np.eye(6)
-        if self.end != "free":
-            rows[6:9, 6:9] = np.eye(3)
-        for k in range(self.n_springs):
-            at = 6 + self.n_conditions + 6 * k + 3
-            rows[at : at + 3, 9 + 3 * k : 12 + 3 * k] = np.eye(3)
-        return ca.sparsify(ca.DM(rows))
-
-    @cached_property
-    def at_ends(self) -> ca.Function:
-        """(x, lam, p, pose, deviation) of the first and last node -> as `slot`."""
-        hessian, gradient = ca.hessian(self._at_ends, self._by_ends)
-        return self._here("at_ends", self._end_arguments, [self._at_ends, gradient, hessian])
-
-    @cached_property
-    def slot_sensitivity(self) -> ca.Function:
-        """As `slot` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
-        by = ca.vertcat(self._p, self._rest, self._deviation)
-        if self.in_space:
-            first, last, pulled = self._framed.by_numbers(by)
-            turns = self._framed.node_turns
-            mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
-        else:
-            mixed = ca.jacobian(ca.gradient(self._terms.lagrangian, self._by_slot), by)
-        return self._here("slot_sensitivity", self._slot_arguments, [mixed], often=False)
-
-    @cached_property
-    def end_sensitivity(self) -> ca.Function:
-        """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
-        by = ca.vertcat(self._p, self._deviation)
-        mixed = ca.jacobian(ca.gradient(self._at_ends, self._by_ends), by)
-        return self._here("end_sensitivity", self._end_arguments, [mixed])
-
-    @cached_property
-    def _advanced(self) -> ca.SX:
-        """True advance of a slot and its `_rates`."""
-        return ca.vertcat(self._terms.advance, self._rates)
-
-    @cached_property
-    def _rates(self) -> ca.SX:
-        """Length ratio of a slot and, in a plane, its turning d phi / ds [1/m]."""
-        if self.in_space:  # no map of the measurement depends on the frame there
-            return self._terms.ratio
-        turning = self._stretch * self.chain.kind.strain(self._plain)
-        return ca.vertcat(self._terms.ratio, turning)
-
-    @cached_property
-    def slot_curve(self) -> ca.Function:
-        """As `slot` -> advance [m], length ratio and, in a plane, turning [1/m]."""
-        return self._here("slot_curve", self._slot_arguments, [self._advanced])
-
-    @cached_property
-    def slot_curve_slopes(self) -> ca.Function:
-        """As `slot` -> the same, derivatives by increments and lam, and by p, rest, deviation."""
-        others = ca.vertcat(self._p, self._rest, self._deviation)
-        if self.in_space:
-            # The advance is the Lagrangian's derivative by the force on the end's holder.
-            found, spread = self._about_nodes, self._of_pulls
-            by_nodes = (spread @ found.hessian)[:, 6:9].T
-            advance = [by_nodes, self._framed.by_numbers(others)[2][:3, :]]
-            stretched = self._terms.ratio
-            by_nodes = ca.jacobian(stretched, self._by_slot) @ self._to_local
-            ratio = [by_nodes, ca.jacobian(stretched, others)]
-            blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
-        else:
-            blocks = [ca.jacobian(self._advanced, by) for by in (self._by_slot, others)]
-        outputs = [self._advanced, *blocks]
-        return self._here("slot_curve_slopes", self._slot_arguments, outputs, often=False)
-
-    @cached_property
-    def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
-        """Arguments, place (and slope) in the measurement of one station, and what moves it."""
-        kind = self.chain.kind
-        x, delta = self._nodes
-        point, rates = (
-            ca.SX.sym("point", self.node.dimension),
-            ca.SX.sym("rates", self._rates.numel()),
-        )
-        before, after = (
-            self.node.retract(own, step)
-            for own, step in zip(
-                ca.vertsplit(x, x.numel() // 2),
-                ca.vertsplit(delta, delta.numel() // 2),
-                strict=True,
-            )
-        )
-        frame = ca.SX.sym("frame", self.node.coordinates)
-        slope = rates[0] * self.node.tangent(frame)
-        image = point
-        maps = self._filling(MeasurementEffect)
-        for effect, local in maps:
-            image = effect.observe(image, frame, self._sight, local)
-        rows = image
-        if kind.smooth:
-            slope = ca.jtimes(image, point, slope) if maps else slope
-            for turning in ca.vertsplit(rates)[1:]:
-                slope += ca.jtimes(image, frame, turning)
-            rows = ca.vertcat(image, slope)
-        rows = ca.substitute(rows, frame, self.node.middle(before, after))
-        arguments = [point, rates, x, self._p, self._pose]
-        return arguments, rows, ca.vertcat(point, rates, delta)
-
-    @cached_property
-    def station(self) -> ca.Function:
-        """(point, rates, x, p, ends) of an element boundary -> its image: place, slope dr/ds."""
-        arguments, rows, _ = self._seen
-        return self._here("station", arguments, [rows])
-
-    @cached_property
-    def station_slopes(self) -> ca.Function:
-        """As `station` -> the same, derivatives by (point, rates, increments) and by p."""
-        arguments, rows, moving = self._seen
-        blocks = [ca.jacobian(rows, symbols) for symbols in (moving, self._p)]
-        return self._here("station_slopes", arguments, [rows, *blocks])
-
-    @cached_property
-    def slot_strain(self) -> ca.Function:
-        """As `slot` -> mean strains of the cell [1/m]."""
-        return self._here("strain", self._slot_arguments, [self.chain.kind.strain(self._plain)])
-
-    @property
-    def _plain(self) -> Slot:
-        """The slot without its inner unknowns."""
-        return self._slot(self._stretch, ca.SX.zeros(self.chain.kind.n_inner), ca.SX(0))
 
     @property
     def has_state(self) -> bool:
         """Whether a pose changes the rest curvature of the next one."""
         return any(isinstance(effect, StateEffect) for effect in self.effects)
 
-    @cached_property
-    def slot_state(self) -> ca.Function:
-        """As `slot` -> rest strains of the cell after it; by increments, rest and p."""
-        own = self._rest[::3]
-        strain, mean = self.chain.kind.strain(self._plain), own
-        for effect, local in self._filling(StateEffect):
-            mean = effect.next_rest(mean, strain, self.cable, local)
-        rest = ca.SX.sym("mean", own.numel())
-        mean = ca.substitute(mean, own, rest)
-        slopes = [ca.jacobian(mean, symbols) for symbols in (self._local[1], rest, self._p)]
-        slopes[0] = slopes[0] @ self._local_slope
-        mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
-        return self._here("slot_state", self._slot_arguments, [mean, *slopes])
-
-    @cached_property
-    def _reactions(self) -> ca.SX:
-        """Forces [N] and moments [N m] of the cable on its fixtures, see `ends.REACTIONS`.
-
-        Forces are minus the slope of the Lagrangian by the ends' places, nodes and multipliers
-        kept. Moments, about the world's axes, are the slope by turns of the first and last node of
-        what the holders add to it: multipliers of clamps, springs of pins.
-        """
-        node, (x, delta) = self.node, self._nodes
-        places = -ca.gradient(self._at_ends, self._pose)[: 2 * node.dimension]
-        turns = ca.gradient(self._at_ends, delta)
-        places, turns = ca.substitute([places, turns], [delta], [ca.SX.zeros(delta.shape)])
-        pairs = zip(
-            ca.vertsplit(places, node.dimension),
-            ca.vertsplit(x, node.coordinates),
-            ca.vertsplit(turns, node.increment),
-            strict=True,
-        )
-        here = [row for force, own, turn in pairs for row in (force, node.in_world(own, turn))]
-        moved = [
-            node.retract(own, step)
-            for own, step in zip(
-                ca.vertsplit(x, node.coordinates),
-                ca.vertsplit(delta, node.increment),
-                strict=True,
-            )
-        ]
-        return ca.substitute([ca.vertcat(*here)], [x], [ca.vertcat(*moved)])[0]
-
-    @cached_property
-    def reactions(self) -> ca.Function:
-        """As `at_ends` -> `ends.REACTIONS` in one column [N, N m]."""
-        return self._here("reactions", self._end_arguments, [self._reactions])
-
-    @cached_property
-    def _readings(self) -> ca.SX:
-        """The same as sensors show them."""
-        rows, of = self._reactions, reaction_rows(self.node)
-        for effect, local in self._filling(MeasurementEffect):
-            parts = effect.feel({name: rows[at] for name, at in of.items()}, local)
-            rows = ca.vertcat(*(parts[name] for name in of))
-        return rows
-
-    @cached_property
-    def readings(self) -> ca.Function:
-        """As `reactions`, as sensors show them."""
-        return self._here("readings", self._end_arguments, [self._readings])
-
-    @cached_property
-    def reading_slopes(self) -> ca.Function:
-        """As `readings` -> derivatives by increments and multipliers, by p, and by deviation."""
-        by = (self._by_ends, self._p, self._deviation)
-        slopes = [ca.jacobian(self._readings, one) for one in by]
-        return self._here("reading_slopes", self._end_arguments, slopes)
-
     @property
     def shape_dependent_loads(self) -> tuple[str, ...]:
         """Names of effects whose forces depend on the shape."""
-        return tuple(effect.name for effect, _ in self._filling(Load) if not effect.dead)
+        loads = [effect for effect in self.effects if isinstance(effect, Load)]
+        return tuple(load.name for load in loads if not load.dead)
+
+    @property
+    def coarse(self) -> Self:
+        """The same model on a coarse mesh."""
+        return self.with_mesh(COARSE_MESH)
 
     @cached_property
-    def dead_load(self) -> ca.Function:
-        """P -> sum of the dead loads (dimension,) [N], without those of single poses."""
-        still = ca.SX.zeros(len(self.deviation_names))
-        load = ca.substitute(self._total_load, self._deviation, still)
-        return ca.Function("dead_load", [self._p], [ca.densify(load)])
+    def n_conditions(self) -> int:
+        """Number of end conditions."""
+        return len(self.condition_names)
+
+    @property
+    def n_springs(self) -> int:
+        """Number of springs from places of the cable."""
+        return sum(effect.n_springs for effect in self.effects if isinstance(effect, Load))
+
+    @property
+    def n_border(self) -> int:
+        """Number of unknowns of the whole pose: `border_names`."""
+        return len(self.border_names)
 
     @cached_property
-    def assembly(self) -> Assembly:
-        """These functions evaluated for many poses."""
-        return Assembly(self)
+    def border_names(self) -> tuple[str, ...]:
+        """Names of the unknowns beside the nodes: end conditions' multipliers, then springs'.
+
+        A spring's place y [m] is an unknown of its own, held on the cable by its pull [N]: so that
+        no node knows more than its neighbours, see `SpringAt`.
+        """
+        own = [f"{what}_{axis}" for what in ("place", "pull") for axis in self.node.axes]
+        springs = [f"spring_{k}.{name}" for k in range(self.n_springs) for name in own]
+        return (*self.condition_names, *springs)
+
+    @property
+    def n_multipliers(self) -> int:
+        """How many of the border are multipliers: negative eigenvalues of a minimum's tangent."""
+        return self.n_conditions + self.node.dimension * self.n_springs
+
+    @cached_property
+    def are_multipliers(self) -> NDArray[np.bool_]:
+        """Which of the border's unknowns are multipliers (n_border,); the others are places."""
+        return np.array([".place_" not in name for name in self.border_names], dtype=bool)
+
+    @cached_property
+    def condition_names(self) -> tuple[str, ...]:
+        """Names of the end conditions: end position, then frames of clamps."""
+        axes, turns = self.node.axes, self.node.turns
+        names = [] if self.end == "free" else [f"end_position_{axis}" for axis in axes]
+        names += [f"start_{turn}" for turn in turns] if self.start == "clamped" else []
+        names += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
+        return tuple(names)
+
+    @cached_property
+    def deviations(self) -> tuple[str, ...]:
+        """Which deviations of a pose can matter for these boundaries."""
+        axes, turns = self.node.axes, self.node.turns
+        used = [] if self.end == "free" else [f"end_{axis}" for axis in axes]
+        used += [f"start_{turn}" for turn in turns] if self.start == "clamped" else []
+        used += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
+        used += [name for effect in self.effects for name in effect.per_pose(self.cable)]
+        return tuple(used)

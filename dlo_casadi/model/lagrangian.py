@@ -9,7 +9,7 @@ equilibrium is a stationary point.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -25,16 +25,19 @@ from dlo_casadi.effects import (
     Sight,
     SpringAt,
 )
-from dlo_casadi.model.composition import (
+from dlo_casadi.model.cable_model import (
     BENDING_STIFFNESS,
     END_ROLL,
     SIGHT_SIZE,
     TORSIONAL_STIFFNESS,
-    Composition,
+    CableModel,
 )
 from dlo_casadi.rod.element import Cell, Slot, Stiffness
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import Forces, SlotInFrame
+
+# Models whose expressions and functions are kept: a diagnosis compares some thirty at a time.
+MODELS = 64
 
 
 @dataclass(frozen=True)
@@ -76,114 +79,131 @@ class SlotNumbers:
     shares: ca.SX
 
 
-class Lagrangian(Composition):
-    """The expressions of a model, in symbols of its own."""
+class Lagrangian:
+    """The expressions of a model, in symbols of their own.
 
-    def _filling(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
+    Parameters
+    ----------
+    model : CableModel
+    """
+
+    def __init__(self, model: CableModel) -> None:
+        self.model = model
+
+    def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
         """Effects of one slot of the model with their own parameters."""
         picked = []
-        for effect in self.effects:
+        for effect in self.model.effects:
             if isinstance(effect, base):
                 local = {
-                    parameter.name: self._p[self.names.index(f"{effect.label}.{parameter.name}")]
-                    for parameter in effect.parameters(self.cable)
+                    parameter.name: self.p[
+                        self.model.names.index(f"{effect.label}.{parameter.name}")
+                    ]
+                    for parameter in effect.parameters(self.model.cable)
                 }
-                for name in effect.per_pose(self.cable):
-                    local[name] = self._deviation[self.deviation_names.index(name)]
+                for name in effect.per_pose(self.model.cable):
+                    local[name] = self.deviation[self.model.deviation_names.index(name)]
                 picked.append((effect, local))
         return picked
 
     # ---- symbols -----------------------------------------------------------------------------
 
     @cached_property
-    def _p(self) -> ca.SX:
-        return ca.SX.sym("p", len(self.parameters))
+    def p(self) -> ca.SX:
+        """Parameters, in the order of `model.names`."""
+        return ca.SX.sym("p", len(self.model.parameters))
 
     @cached_property
-    def _pose(self) -> ca.SX:
+    def pose(self) -> ca.SX:
         """What is declared of one pose, see `pose.Pose.vector`."""
-        return ca.SX.sym("pose", self.n_pose)
+        return ca.SX.sym("pose", self.model.n_pose)
 
     @property
-    def _ends(self) -> ca.SX:
+    def declared_ends(self) -> ca.SX:
         """The ends as declared, see `EndConditions.vector`."""
-        return self._pose[:-SIGHT_SIZE]
+        return self.pose[:-SIGHT_SIZE]
 
     @property
-    def _sight(self) -> Sight:
-        start = EndConditions.of(self._ends, self.node).start
-        return Sight(start, self._pose[-3:-1], self._pose[-1])
+    def sight(self) -> Sight:
+        """From where the points of a pose are measured."""
+        start = EndConditions.of(self.declared_ends, self.model.node).start
+        return Sight(start, self.pose[-3:-1], self.pose[-1])
 
     @cached_property
-    def _deviation(self) -> ca.SX:
+    def deviation(self) -> ca.SX:
         """Deviation of one pose from its declared ends: `deviation_names`."""
-        return ca.SX.sym("deviation", len(self.deviation_names))
+        return ca.SX.sym("deviation", len(self.model.deviation_names))
 
     @cached_property
-    def _lam(self) -> ca.SX:
+    def lam(self) -> ca.SX:
         """Border: multipliers of the end conditions, then place and pull of each spring."""
-        return ca.SX.sym("lam", self.n_border)
+        return ca.SX.sym("lam", self.model.n_border)
 
     @cached_property
-    def _nodes(self) -> tuple[ca.SX, ca.SX]:
+    def nodes(self) -> tuple[ca.SX, ca.SX]:
         """Coordinates of the two nodes of a slot, and their increments."""
-        node = self.chain.kind.node
+        node = self.model.chain.kind.node
         return ca.SX.sym("x", 2 * node.coordinates), ca.SX.sym("delta", 2 * node.increment)
 
     @cached_property
-    def _local(self) -> tuple[ca.SX, ca.SX]:
+    def local(self) -> tuple[ca.SX, ca.SX]:
         """Local coordinates of a slot, and their increments: see `Element.local`."""
-        return ca.SX.sym("local", self._local_of_nodes.numel()), ca.SX.sym(
-            "step", 2 * self.node.increment
+        return ca.SX.sym("local", self.local_of_nodes.numel()), ca.SX.sym(
+            "step", 2 * self.model.node.increment
         )
 
     @property
-    def _local_of_nodes(self) -> ca.SX:
-        return self.chain.kind.local(*ca.vertsplit(self._nodes[0], self.node.coordinates))
+    def local_of_nodes(self) -> ca.SX:
+        """Local coordinates of a slot, of its nodes."""
+        return self.model.chain.kind.local(
+            *ca.vertsplit(self.nodes[0], self.model.node.coordinates)
+        )
 
     @cached_property
-    def _local_slope(self) -> ca.SX:
+    def local_slope(self) -> ca.SX:
         """Derivative (2b, 2b) of the local increments by the nodes'."""
-        kind, (x, delta) = self.chain.kind, self._nodes
+        kind, (x, delta) = self.model.chain.kind, self.nodes
         pairs = zip(
-            ca.vertsplit(x, self.node.coordinates),
-            ca.vertsplit(delta, self.node.increment),
+            ca.vertsplit(x, self.model.node.coordinates),
+            ca.vertsplit(delta, self.model.node.increment),
             strict=True,
         )
-        moved = kind.local(*(self.node.retract(own, step) for own, step in pairs))
-        slope = ca.jacobian(kind.local_gap(self._local_of_nodes, moved), delta)
+        moved = kind.local(*(self.model.node.retract(own, step) for own, step in pairs))
+        slope = ca.jacobian(kind.local_gap(self.local_of_nodes, moved), delta)
         return ca.substitute(slope, delta, ca.SX.zeros(delta.shape))
 
     @cached_property
-    def _rest(self) -> ca.SX:
+    def rest_strains(self) -> ca.SX:
         """Rest strains inside a slot, see `Chain.rest_stencils`."""
-        return ca.SX.sym("rest", 3 * len(self.node.strains))
+        return ca.SX.sym("rest", 3 * len(self.model.node.strains))
 
     @cached_property
-    def _place(self) -> ca.SX:
+    def place(self) -> ca.SX:
         """A row of `Layout.slots`."""
-        return ca.SX.sym("place", self.chain.layout.slots.shape[1])
+        return ca.SX.sym("place", self.model.chain.layout.slots.shape[1])
 
-    def _spring_unknowns(self, k: int) -> tuple[ca.SX, ca.SX]:
+    def spring_unknowns(self, k: int) -> tuple[ca.SX, ca.SX]:
         """Place and pull of a spring."""
-        d = self.node.dimension
-        own = self._lam[self.n_conditions + 2 * d * k : self.n_conditions + 2 * d * (k + 1)]
+        d = self.model.node.dimension
+        own = self.lam[
+            self.model.n_conditions + 2 * d * k : self.model.n_conditions + 2 * d * (k + 1)
+        ]
         return own[:d], own[d:]
 
     # ---- mechanics ---------------------------------------------------------------------------
 
     @cached_property
-    def _held(self) -> EndConditions:
+    def true_ends(self) -> EndConditions:
         """Where the ends really are: declared, deviation of the pose, boundary effects."""
-        d, b = self.node.dimension, self.node.increment
-        place, first, last, _ = ca.vertsplit(self._deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
-        declared = EndConditions.of(self._ends, self.node)
+        d, b = self.model.node.dimension, self.model.node.increment
+        place, first, last, _ = ca.vertsplit(self.deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
+        declared = EndConditions.of(self.declared_ends, self.model.node)
         ends = declared.changed(end=declared.end + place).turned(first, last)
-        for effect, local in self._filling(BoundaryEffect):
+        for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)
-        if END_ROLL in self.names:
+        if END_ROLL in self.model.names:
             # The material axes of an untwisted cable at the end, against the clamp's.
-            ends = ends.rolled(self._p[self.names.index(END_ROLL)])
+            ends = ends.rolled(self.p[self.model.names.index(END_ROLL)])
         return ends
 
     @cached_property
@@ -192,105 +212,104 @@ class Lagrangian(Composition):
 
         The ends as `EndConditions.vector`, declared and true.
         """
-        length = self.cable.length * self._stretch
-        arguments = [self._p, self._ends, self._deviation]
-        return ca.Function("held", arguments, [self._held.vector, length])
+        length = self.model.cable.length * self.stretch
+        arguments = [self.p, self.declared_ends, self.deviation]
+        return ca.Function("held", arguments, [self.true_ends.vector, length])
 
     @cached_property
-    def _stretch(self) -> ca.SX:
+    def stretch(self) -> ca.SX:
+        """True length without load over the declared one."""
         factor = ca.SX(1)
-        for effect, local in self._filling(Kinematics):
-            factor = factor * effect.stretch(self.cable, local)
+        for effect, local in self.effects_of(Kinematics):
+            factor = factor * effect.stretch(self.model.cable, local)
         return factor
 
     @cached_property
-    def _compliance(self) -> ca.SX:
+    def axial_compliance(self) -> ca.SX:
+        """Axial strain per tension [1/N]."""
         return sum(
-            (effect.compliance(local) for effect, local in self._filling(Kinematics)),
+            (effect.compliance(local) for effect, local in self.effects_of(Kinematics)),
             start=ca.SX(0),
         )
 
-    @property
-    def extensible(self) -> bool:
-        """Whether some effect lets the cable stretch under tension."""
-        return any(effect.extensible for effect, _ in self._filling(Kinematics))
-
-    @property
-    def yields(self) -> bool:
-        """Whether the end moves with the force on it while the nodes stay."""
-        return self.extensible or self.chain.kind.n_inner > 0
-
     @cached_property
-    def _gravity(self) -> ca.SX:
+    def felt_gravity(self) -> ca.SX:
         """Gravity [m/s^2] as every weight feels it."""
-        gravity = ca.SX(ca.DM(self.gravity))
-        for effect, local in self._filling(Load):
+        gravity = ca.SX(ca.DM(self.model.gravity))
+        for effect, local in self.effects_of(Load):
             gravity = effect.gravity(gravity, local)
         return gravity
 
-    def _resultant(self, s: ca.SX | float) -> ca.SX:
+    def resultant(self, s: ca.SX | float) -> ca.SX:
         """Force [N] of all that is spread along the cable on its part beyond s."""
-        weight = self.cable.mass / self.cable.length * self._gravity
-        total = weight * (self.cable.length - s)
-        for effect, local in self._filling(Load):
-            total += effect.resultant(ca.SX(s), self._gravity, self.cable, local)
+        weight = self.model.cable.mass / self.model.cable.length * self.felt_gravity
+        total = weight * (self.model.cable.length - s)
+        for effect, local in self.effects_of(Load):
+            total += effect.resultant(ca.SX(s), self.felt_gravity, self.model.cable, local)
         return total
 
     @cached_property
-    def _forces(self) -> list[PointForceAt]:
+    def dead_forces(self) -> list[PointForceAt]:
         """Dead forces on single places of the cable."""
         return [
             force
-            for effect, local in self._filling(Load)
-            for force in effect.forces(self._gravity, local)
+            for effect, local in self.effects_of(Load)
+            for force in effect.forces(self.felt_gravity, local)
         ]
 
     @cached_property
-    def _springs(self) -> list[SpringAt]:
+    def springs(self) -> list[SpringAt]:
         """Springs from places of the cable."""
-        return [spring for effect, local in self._filling(Load) for spring in effect.springs(local)]
+        return [
+            spring for effect, local in self.effects_of(Load) for spring in effect.springs(local)
+        ]
 
     @cached_property
-    def _total_load(self) -> ca.SX:
+    def total_load(self) -> ca.SX:
         """Sum of all dead loads [N]."""
-        return sum((force.force for force in self._forces), start=self._resultant(0.0))
+        return sum((force.force for force in self.dead_forces), start=self.resultant(0.0))
 
-    def _slot(self, ratio: ca.SX, inner: ca.SX, square: ca.SX) -> Slot:
+    def slot(self, ratio: ca.SX, inner: ca.SX, square: ca.SX) -> Slot:
         """The slot's symbols; numbers that all slots share are written in."""
-        kind, table = self.chain.kind, self.chain.layout.slots
+        kind, table = self.model.chain.kind, self.model.chain.layout.slots
         place = ca.vertcat(
             *(
-                ca.SX(column[0]) if np.all(column == column[0]) else self._place[i]
+                ca.SX(column[0]) if np.all(column == column[0]) else self.place[i]
                 for i, column in enumerate(table.T)
             )
         )
         return Slot(
-            local=kind.local_moved(*self._local),
-            rest=self._rest,
+            local=kind.local_moved(*self.local),
+            rest=self.rest_strains,
             place=place,
-            mesh=self.chain.h,
-            stretch=self._stretch,
+            mesh=self.model.chain.h,
+            stretch=self.stretch,
             ratio=ratio,
             inner=inner,
             square=square,
         )
 
-    def _bending_energy(self, slot: Slot) -> ca.SX:
-        laws = [_Law(effect, self.cable, local) for effect, local in self._filling(SectionLaw)]
-        return self.chain.kind.bending(slot, self._stiffness, laws)
+    def bending_energy(self, slot: Slot) -> ca.SX:
+        """Energy of bending and twist of a slot [J]."""
+        laws = [
+            _Law(effect, self.model.cable, local) for effect, local in self.effects_of(SectionLaw)
+        ]
+        return self.model.chain.kind.bending(slot, self.stiffness, laws)
 
     @property
-    def _bending_stiffness(self) -> ca.SX:
-        return self._p[self.names.index(BENDING_STIFFNESS)]
+    def bending_stiffness(self) -> ca.SX:
+        """EI [N m^2], section laws aside."""
+        return self.p[self.model.names.index(BENDING_STIFFNESS)]
 
     @property
-    def _stiffness(self) -> Stiffness:
-        if not self.in_space:
-            return Stiffness(self._bending_stiffness, ca.SX(0))
-        bending = self._bending_stiffness * ca.SX.eye(2)
-        for effect, local in self._filling(SectionLaw):
+    def stiffness(self) -> Stiffness:
+        """Stiffness of the section about its axes."""
+        if not self.model.in_space:
+            return Stiffness(self.bending_stiffness, ca.SX(0))
+        bending = self.bending_stiffness * ca.SX.eye(2)
+        for effect, local in self.effects_of(SectionLaw):
             bending = effect.bending(bending, local)
-        return Stiffness(bending, self._p[self.names.index(TORSIONAL_STIFFNESS)])
+        return Stiffness(bending, self.p[self.model.names.index(TORSIONAL_STIFFNESS)])
 
     @cached_property
     def section_moment(self) -> ca.Function:
@@ -298,22 +317,22 @@ class Lagrangian(Composition):
 
         M = dW/dk of the energy W = EI/2 k^2 factor(k) per length.
         """
-        bend, length = ca.SX.sym("bend"), self.cable.length
+        bend, length = ca.SX.sym("bend"), self.model.cable.length
         cell = Cell(ca.SX(0.499 * length), ca.SX(0.002 * length), 0.002 * length)
-        energy = self._bending_stiffness / 2 * bend**2
-        for effect, local in self._filling(SectionLaw):
-            energy *= effect.factor(bend, cell, self.cable, local)
-        return ca.Function("section_moment", [bend, self._p], [ca.gradient(energy, bend)])
+        energy = self.bending_stiffness / 2 * bend**2
+        for effect, local in self.effects_of(SectionLaw):
+            energy *= effect.factor(bend, cell, self.model.cable, local)
+        return ca.Function("section_moment", [bend, self.p], [ca.gradient(energy, bend)])
 
-    def _slot_energy(self, slot: Slot) -> ca.SX:
+    def slot_energy(self, slot: Slot) -> ca.SX:
         """Energy of bending and loads of one slot [J]: of the loads, minus their work along it."""
-        return self._bending_energy(slot) - self._work(slot, self._slot_forces(slot))
+        return self.bending_energy(slot) - self.work_along(slot, self.forces_on(slot))
 
-    def _work(self, slot: Slot, forces: list[ca.SX]) -> ca.SX:
+    def work_along(self, slot: Slot, forces: list[ca.SX]) -> ca.SX:
         """Work of `_slot_forces` along a slot [J]."""
-        kind = self.chain.kind
+        kind = self.model.chain.kind
         nodes, weights = kind.rule
-        shares = ca.vertsplit(self._shares)
+        shares = ca.vertsplit(self.share_symbols)
         work = ca.SX(0)
         for force, u, weight in zip(forces, nodes, weights, strict=False):
             work += weight * slot.length * ca.dot(force, kind.tangent(slot, u))
@@ -321,73 +340,78 @@ class Lagrangian(Composition):
             work += ca.dot(force, kind.advance(slot, share))
         return work
 
-    def _slot_forces(self, slot: Slot) -> list[ca.SX]:
+    def forces_on(self, slot: Slot) -> list[ca.SX]:
         """Dead forces [N] that a slot carries: at the points of its rule, then those on places."""
-        nodes, _ = self.chain.kind.rule
-        spread = [self._resultant(slot.start + u * slot.length) for u in nodes]
-        return [*spread, *(force.force for force in self._forces)]
+        nodes, _ = self.model.chain.kind.rule
+        spread = [self.resultant(slot.start + u * slot.length) for u in nodes]
+        return [*spread, *(force.force for force in self.dead_forces)]
 
     @cached_property
-    def _shares(self) -> ca.SX:
+    def share_symbols(self) -> ca.SX:
         """Shares of a slot up to the places of the forces, then of the springs, 0 to 1."""
-        return ca.SX.sym("share", len(self._forces) + self.n_springs)
+        return ca.SX.sym("share", len(self.dead_forces) + self.model.n_springs)
 
     @cached_property
     def shares(self) -> ca.Function:
         """(p, place) -> the shares of a slot (n_forces + n_springs,)."""
-        start = self._place[0]
-        positions = [local.position for local in self._forces]
-        positions += [local.position for local in self._springs]
-        found = [ca.fmin(ca.fmax((s - start) / self.chain.h, 0), 1) for s in positions]
-        return ca.Function("shares", [self._p, self._place], [ca.vertcat(ca.SX.zeros(0), *found)])
+        start = self.place[0]
+        positions = [local.position for local in self.dead_forces]
+        positions += [local.position for local in self.springs]
+        found = [ca.fmin(ca.fmax((s - start) / self.model.chain.h, 0), 1) for s in positions]
+        return ca.Function("shares", [self.p, self.place], [ca.vertcat(ca.SX.zeros(0), *found)])
 
-    def _with_shares(self, expressions: list[ca.SX]) -> list[ca.SX]:
-        return ca.substitute(expressions, [self._shares], [self.shares(self._p, self._place)])
+    def with_shares(self, expressions: list[ca.SX]) -> list[ca.SX]:
+        """Expressions with the shares in place of their symbols."""
+        return ca.substitute(expressions, [self.share_symbols], [self.shares(self.p, self.place)])
 
-    def _pull(self, slot: Slot) -> ca.SX:
+    def work_of_multipliers(self, slot: Slot) -> ca.SX:
         """Work of the multipliers of places, the end's and the springs', along a slot [J]."""
-        kind = self.chain.kind
+        kind = self.model.chain.kind
         work = ca.SX(0)
-        if self.end != "free":
-            work = ca.dot(self._lam[: self.node.dimension], kind.advance(slot))
-        shares = ca.vertsplit(self._shares)[len(self._forces) :] if self.n_springs else []
+        if self.model.end != "free":
+            work = ca.dot(self.lam[: self.model.node.dimension], kind.advance(slot))
+        shares = (
+            ca.vertsplit(self.share_symbols)[len(self.dead_forces) :]
+            if self.model.n_springs
+            else []
+        )
         for k, share in enumerate(shares):
-            work += ca.dot(self._spring_unknowns(k)[1], kind.advance(slot, share))
+            work += ca.dot(self.spring_unknowns(k)[1], kind.advance(slot, share))
         return work
 
     @cached_property
-    def _terms(self) -> _SlotTerms:
+    def slot_terms(self) -> _SlotTerms:
         """A slot's Lagrangian and curve."""
-        terms = self._terms_by_share
-        return _SlotTerms(*self._with_shares([terms.lagrangian, terms.advance, terms.ratio]))
+        terms = self.slot_terms_by_share
+        return _SlotTerms(*self.with_shares([terms.lagrangian, terms.advance, terms.ratio]))
 
     @cached_property
-    def _terms_by_share(self) -> _SlotTerms:
+    def slot_terms_by_share(self) -> _SlotTerms:
         """A slot's Lagrangian, and its curve, stretched by the tension and bowed.
 
             L_e = V_e + lam^T advance_e - h C N_e^2 / 2,   N_e = -(1/h) dL_e/d(ratio)
 
         which is exact for dead loads; the inner unknowns are eliminated.
         """
-        kind, h = self.chain.kind, self.chain.h
+        kind, h = self.model.chain.kind, self.model.chain.h
         ratio, inner = ca.SX.sym("ratio"), ca.SX.sym("inner", kind.n_inner)
-        slot = self._slot(ratio, inner, inner**2)
-        plain = self._slot_energy(slot) + self._pull(slot)
+        slot = self.slot(ratio, inner, inner**2)
+        plain = self.slot_energy(slot) + self.work_of_multipliers(slot)
 
         def rigid(expression: ca.SX) -> ca.SX:
-            return ca.substitute(expression, ratio, self._stretch)
+            return ca.substitute(expression, ratio, self.stretch)
 
-        condensed = kind.condensed(slot, rigid(plain), self._bending_energy)
-        lagrangian, stretched = condensed.lagrangian, self._stretch
-        if self.extensible:
+        condensed = kind.condensed(slot, rigid(plain), self.bending_energy)
+        lagrangian, stretched = condensed.lagrangian, self.stretch
+        if self.model.extensible:
             (tension,) = ca.substitute(
                 [-ca.gradient(plain, ratio) / h],
                 [ratio, inner],
-                [self._stretch, ca.SX.zeros(inner.shape)],
+                [self.stretch, ca.SX.zeros(inner.shape)],
             )
-            lagrangian -= self._compliance * h * tension**2 / 2
-            stretched = self._stretch + self._compliance * tension
-        true = self._slot(stretched, condensed.inner, condensed.square)
+            lagrangian -= self.axial_compliance * h * tension**2 / 2
+            stretched = self.stretch + self.axial_compliance * tension
+        true = self.slot(stretched, condensed.inner, condensed.square)
         # The curve whose end the Lagrangian's derivative by the multipliers holds.
         return _SlotTerms(lagrangian, kind.advance(true), stretched)
 
@@ -402,26 +426,26 @@ class Lagrangian(Composition):
             Force on the end's holder, then the springs' pulls.
         numbers : SlotNumbers
         """
-        spread, dead = len(self.chain.kind.rule[0]), len(self._forces)
-        weights = np.zeros((spread + dead + self.n_springs, pulls.shape[1]))
+        spread, dead = len(self.model.chain.kind.rule[0]), len(self.dead_forces)
+        weights = np.zeros((spread + dead + self.model.n_springs, pulls.shape[1]))
         weights[:spread, 0] = -1.0
-        weights[spread + dead :, 1:] = -np.eye(self.n_springs)
+        weights[spread + dead :, 1:] = -np.eye(self.model.n_springs)
         loads = self.slot_forces(numbers.p, numbers.place, numbers.deviation)
         own = numbers.p, numbers.rest, numbers.place, numbers.deviation, numbers.shares
 
         def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
-            local = ca.vertcat(ca.DM(self.node.identity), phi)
+            local = ca.vertcat(ca.DM(self.model.node.identity), phi)
             return ca.SX(self.slot_in_frame(local, inner, forces, *own))
 
         total = ca.SX(loads) + pulls @ ca.DM(weights.T)
-        return SlotInFrame(self.chain.kind, energy, x, Forces(total, weights))
+        return SlotInFrame(self.model.chain.kind, energy, x, Forces(total, weights))
 
     @cached_property
     def slot_forces(self) -> ca.Function:
         """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `slot_in_frame`."""
-        forces = self._slot_forces(self._slot(self._stretch, self._inner, ca.SX(0)))
-        forces += [ca.SX.zeros(self.node.dimension)] * self.n_springs
-        arguments = [self._p, self._place, self._deviation]
+        forces = self.forces_on(self.slot(self.stretch, self.inner, ca.SX(0)))
+        forces += [ca.SX.zeros(self.model.node.dimension)] * self.model.n_springs
+        arguments = [self.p, self.place, self.deviation]
         return ca.Function("slot_forces", arguments, [ca.horzcat(*forces)])
 
     @cached_property
@@ -432,68 +456,74 @@ class Lagrangian(Composition):
         that a slot and the forces on it may be turned together: the energy stays. The multipliers
         of the end's place and of the springs' are such forces, too, see `in_frame`.
         """
-        kind, h = self.chain.kind, self.chain.h
-        ratio, inner = ca.SX.sym("ratio"), self._inner
-        slot = self._slot(ratio, inner, inner**2)
-        count = len(self._slot_forces(slot)) + self.n_springs
-        forces = ca.SX.sym("force", self.node.dimension, count)
-        energy = self._bending_energy(slot) - self._work(slot, ca.horzsplit(forces))
+        kind, h = self.model.chain.kind, self.model.chain.h
+        ratio, inner = ca.SX.sym("ratio"), self.inner
+        slot = self.slot(ratio, inner, inner**2)
+        count = len(self.forces_on(slot)) + self.model.n_springs
+        forces = ca.SX.sym("force", self.model.node.dimension, count)
+        energy = self.bending_energy(slot) - self.work_along(slot, ca.horzsplit(forces))
         tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
-        lagrangian = kind.expanded(slot, energy, self._bending_energy)
-        lagrangian -= self._compliance * h * tension**2 / 2
-        local, step = self._local
-        own = [self._p, self._rest, self._place, self._deviation, self._shares]
-        found = ca.substitute([lagrangian], [ratio, step], [self._stretch, ca.SX.zeros(step.shape)])
+        lagrangian = kind.expanded(slot, energy, self.bending_energy)
+        lagrangian -= self.axial_compliance * h * tension**2 / 2
+        local, step = self.local
+        own = [self.p, self.rest_strains, self.place, self.deviation, self.share_symbols]
+        found = ca.substitute([lagrangian], [ratio, step], [self.stretch, ca.SX.zeros(step.shape)])
         return ca.Function("slot_in_frame", [local, inner, forces, *own], found)
 
     @cached_property
-    def _inner(self) -> ca.SX:
+    def inner(self) -> ca.SX:
         """Unknowns inside an element that are eliminated from it."""
-        return ca.SX.sym("inner", self.chain.kind.n_inner)
+        return ca.SX.sym("inner", self.model.chain.kind.n_inner)
 
     @cached_property
-    def _compliances(self) -> dict[int, ca.SX]:
+    def compliance_of(self) -> dict[int, ca.SX]:
         """What the conditions of clamps that give way give per multiplier, by their places."""
         sides = {"start": ca.SX(0), "end": ca.SX(0)}
-        for effect, local in self._filling(BoundaryEffect):
+        for effect, local in self.effects_of(BoundaryEffect):
             if effect.gives:
                 for side, compliance in zip(sides, effect.compliance(local), strict=True):
                     sides[side] += compliance
-        turns = {f"{side}_{turn}": c for side, c in sides.items() for turn in self.node.turns}
+        turns = {f"{side}_{turn}": c for side, c in sides.items() for turn in self.model.node.turns}
         return {
             k: turns[name]
-            for k, name in enumerate(self.condition_names)
+            for k, name in enumerate(self.model.condition_names)
             if name in turns and not turns[name].is_zero()
         }
 
     @cached_property
     def compliances(self) -> ca.Function:
         """(p) -> compliances of the conditions `compliant`."""
-        found = ca.vertcat(ca.SX.zeros(0), *self._compliances.values())
-        return ca.Function("compliances", [self._p], [found])
+        found = ca.vertcat(ca.SX.zeros(0), *self.compliance_of.values())
+        return ca.Function("compliances", [self.p], [found])
 
     @property
     def compliant(self) -> list[int]:
         """End conditions that give way."""
-        return list(self._compliances)
+        return list(self.compliance_of)
 
     @cached_property
-    def _at_ends(self) -> ca.SX:
+    def ends_lagrangian(self) -> ca.SX:
         """Lagrangian of the ends: holders, end conditions, and the loads' work at the start."""
-        node = self.chain.kind.node
-        x, delta = self._nodes
+        node = self.model.chain.kind.node
+        x, delta = self.nodes
         first = node.retract(x[: node.coordinates], delta[: node.increment])
         last = node.retract(x[node.coordinates :], delta[node.increment :])
-        held = self._held
-        gaps = [] if self.end == "free" else [held.start - held.end]
-        gaps += [node.gap(held.start_frame, first)] if self.start == "clamped" else []
-        gaps += [node.gap(held.end_frame, last)] if self.end == "clamped" else []
-        total = ca.dot(self._lam[: self.n_conditions], ca.vertcat(*gaps)) if gaps else ca.SX(0)
-        for effect, local in self._filling(BoundaryEffect):
+        held = self.true_ends
+        gaps = [] if self.model.end == "free" else [held.start - held.end]
+        gaps += [node.gap(held.start_frame, first)] if self.model.start == "clamped" else []
+        gaps += [node.gap(held.end_frame, last)] if self.model.end == "clamped" else []
+        total = ca.dot(self.lam[: self.model.n_conditions], ca.vertcat(*gaps)) if gaps else ca.SX(0)
+        for effect, local in self.effects_of(BoundaryEffect):
             total += effect.energy(first, last, local)
-        for k, compliance in self._compliances.items():
-            total -= compliance * self._lam[k] ** 2 / 2
-        for k, spring in enumerate(self._springs):
-            place, pull = self._spring_unknowns(k)
+        for k, compliance in self.compliance_of.items():
+            total -= compliance * self.lam[k] ** 2 / 2
+        for k, spring in enumerate(self.springs):
+            place, pull = self.spring_unknowns(k)
             total += spring.energy(place) + ca.dot(pull, held.start - place)
-        return total - ca.dot(self._total_load, held.start)
+        return total - ca.dot(self.total_load, held.start)
+
+
+@lru_cache(maxsize=MODELS)
+def lagrangian_of(model: CableModel) -> Lagrangian:
+    """The expressions of a model, made once."""
+    return Lagrangian(model)

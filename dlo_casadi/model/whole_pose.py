@@ -10,6 +10,8 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.lagrangian import lagrangian_of
 
 
 @dataclass(frozen=True)
@@ -62,18 +64,20 @@ def potential(model: CableModel) -> Potential:
     """
     s, chain = PoseSymbols.of(model), model.chain
     inner = ca.SX.sym("inner", model.n_inner, chain.n_slots)
-    energy, gradient, _ = model.at_ends(*_end_arguments(model, s))
+    energy, gradient, _ = functions_of(model).at_ends(*_end_arguments(model, s))
     conditions = gradient[2 * chain.kind.node.increment :]
     for j, arguments in enumerate(_slot_arguments(model, s)):
-        own, reached = model.slot_potential(*arguments, inner[:, j])
+        own, reached = functions_of(model).slot_potential(*arguments, inner[:, j])
         energy, conditions = energy + own, conditions + reached
     multipliers = np.flatnonzero(model.are_multipliers).tolist()
     places = np.flatnonzero(~model.are_multipliers).tolist()
     zero = ca.SX.zeros(len(multipliers))
-    given_way = ca.SX.sym("given_way", len(model.compliant))
-    if model.compliant:
+    given_way = ca.SX.sym("given_way", len(lagrangian_of(model).compliant))
+    if lagrangian_of(model).compliant:
         energy += ca.sumsqr(given_way) / 2
-        conditions[model.compliant] -= ca.sqrt(model.compliances(s.p)) * given_way
+        conditions[lagrangian_of(model).compliant] -= (
+            ca.sqrt(lagrangian_of(model).compliances(s.p)) * given_way
+        )
     given = [energy, conditions[multipliers]]
     energy, conditions = ca.substitute(given, [s.lam[multipliers]], [zero])
     parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
@@ -87,10 +91,10 @@ def balance(model: CableModel, s: PoseSymbols) -> ca.SX:
     node, slots = model.chain.kind.node, model.chain.n_slots
     b, n = node.increment, model.chain.n_nodes
     rows = [ca.SX.zeros(b) for _ in range(max(n, slots + 1))]
-    _, ends, _ = model.at_ends(*_end_arguments(model, s))
+    _, ends, _ = functions_of(model).at_ends(*_end_arguments(model, s))
     border = ends[2 * b :]
     for j, arguments in enumerate(_slot_arguments(model, s)):
-        _, gradient, _ = model.slot(*arguments)
+        _, gradient, _ = functions_of(model).slot(*arguments)
         rows[j] += gradient[:b]
         rows[j + 1] += gradient[b : 2 * b]
         border += gradient[2 * b :]
@@ -104,7 +108,7 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     chain, layout = model.chain, model.chain.layout
     c, d = chain.kind.node.coordinates, chain.kind.node.dimension
     arguments = _slot_arguments(model, s)
-    steps = [model.slot_curve(*arguments[j]) for j in layout.advancing]
+    steps = [functions_of(model).slot_curve(*arguments[j]) for j in layout.advancing]
     rates = [step[d:] for step in steps]
     rates = [
         rates[0],
@@ -114,7 +118,7 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     point, rows = s.pose[:d], []
     for i, (first, last) in enumerate(layout.stations):
         both = ca.vertcat(s.x[first * c : (first + 1) * c], s.x[last * c : (last + 1) * c])
-        rows.append(model.station(point, rates[i], both, s.p, s.pose))
+        rows.append(functions_of(model).station(point, rates[i], both, s.p, s.pose))
         if i < chain.n:
             point = point + steps[i][:d]
     return ca.vertcat(*rows)
@@ -122,13 +126,15 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
 
 def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
     """What sensors on the fixtures show (n_reactions,) [N, N m], see `ends.REACTIONS`."""
-    return model.readings(*_end_arguments(model, s))
+    return functions_of(model).readings(*_end_arguments(model, s))
 
 
 def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Rest curvature (n_rests,) [1/m] that the pose leaves behind."""
     arguments = _slot_arguments(model, s)
-    rests: list[Any] = [model.slot_state(*arguments[j])[0].T for j in model.chain.layout.bends]
+    rests: list[Any] = [
+        functions_of(model).slot_state(*arguments[j])[0].T for j in model.chain.layout.bends
+    ]
     return ca.vec(ca.vertcat(*rests))
 
 

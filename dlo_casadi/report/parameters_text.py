@@ -17,7 +17,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.parameters import SCHEMA, Parameters, metadata_of, parameters_hash
-from dlo_casadi.model.composition import STIFFNESSES
+from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.report.json_report import finite
 from dlo_casadi.session.outcome import Outcome
 

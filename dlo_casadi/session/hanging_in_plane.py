@@ -9,8 +9,7 @@ import numpy as np
 
 from dlo_casadi.config import Config
 from dlo_casadi.estimation.prediction import Prediction, predict_poses
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.composition import BENDING_STIFFNESS
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.coarse import MESH, coarse_fit, posed, some, tells_weight
 from dlo_casadi.session.declared import declared_model, straight

@@ -22,8 +22,7 @@ from dlo_casadi.estimation.prediction import (
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.composition import END_ROLL
+from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.paper.algorithm1 import Algorithm1Result
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.sensing.measured_pose import MeasuredPose

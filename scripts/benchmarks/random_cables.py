@@ -28,9 +28,8 @@ from dlo_casadi.equilibrium.guesses import guesses
 from dlo_casadi.equilibrium.initial_arcs import limited
 from dlo_casadi.equilibrium.ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Given, Shapes
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.composition import EndKind, StartKind
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.cable_model import CableModel, EndKind, StartKind
 
 FloatArray = NDArray[np.floating]
 
@@ -160,7 +159,7 @@ def _is_minimum(
     model = problem.model
     given = Given.of(problem.p, problem.rest, problem.poses[i].vector[None])
     shapes = Shapes.declared(frames[None], lam[None])
-    _, slope, matrix = model.assembly.balance(shapes, given)
+    _, slope, matrix = assembly_of(model).balance(shapes, given)
     scale = float(matrix.scale[0])
     balanced = np.abs(slope.x).max() < 1e-7 * scale
     stable = (np.linalg.eigvalsh(matrix.dense()[0] / scale) < 0).sum() == model.n_multipliers
@@ -314,7 +313,7 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
     pose = Pose((0.0, 0.0), (float(end[0]), float(end[1])))
     given = Given.of(model.nominal, problem.rest, pose.vector[None])
     shapes = Shapes.declared(phi[None, :, None], shape["lam"][None])
-    _, slope, matrix = model.assembly.balance(shapes, given)
+    _, slope, matrix = assembly_of(model).balance(shapes, given)
     force = slope.x[0, :, 0, 0]
     active = np.flatnonzero(np.abs(np.diff(phi)) > JOINT_BOUND - 1e-7)
     error = float(np.hypot(*slope.y[0, :2, 0]))

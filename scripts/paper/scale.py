@@ -24,7 +24,7 @@ from dlo_casadi import CableModel, CompiledSolver, Pose
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.model.assembly import Given, Shapes
+from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -61,7 +61,7 @@ def simulated(poses: int) -> list[MeasuredPose]:
         pose = Pose((0.0, 0.0), end, branch="ccw", name=f"{len(out)}")
         shapes = Shapes.declared(shape.headings[None, :, None], shape.lam[None])
         given = Given.of(model.nominal, rest, pose.vector[None])
-        z = model.assembly.curve(shapes, given)[0]
+        z = assembly_of(model).curve(shapes, given)[0]
         s = np.linspace(0.01, 0.99, POINTS) * published.LENGTH
         points = NodeCurve.of(published.LENGTH, z).at(s) + STD * rng.standard_normal((POINTS, 2))
         out.append(MeasuredPose.of_points(pose, points))

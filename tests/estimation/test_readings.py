@@ -11,7 +11,7 @@ from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.assembly import Directions, Given
+from dlo_casadi.model.assembly import Directions, Given, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.ends import REACTIONS, reaction_rows
@@ -38,7 +38,7 @@ def reactions(model: CableModel, pose: Pose) -> tuple[dict[str, np.ndarray], flo
     rest = np.full(model.chain.n_rests, 0.5)
     eq = solve_equilibrium(model, model.nominal, rest, pose)
     given = Given.of(model.nominal, rest, pose.vector[None])
-    found = model.assembly.reactions(eq.shapes, given)[0]
+    found = assembly_of(model).reactions(eq.shapes, given)[0]
     return {name: found[at] for name, at in reaction_rows(model.node).items()}, eq.energy, eq.points
 
 
@@ -103,7 +103,7 @@ def test_a_spring_at_a_pin_holds_a_moment():
     p[[model.names.index(f"start_spring.{name}") for name in ("stiffness", "heading")]] = 0.05, 0.4
     rest, pose = np.zeros(model.chain.n_rests), Pose((0.0, 0.0), (0.6, 0.0))
     eq = solve_equilibrium(model, p, rest, pose)
-    found = model.assembly.reactions(eq.shapes, Given.of(p, rest, pose.vector[None]))[0]
+    found = assembly_of(model).reactions(eq.shapes, Given.of(p, rest, pose.vector[None]))[0]
     np.testing.assert_allclose(found[[2, 5]], [0.05 * (eq.phi[0] - 0.4), 0.0], atol=1e-12)
 
 
@@ -113,7 +113,7 @@ def test_derivatives_of_readings(space):
     model, pose = clamped(space)
     setup = Setup(model.cable, gravity=model.gravity, readings=REACTIONS)
     model = model.with_effect(SensorBias.made_for(setup))
-    rest, assembly = np.full(model.chain.n_rests, 0.5), model.assembly
+    rest, assembly = np.full(model.chain.n_rests, 0.5), assembly_of(model)
     shapes = solve_equilibrium(model, model.nominal, rest, pose).shapes
     given = Given.of(model.nominal, rest, pose.vector[None])
     rng = np.random.default_rng(0)

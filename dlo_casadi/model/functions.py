@@ -1,0 +1,373 @@
+"""What a slot, an end or a node adds, as one CasADi function each.
+
+Every stage differentiates the same expressions, see `lagrangian`; the functions are mapped over the
+cable, see `assembly`.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+
+import casadi as ca
+import numpy as np
+
+from dlo_casadi.effects import MeasurementEffect, StateEffect
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.lagrangian import MODELS, SlotNumbers, lagrangian_of
+from dlo_casadi.rod.element import Slot
+from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.rod.in_frame import SlotDerivatives, SlotInFrame
+
+
+class Functions:
+    """CasADi functions of one slot, of the ends and of one station of a model.
+
+    Parameters
+    ----------
+    model : CableModel
+    """
+
+    def __init__(self, model: CableModel) -> None:
+        self.model, self.terms = model, lagrangian_of(model)
+
+    @property
+    def _slot_arguments(self) -> list[ca.SX]:
+        x, _ = self.terms.nodes
+        return [
+            x,
+            self.terms.lam,
+            self.terms.p,
+            self.terms.rest_strains,
+            self.terms.place,
+            self.terms.deviation,
+        ]
+
+    @property
+    def _end_arguments(self) -> list[ca.SX]:
+        x, _ = self.terms.nodes
+        return [x, self.terms.lam, self.terms.p, self.terms.pose, self.terms.deviation]
+
+    def _here(
+        self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
+    ) -> ca.Function:
+        """A function at increments of zero, its outputs dense.
+
+        What is evaluated often is worth the search for common subexpressions: it takes away a
+        fifth of the operations, and of many effects' derivatives longer than the evaluation.
+        """
+        local, step = self.terms.local
+        _, delta = self.terms.nodes
+        symbols = [step, delta, local]
+        values = [ca.SX.zeros(step.shape), ca.SX.zeros(delta.shape), self.terms.local_of_nodes]
+        found = ca.substitute(outputs, symbols, values)
+        found = ca.cse(found) if often else found
+        return ca.Function(name, arguments, [ca.densify(one) for one in found])
+
+    @property
+    def _by_slot(self) -> ca.SX:
+        """What the Lagrangian of a slot is differentiated by: local increments, multipliers."""
+        return ca.vertcat(self.terms.local[1], self.terms.lam)
+
+    @property
+    def _by_ends(self) -> ca.SX:
+        """What that of the ends is differentiated by: increments of the nodes, multipliers."""
+        return ca.vertcat(self.terms.nodes[1], self.terms.lam)
+
+    @property
+    def _to_local(self) -> ca.SX:
+        """Derivative of local increments and multipliers by the nodes' and multipliers."""
+        return ca.diagcat(self.terms.local_slope, ca.SX.eye(self.model.n_border))
+
+    @cached_property
+    def slot(self) -> ca.Function:
+        """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
+        if self.model.in_space:
+            found, spread = self._about_nodes, self._of_pulls
+            outputs = [found.value, spread @ found.gradient, spread @ found.hessian @ spread.T]
+            return self._here("slot", self._slot_arguments, outputs)
+        value = self.terms.slot_terms.lagrangian
+        hessian, gradient = ca.hessian(value, self._by_slot)
+        return self._here("slot", self._slot_arguments, [value, gradient, hessian])
+
+    @cached_property
+    def slot_slope(self) -> ca.Function:
+        """As `slot` -> its gradient alone, for a small part of the operations."""
+        if self.model.in_space:
+            gradient = self._of_pulls @ self._about_nodes.gradient
+        else:
+            gradient = ca.gradient(self.terms.slot_terms.lagrangian, self._by_slot)
+        return self._here("slot_slope", self._slot_arguments, [gradient])
+
+    @cached_property
+    def slot_by_share(self) -> ca.Function:
+        """(x, lam, p, rest, place, deviation, shares) -> L_e and advance: see `shares`."""
+        terms = self.terms.slot_terms_by_share
+        arguments = [*self._slot_arguments, self.terms.share_symbols]
+        return self._here("slot_by_share", arguments, [terms.lagrangian, terms.advance])
+
+    @cached_property
+    def slot_potential(self) -> ca.Function:
+        """(x, lam, p, rest, place, deviation, inner) -> energy [J] to minimise, and conditions.
+
+        The slot's share (n_border,) of the conditions on places is the slope by the multipliers.
+        The unknowns inside are, for an extensible cable, a_e with the axial strain sqrt(C) a_e and
+        the energy h a_e^2 / 2, and the element's own.
+        """
+        kind, unknowns = self.model.chain.kind, ca.SX.sym("unknowns", self.model.n_inner)
+        ratio, axial = self.terms.stretch, ca.SX(0)
+        if self.model.extensible:
+            axial = unknowns[0]
+            ratio = ratio + ca.sqrt(self.terms.axial_compliance) * axial
+        inner = ca.SX.sym("inner", kind.n_inner)
+        slot = self.terms.slot(ratio, inner, inner**2)
+        energy = kind.expanded(slot, self.terms.slot_energy(slot), self.terms.bending_energy)
+        energy += self.model.chain.h * axial**2 / 2
+        own = ca.reshape(unknowns[self.model.n_inner - kind.n_inner :], inner.shape)
+        reached = ca.gradient(self.terms.work_of_multipliers(slot), self.terms.lam)
+        outputs = ca.substitute([energy, reached], [inner], [own])
+        arguments = [*self._slot_arguments, unknowns]
+        return self._here("slot_potential", arguments, self.terms.with_shares(outputs))
+
+    @cached_property
+    def _framed(self) -> SlotInFrame:
+        """The slot in space, at this model's own symbols."""
+        starts = [] if self.model.end == "free" else [0]
+        starts += [self.model.n_conditions + 6 * k + 3 for k in range(self.model.n_springs)]
+        pulls = [self.terms.lam[k : k + 3] for k in starts]
+        if self.model.end == "free":
+            pulls = [ca.SX.zeros(3), *pulls]
+        shares = ca.SX(self.terms.shares(self.terms.p, self.terms.place))
+        numbers = SlotNumbers(
+            self.terms.p, self.terms.rest_strains, self.terms.place, self.terms.deviation, shares
+        )
+        return self.terms.in_frame(self.terms.nodes[0], ca.horzcat(*pulls), numbers)
+
+    @cached_property
+    def _about_nodes(self) -> SlotDerivatives:
+        """Derivatives by rotations about the nodes' own axes."""
+        framed = self._framed
+        return framed.derivatives().about(*framed.node_turns)
+
+    @property
+    def _of_pulls(self) -> ca.DM:
+        """Matrix from both nodes and the pulls to both nodes and all multipliers."""
+        rows = np.zeros(
+            (
+                2 * self.model.node.increment + self.model.n_border,
+                6 + 3 * (1 + self.model.n_springs),
+            )
+        )
+        rows[:6, :6] = np.eye(6)
+        if self.model.end != "free":
+            rows[6:9, 6:9] = np.eye(3)
+        for k in range(self.model.n_springs):
+            at = 6 + self.model.n_conditions + 6 * k + 3
+            rows[at : at + 3, 9 + 3 * k : 12 + 3 * k] = np.eye(3)
+        return ca.sparsify(ca.DM(rows))
+
+    @cached_property
+    def at_ends(self) -> ca.Function:
+        """(x, lam, p, pose, deviation) of the first and last node -> as `slot`."""
+        hessian, gradient = ca.hessian(self.terms.ends_lagrangian, self._by_ends)
+        return self._here(
+            "at_ends", self._end_arguments, [self.terms.ends_lagrangian, gradient, hessian]
+        )
+
+    @cached_property
+    def slot_sensitivity(self) -> ca.Function:
+        """As `slot` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
+        by = ca.vertcat(self.terms.p, self.terms.rest_strains, self.terms.deviation)
+        if self.model.in_space:
+            first, last, pulled = self._framed.by_numbers(by)
+            turns = self._framed.node_turns
+            mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
+        else:
+            mixed = ca.jacobian(ca.gradient(self.terms.slot_terms.lagrangian, self._by_slot), by)
+        return self._here("slot_sensitivity", self._slot_arguments, [mixed], often=False)
+
+    @cached_property
+    def end_sensitivity(self) -> ca.Function:
+        """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
+        by = ca.vertcat(self.terms.p, self.terms.deviation)
+        mixed = ca.jacobian(ca.gradient(self.terms.ends_lagrangian, self._by_ends), by)
+        return self._here("end_sensitivity", self._end_arguments, [mixed])
+
+    @cached_property
+    def _advanced(self) -> ca.SX:
+        """True advance of a slot and its `_rates`."""
+        return ca.vertcat(self.terms.slot_terms.advance, self._rates)
+
+    @cached_property
+    def _rates(self) -> ca.SX:
+        """Length ratio of a slot and, in a plane, its turning d phi / ds [1/m]."""
+        if self.model.in_space:  # no map of the measurement depends on the frame there
+            return self.terms.slot_terms.ratio
+        turning = self.terms.stretch * self.model.chain.kind.strain(self._plain)
+        return ca.vertcat(self.terms.slot_terms.ratio, turning)
+
+    @cached_property
+    def slot_curve(self) -> ca.Function:
+        """As `slot` -> advance [m], length ratio and, in a plane, turning [1/m]."""
+        return self._here("slot_curve", self._slot_arguments, [self._advanced])
+
+    @cached_property
+    def slot_curve_slopes(self) -> ca.Function:
+        """As `slot` -> the same, derivatives by increments and lam, and by p, rest, deviation."""
+        others = ca.vertcat(self.terms.p, self.terms.rest_strains, self.terms.deviation)
+        if self.model.in_space:
+            # The advance is the Lagrangian's derivative by the force on the end's holder.
+            found, spread = self._about_nodes, self._of_pulls
+            by_nodes = (spread @ found.hessian)[:, 6:9].T
+            advance = [by_nodes, self._framed.by_numbers(others)[2][:3, :]]
+            stretched = self.terms.slot_terms.ratio
+            by_nodes = ca.jacobian(stretched, self._by_slot) @ self._to_local
+            ratio = [by_nodes, ca.jacobian(stretched, others)]
+            blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
+        else:
+            blocks = [ca.jacobian(self._advanced, by) for by in (self._by_slot, others)]
+        outputs = [self._advanced, *blocks]
+        return self._here("slot_curve_slopes", self._slot_arguments, outputs, often=False)
+
+    @cached_property
+    def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
+        """Arguments, place (and slope) in the measurement of one station, and what moves it."""
+        kind = self.model.chain.kind
+        x, delta = self.terms.nodes
+        point, rates = (
+            ca.SX.sym("point", self.model.node.dimension),
+            ca.SX.sym("rates", self._rates.numel()),
+        )
+        before, after = (
+            self.model.node.retract(own, step)
+            for own, step in zip(
+                ca.vertsplit(x, x.numel() // 2),
+                ca.vertsplit(delta, delta.numel() // 2),
+                strict=True,
+            )
+        )
+        frame = ca.SX.sym("frame", self.model.node.coordinates)
+        slope = rates[0] * self.model.node.tangent(frame)
+        image = point
+        maps = self.terms.effects_of(MeasurementEffect)
+        for effect, local in maps:
+            image = effect.observe(image, frame, self.terms.sight, local)
+        rows = image
+        if kind.smooth:
+            slope = ca.jtimes(image, point, slope) if maps else slope
+            for turning in ca.vertsplit(rates)[1:]:
+                slope += ca.jtimes(image, frame, turning)
+            rows = ca.vertcat(image, slope)
+        rows = ca.substitute(rows, frame, self.model.node.middle(before, after))
+        arguments = [point, rates, x, self.terms.p, self.terms.pose]
+        return arguments, rows, ca.vertcat(point, rates, delta)
+
+    @cached_property
+    def station(self) -> ca.Function:
+        """(point, rates, x, p, ends) of an element boundary -> its image: place, slope dr/ds."""
+        arguments, rows, _ = self._seen
+        return self._here("station", arguments, [rows])
+
+    @cached_property
+    def station_slopes(self) -> ca.Function:
+        """As `station` -> the same, derivatives by (point, rates, increments) and by p."""
+        arguments, rows, moving = self._seen
+        blocks = [ca.jacobian(rows, symbols) for symbols in (moving, self.terms.p)]
+        return self._here("station_slopes", arguments, [rows, *blocks])
+
+    @cached_property
+    def slot_strain(self) -> ca.Function:
+        """As `slot` -> mean strains of the cell [1/m]."""
+        return self._here(
+            "strain", self._slot_arguments, [self.model.chain.kind.strain(self._plain)]
+        )
+
+    @property
+    def _plain(self) -> Slot:
+        """The slot without its inner unknowns."""
+        return self.terms.slot(
+            self.terms.stretch, ca.SX.zeros(self.model.chain.kind.n_inner), ca.SX(0)
+        )
+
+    @cached_property
+    def slot_state(self) -> ca.Function:
+        """As `slot` -> rest strains of the cell after it; by increments, rest and p."""
+        own = self.terms.rest_strains[::3]
+        strain, mean = self.model.chain.kind.strain(self._plain), own
+        for effect, local in self.terms.effects_of(StateEffect):
+            mean = effect.next_rest(mean, strain, self.model.cable, local)
+        rest = ca.SX.sym("mean", own.numel())
+        mean = ca.substitute(mean, own, rest)
+        slopes = [
+            ca.jacobian(mean, symbols) for symbols in (self.terms.local[1], rest, self.terms.p)
+        ]
+        slopes[0] = slopes[0] @ self.terms.local_slope
+        mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
+        return self._here("slot_state", self._slot_arguments, [mean, *slopes])
+
+    @cached_property
+    def _reactions(self) -> ca.SX:
+        """Forces [N] and moments [N m] of the cable on its fixtures, see `ends.REACTIONS`.
+
+        Forces are minus the slope of the Lagrangian by the ends' places, nodes and multipliers
+        kept. Moments, about the world's axes, are the slope by turns of the first and last node of
+        what the holders add to it: multipliers of clamps, springs of pins.
+        """
+        node, (x, delta) = self.model.node, self.terms.nodes
+        places = -ca.gradient(self.terms.ends_lagrangian, self.terms.pose)[: 2 * node.dimension]
+        turns = ca.gradient(self.terms.ends_lagrangian, delta)
+        places, turns = ca.substitute([places, turns], [delta], [ca.SX.zeros(delta.shape)])
+        pairs = zip(
+            ca.vertsplit(places, node.dimension),
+            ca.vertsplit(x, node.coordinates),
+            ca.vertsplit(turns, node.increment),
+            strict=True,
+        )
+        here = [row for force, own, turn in pairs for row in (force, node.in_world(own, turn))]
+        moved = [
+            node.retract(own, step)
+            for own, step in zip(
+                ca.vertsplit(x, node.coordinates),
+                ca.vertsplit(delta, node.increment),
+                strict=True,
+            )
+        ]
+        return ca.substitute([ca.vertcat(*here)], [x], [ca.vertcat(*moved)])[0]
+
+    @cached_property
+    def reactions(self) -> ca.Function:
+        """As `at_ends` -> `ends.REACTIONS` in one column [N, N m]."""
+        return self._here("reactions", self._end_arguments, [self._reactions])
+
+    @cached_property
+    def _readings(self) -> ca.SX:
+        """The same as sensors show them."""
+        rows, of = self._reactions, reaction_rows(self.model.node)
+        for effect, local in self.terms.effects_of(MeasurementEffect):
+            parts = effect.feel({name: rows[at] for name, at in of.items()}, local)
+            rows = ca.vertcat(*(parts[name] for name in of))
+        return rows
+
+    @cached_property
+    def readings(self) -> ca.Function:
+        """As `reactions`, as sensors show them."""
+        return self._here("readings", self._end_arguments, [self._readings])
+
+    @cached_property
+    def reading_slopes(self) -> ca.Function:
+        """As `readings` -> derivatives by increments and multipliers, by p, and by deviation."""
+        by = (self._by_ends, self.terms.p, self.terms.deviation)
+        slopes = [ca.jacobian(self._readings, one) for one in by]
+        return self._here("reading_slopes", self._end_arguments, slopes)
+
+    @cached_property
+    def dead_load(self) -> ca.Function:
+        """P -> sum of the dead loads (dimension,) [N], without those of single poses."""
+        still = ca.SX.zeros(len(self.model.deviation_names))
+        load = ca.substitute(self.terms.total_load, self.terms.deviation, still)
+        return ca.Function("dead_load", [self.terms.p], [ca.densify(load)])
+
+
+@lru_cache(maxsize=MODELS)
+def functions_of(model: CableModel) -> Functions:
+    """The functions of a model, made once."""
+    return Functions(model)
