@@ -15,6 +15,8 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.lagrangian import lagrangian_of
 
 LENGTH, EI, GJ = 0.8, 0.02, 0.015
 DOWN = (0.0, 0.0, -9.81)
@@ -290,7 +292,9 @@ def test_a_slot_is_differentiated_as_by_casadi_in_one_go(element, end):
     )
     place = m.chain.layout.slots[4]
     nodes = ca.vertcat(node.retract(x[:4], delta[:3]), node.retract(x[4:], delta[3:]))
-    value, advance = m.slot_by_share(nodes, lam, p, rest, place, deviation, m.shares(p, place))
+    value, advance = functions_of(m).slot_by_share(
+        nodes, lam, p, rest, place, deviation, lagrangian_of(m).shares(p, place)
+    )
     by = ca.vertcat(delta, lam)
     hessian, gradient = ca.hessian(value, by)
     others = ca.vertcat(p, rest, deviation)
@@ -307,8 +311,8 @@ def test_a_slot_is_differentiated_as_by_casadi_in_one_go(element, end):
     moved = 0.01 * rng.normal(size=len(m.deviation_names))
     expected = plain(frames, forces, numbers, own, moved)
     arguments = (frames, forces, numbers, own, place, moved)
-    slopes = m.slot_curve_slopes(*arguments)
-    found = [*m.slot(*arguments), m.slot_sensitivity(*arguments)]
+    slopes = functions_of(m).slot_curve_slopes(*arguments)
+    found = [*functions_of(m).slot(*arguments), functions_of(m).slot_sensitivity(*arguments)]
     found += [slopes[1][:3, :], slopes[2][:3, :]]
     for one, other in zip(found, expected, strict=True):
         size = np.abs(np.array(other)).max()
