@@ -17,22 +17,17 @@ from dlo_casadi.effects import (
     ClampCompliance,
     EdgeBias,
     Effect,
-    EndOffset,
-    EndSpring,
     GravityTilt,
-    ImageDistortion,
     ImageScale,
     Kinematics,
     Load,
     LumpedMass,
     PlasticSet,
     PointForce,
-    RestCurvatureDrift,
     SectionLaw,
     SideLoad,
     Sight,
     StandoffError,
-    StartSpring,
     StiffnessGradient,
     StiffSection,
     Tether,
@@ -384,14 +379,10 @@ def test_an_unknown_pull_is_another_force_in_every_pose(element):
 CELLS = [Cell(ca.SX(low), ca.SX(0.2), 0.2) for low in (0.0, 0.2, 0.4, 0.6)]  # m
 
 
-def factors(
-    effect: SectionLaw, values: dict[str, float], bend=(1.0, 1.0, 1.0, 1.0), what="factor"
-) -> np.ndarray:
-    """Factors of the law in each of the four cells, bent by so much [1/m]."""
+def factors(effect: SectionLaw, values: dict[str, float]) -> np.ndarray:
+    """Factors of the law in each of the four cells."""
     params = {key: ca.SX(value) for key, value in values.items()}
-    law = getattr(effect, what)
-    pairs = zip(bend, CELLS, strict=True)
-    return np.array([number(law(ca.SX(float(k)), cell, CABLE, params)) for k, cell in pairs])
+    return np.array([number(effect.along(cell, CABLE, params)) for cell in CELLS])
 
 
 def test_taper_in_each_cell():
@@ -420,54 +411,37 @@ def test_moment_of_a_softening_section():
     softness, d = 0.2, 1e-5
     k = np.array([-6.0, -1.0, 0.5, 8.0])
 
+    def law(what: str, bend: np.ndarray) -> np.ndarray:
+        of = getattr(BendingSoftening(), what)
+        return number(of(ca.SX(ca.DM(bend**2)), CABLE, {"softness": ca.SX(softness)}))
+
     def energy(bend):
-        return bend**2 / 2 * factors(BendingSoftening(), {"softness": softness}, bend)
+        return bend**2 / 2 * law("of_bend", bend)
 
     moment = (energy(k + d) - energy(k - d)) / (2 * d)
     # |k| is rounded by 1e-3 of a turn per length (0.008 1/m), which the softness turns into a
     # share of 0.2 * 0.008 = 1.6e-3.
     np.testing.assert_allclose(moment, k / (1 + np.abs(k) * softness), rtol=2e-3)
     assert np.all(np.diff(moment) > 0)
-    tangent = factors(BendingSoftening(), {"softness": softness}, k, "tangent")
     slope = 1 / (1 + np.abs(k) * softness) ** 2  # dM/dk over EI
-    np.testing.assert_allclose(tangent, slope, rtol=4e-3)
-    assert BendingSoftening.even
+    np.testing.assert_allclose(law("tangent", k), slope, rtol=4e-3)
 
 
-@pytest.mark.parametrize("name", sorted(k for k, c in EFFECTS.items() if issubclass(c, SectionLaw)))
-def test_even_laws_are_the_same_all_along_the_cable(name):
-    law = EFFECTS[name]()
-    values = {q.name: q.nominal + 0.5 * q.scale for q in law.parameters(CABLE)}
-    assert law.even == (np.ptp(factors(law, values)) == 0)
+def test_the_tangent_of_a_law_that_tells_none():
+    """W = EI k^2 (1 + k^2) / 2 has d^2W/dk^2 = EI (1 + 6 k^2)."""
+
+    class Hardening(SectionLaw):
+        name = "hardening"
+
+        def of_bend(self, square, cable, params):
+            return 1 + square
+
+    k = np.array([0.0, 0.5, -2.0])
+    found = [number(Hardening().tangent(ca.SX(x**2), CABLE, {})) for x in k]
+    np.testing.assert_allclose(found, 1 + 6 * k**2, rtol=1e-14)
 
 
 # ---- boundaries, measurement, state ------------------------------------------------------------
-
-
-def test_springs_pull_towards_their_heading():
-    """V = k (phi - heading)^2 / 2 at the first or last heading."""
-    for kind, index in ((StartSpring, 0), (EndSpring, -1)):
-        model = CableModel(CABLE, n=5, effects=(kind(),))
-        bare = CableModel(CABLE, n=5)
-        shapes, given = posed(model, np.array([0.05, 0.7, -0.4]))
-        with_it = assembly_of(model).energy(shapes, given)[0]
-        without = assembly_of(bare).energy(shapes, replace(given, p=given.p[:, :1]))[0]
-        exact = 0.7 * (shapes.x[0, index, 0] + 0.4) ** 2 / 2
-        assert with_it - without == pytest.approx(exact, abs=1e-12)
-
-
-def test_fixtures_are_where_the_boundary_effects_put_them():
-    pose = Pose((0.0, 0.0), (0.5, 0.0))
-    model = CableModel(CABLE, n=8, effects=(EndOffset(),))
-    p = np.array([0.05, 0.01, -0.02])
-    found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), pose)
-    np.testing.assert_allclose(found.points[-1], [0.51, -0.02], atol=1e-8)  # IPOPT's tol
-
-    model = CableModel(CABLE, n=8, start="clamped", end="clamped", effects=(ClampAngle(),))
-    pose = Pose((0.0, 0.0), (0.5, 0.0), start_heading=-0.5, end_heading=0.5)
-    p = np.array([0.05, 0.1, -0.2])
-    found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), pose)
-    np.testing.assert_allclose(found.phi[[0, -1]], [-0.4, 0.3], atol=1e-8)
 
 
 @ALL
@@ -506,18 +480,6 @@ def seen_from(camera_center, start=(0.0, 0.0)) -> Sight:
     return Sight(vector[:2], vector[6:8], vector[8])
 
 
-@pytest.mark.parametrize("distance", [-0.03, 0.0, 0.004])
-def test_a_standoff_error_follows_the_ray_to_the_declared_plane(distance):
-    """Where the straight line from the camera through the cable's point meets z = 0."""
-    camera, point = np.array([0.3, -0.9, 1.4]), np.array([0.5, 0.2, distance])
-    ray = point - camera
-    met = camera - ray * camera[2] / ray[2]
-    seen = StandoffError().observe(
-        ca.SX(ca.DM(point[:2])), ca.SX(0), seen_from(tuple(camera)), {"distance": ca.SX(distance)}
-    )
-    np.testing.assert_allclose([*number(seen), 0.0], met, atol=1e-15)
-
-
 def test_a_camera_at_infinity_sees_no_standoff():
     point = ca.SX(ca.DM([0.5, 0.2]))
     seen = StandoffError().observe(point, ca.SX(0), seen_from(None), {"distance": ca.SX(0.01)})
@@ -545,23 +507,6 @@ def test_the_line_that_a_map_by_direction_shows_converges(element):
         lines.append(found.curve.at(s))
     gaps = [np.abs(line - lines[-1]).max() for line in lines[:-1]]
     assert np.all(np.log2(np.divide(gaps[:-1], gaps[1:])) > 1.9), gaps
-
-
-def test_measurement_maps():
-    """Scale about the start; radial distortion about the image centre, by hand."""
-    point, sight = ca.SX(ca.DM([0.5, 0.2])), seen_from(None, start=(0.1, 0.0))
-    scaled = ImageScale().observe(point, ca.SX(0.3), sight, {"factor": ca.SX(1.1)})
-    np.testing.assert_allclose(number(scaled), [0.54, 0.22], rtol=1e-14)
-    lens = ImageDistortion(center=(0.2, -0.2))
-    moved = lens.observe(point, ca.SX(0.3), sight, {"coefficient": ca.SX(0.4)})
-    # Arm (0.3, 0.4), length 0.5: factor 1 + 0.4 * 0.25 = 1.1.
-    np.testing.assert_allclose(number(moved), [0.53, 0.24], rtol=1e-14)
-
-
-def test_drift_moves_the_rest_curvature_towards_the_bend():
-    rest, curvature = ca.SX(ca.DM([1.0, -2.0])), ca.SX(ca.DM([3.0, 2.0]))
-    after = RestCurvatureDrift().next_rest(rest, curvature, CABLE, {"rate": ca.SX(0.25)})
-    np.testing.assert_allclose(number(after), [1.5, -1.0], rtol=1e-14)
 
 
 @pytest.mark.parametrize("space", [False, True])

@@ -16,13 +16,11 @@ from dlo_casadi.effects import (
     ClampRotation,
     EdgeBias,
     GravityTilt,
-    LumpedMass,
     MassError,
     PointForce,
     RestCurvatureDrift,
     Setup,
     SideLoad,
-    Sight,
     Tether,
 )
 from dlo_casadi.equilibrium.pose import Pose
@@ -156,28 +154,13 @@ def test_clamps_that_give_way_turn_by_the_moment_on_them(end):
 # ---- turned frames -----------------------------------------------------------------------------
 
 
-def test_tilted_gravity_is_turned_about_the_axes_across_it():
-    for gravity, axes in (((0.3, 0.5, -9.7), "xy"), ((0.3, -9.7, 0.5), "xz")):
-        effect = GravityTilt.made_for(Setup(CABLE, gravity=gravity))
-        assert [q.name for q in effect.parameters(CABLE)] == [f"angle_{axis}" for axis in axes]
-        vector = np.array([0.3 * (axis == axes[0]) - 0.2 * (axis == axes[1]) for axis in "xyz"])
-        turned = tuple(map(float, Rotation.from_rotvec(vector).apply(gravity)))
-        found = solved((effect,), (0.3, -0.2), gravity=gravity)
-        np.testing.assert_allclose(found.points, solved(gravity=turned).points, atol=1e-8)
-
-
-def test_a_side_load_is_a_gravity_of_its_own_across_gravity():
-    """As of q L / m, along unit vectors perpendicular to gravity and nearest to x and y."""
-    down, q = np.array(GRAVITY) / np.linalg.norm(GRAVITY), (0.5, -0.3)
-    across = np.eye(3)[:2] - np.outer(down[:2], down)
-    across /= np.linalg.norm(across, axis=1)[:, None]
-    np.testing.assert_allclose(across @ down, 0.0, atol=1e-15)
-    wind = np.array(GRAVITY) + np.array(q) @ across * CABLE.length / CABLE.mass
-    effect = SideLoad.made_for(Setup(CABLE, gravity=GRAVITY))
-    assert [p.name for p in effect.parameters(CABLE)] == [f"force_per_length_{a}" for a in "xy"]
-    found = solved((effect,), q)
-    np.testing.assert_allclose(found.points, solved(gravity=tuple(wind)).points, atol=1e-8)
-    np.testing.assert_allclose(found.lam, solved(gravity=tuple(wind)).lam, atol=1e-7)
+@pytest.mark.parametrize(("gravity", "axes"), [(GRAVITY, "xy"), ((0.3, -9.7, 0.5), "xz")])
+@pytest.mark.parametrize(("kind", "name"), [(GravityTilt, "angle"), (SideLoad, "force_per_length")])
+def test_components_across_gravity_are_named_after_the_axes_it_is_least_along(
+    kind, name, gravity, axes
+):
+    effect = kind.made_for(Setup(CABLE, gravity=gravity))
+    assert [q.name for q in effect.parameters(CABLE)] == [f"{name}_{axis}" for axis in axes]
 
 
 def test_without_weight_a_side_load_is_along_the_worlds_axes():
@@ -216,15 +199,7 @@ def test_clamp_rotations_of_one_end_only():
     assert effect.prior(setup) == {"start_y": 5e-3, "start_z": 5e-3}
 
 
-def test_a_cameras_frame_is_turned_about_the_start_and_shifted():
-    start, point = np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.2, -0.1])
-    turn, shift = (0.3, -0.2, 0.4), (0.01, -0.02, 0.03)
-    names = [q.name for q in CameraFrame().parameters(CABLE)]
-    params = dict(zip(names, map(ca.SX, (*turn, *shift)), strict=True))
-    sight = Sight(ca.SX(ca.DM(start)), ca.SX.zeros(2), ca.SX(0))
-    seen = CameraFrame().observe(ca.SX(ca.DM(point)), ca.SX(0), sight, params)
-    exact = start + Rotation.from_rotvec(turn).apply(point - start) + shift
-    np.testing.assert_allclose(np.array(ca.evalf(seen))[:, 0], exact, atol=1e-15)
+def test_a_cameras_frame_is_known_within_its_tolerances():
     tolerances = {"camera_rotation": 2e-3, "camera_translation": 1e-3}
     prior = CameraFrame().prior(Setup(CABLE, gravity=GRAVITY, tolerances=tolerances))
     assert list(prior.values()) == 3 * [2e-3] + 3 * [1e-3]
@@ -233,33 +208,12 @@ def test_a_cameras_frame_is_turned_about_the_start_and_shifted():
 # ---- loads and sections ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cable", [FLAT, CABLE], ids=["plane", "space"])
-def test_a_heavier_cable(cable):
-    """True over declared mass; what hangs on the cable stays as heavy."""
-    clip, factor = LumpedMass(), 1.4
-    pose, gravity = HELD, GRAVITY
-    if cable is FLAT:
-        pose, gravity = Pose((0.0, 0.0), (0.5, -0.1), 0.6, -0.5), (0.5, -9.7)
-    found = solved((clip, MassError()), (0.05, 0.3, factor), pose, gravity, cable)
-    heavier = replace(cable, mass=factor * cable.mass)
-    by_hand = solved((clip,), (0.05, 0.3), pose, gravity, heavier)
-    np.testing.assert_allclose(found.points, by_hand.points, atol=1e-8)
-    np.testing.assert_allclose(found.lam, by_hand.lam, atol=1e-7)
-
-
 def test_a_mass_error_takes_a_reading():
     setup = Setup(CABLE, gravity=GRAVITY)
     assert not MassError.applies(setup)
     assert MassError.applies(replace(setup, readings=True))
     assert not MassError.applies(replace(setup, readings=True, gravity=(0.0, 0.0, 0.0)))
     assert MassError().refusal(setup, {"factor": 1.2}) == ""
-
-
-def test_reactions_carry_the_weight_and_the_pull_of_a_tether():
-    anchor = np.array([0.3, 0.4, 0.2])
-    found = solved((Tether(),), (5.0, 0.4, *anchor))
-    loads = 5.0 * (anchor - found.points[5]) + CABLE.mass * np.array(GRAVITY)
-    np.testing.assert_allclose(found.lam + found.lam_start, loads, atol=1e-6)
 
 
 def test_a_soft_tether_to_a_far_anchor_keeps_its_force():

@@ -182,7 +182,26 @@ class Search:
             added.append(AddedEffect(winner.candidate, p_value, validation, after, tuple(rivals)))
             validation = after
         self.step("search for a missing effect", self.max_effects, self.max_effects)
-        return self._ended(*prune(current, added, self.significance), tuple(ranked))
+        return self._ended(*self._pruned(current, added), tuple(ranked))
+
+    def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
+        """Backward step: without the effects that a later one has made superfluous.
+
+        An effect has to be as significant as when it was added, and worth its parameters.
+        """
+        for effect in added[:-1]:
+            smaller = _drop(fit, effect.candidate)
+            if smaller is None:
+                continue
+            screened = self._screened(smaller)
+            single = {item.candidate.name: item.p_value for item in screened}
+            p_value = sidak(single[effect.candidate.name], len(screened))
+            price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
+            gain = 2 * (smaller.point.objective - fit.point.objective)
+            if gain < price or p_value > self.significance:
+                fit = settle(smaller)
+                added = [item for item in added if item is not effect]
+        return fit, added
 
     def _leading(
         self, current: Fit, screened: Sequence[Screened], p_values: Mapping[str, float]
@@ -291,27 +310,6 @@ def screen(
     """Score tests of all `candidates_of` a fit, best first."""
     listed = candidates_of(fit, center, exclude)
     return Screen(fit, listed).run(screening_degrees(fit), executor) if listed else []
-
-
-def prune(fit: Fit, added: list[AddedEffect], significance: float) -> tuple[Fit, list[AddedEffect]]:
-    """Backward step: drop an effect that a later one has made superfluous."""
-    if len(added) < 2:
-        return fit, added
-    for effect in list(added[:-1]):
-        smaller = _drop(fit, effect.candidate)
-        if smaller is None:
-            continue
-        again = [
-            item
-            for item in screen(smaller, None, ())
-            if item.candidate.name == effect.candidate.name
-        ]
-        price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
-        gain = 2 * (smaller.point.objective - fit.point.objective)
-        if gain < price or (again and again[0].p_value > significance):
-            fit = settle(smaller)
-            added = [item for item in added if item is not effect]
-    return fit, added
 
 
 def _drop(fit: Fit, candidate: Candidate) -> Fit | None:

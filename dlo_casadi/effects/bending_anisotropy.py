@@ -36,7 +36,6 @@ class BendingAnisotropy(SectionLaw):
     """
 
     name = "bending_anisotropy"
-    even = True
     in_plane = False
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
@@ -74,7 +73,6 @@ class _LinearAnisotropy(SectionLaw):
     """
 
     name = "linear_anisotropy"
-    even = True
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare a and b."""

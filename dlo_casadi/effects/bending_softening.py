@@ -10,7 +10,6 @@ import numpy as np
 from dlo_casadi.effects.cable import Cable
 from dlo_casadi.effects.effect import Params, SectionLaw
 from dlo_casadi.effects.parameter import Parameter
-from dlo_casadi.rod.element import Cell
 
 # Gauss-Legendre on [0, 1]; ten points integrate the law to 1e-9 for |k|/c up to 5.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
@@ -22,9 +21,15 @@ _ROUNDING = 1e-3
 class BendingSoftening(SectionLaw):
     """The moment grows less than the bend: strands slip, insulation yields.
 
-        M = EI k / (1 + |k| / c),   W = int_0^k M dk                     [N m], [N]
+        M = EI k / (1 + |k| / c),   W = int_0^k M dk = EI k^2 f(|k|) / 2     [N m], [N]
+        f(|k|) = 2 int_0^1 t / (1 + t |k| / c) dt
 
-    with k = curvature - rest curvature. Estimated as `softness` = 1/c, which vanishes at 0.
+    with k = curvature - rest curvature. In space k is a vector, and with the stiffness matrix B
+
+        W = f(|k|) k^T B k / 2,   M = dW/dk
+
+    so that the size of the bend softens the section, whatever its direction; torsion keeps its
+    stiffness. Estimated as `softness` = 1/c, which vanishes at 0.
 
     Parameters
     ----------
@@ -39,24 +44,23 @@ class BendingSoftening(SectionLaw):
 
     name = "bending_softening"
     inverses: ClassVar = {"softness": ("curvature_scale", "1/m")}
-    even = True
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the softness."""
         return (Parameter("softness", "m", scale=0.1 * cable.length, lower=0.0, upper=1e3),)
 
-    def factor(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+    def of_bend(self, square: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Energy over EI k^2 / 2: 2 int_0^1 t / (1 + t |k|/c) dt, by quadrature in t."""
-        ratio = self._ratio(bend, cable, params)
+        ratio = self._ratio(square, cable, params)
         terms = [2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)]
         return sum(terms, start=ca.SX(0))
 
-    def tangent(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+    def tangent(self, square: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """dM/dk over EI: (1 + |k|/c)^-2."""
-        return 1 / (1 + self._ratio(bend, cable, params)) ** 2
+        return 1 / (1 + self._ratio(square, cable, params)) ** 2
 
     @staticmethod
-    def _ratio(bend: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def _ratio(square: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """|k|/c, rounded."""
         delta = _ROUNDING * cable.curvature_scale
-        return params["softness"] * (ca.sqrt(bend * bend + delta**2) - delta)
+        return params["softness"] * (ca.sqrt(square + delta**2) - delta)

@@ -176,38 +176,42 @@ class Effect:
 
 
 class SectionLaw(Effect):
-    """Slot `section`: how much the section resists bending. Section laws multiply.
+    """Slot `section`: how much the section resists. Section laws multiply.
 
-    In space the factor is on the energy of the twist, too.
+        W = along (of_bend k^T B k + GJ tau^2) / 2                      [N]
+
+    of the curvature k and the twist tau beyond those at rest. Where a cable is thicker it resists
+    both more, `along`; what a bend does to the section, `of_bend`, acts on bending alone.
     """
 
     slot: ClassVar[str] = "section"
-    # Whether the law is the same all along the cable.
-    even: ClassVar[bool] = False
 
-    def factor(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
-        """Factor on the bending energy EI/2 (curvature - rest curvature)^2 of a cell.
+    def along(self, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+        """Factor on the stiffnesses against bending and torsion of a cell."""
+        return ca.SX(1)
+
+    def of_bend(self, square: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Factor on the bending energy.
 
         Parameters
         ----------
-        bend : scalar [1/m]
-            Curvature minus rest curvature; in space its size.
-        cell : Cell
-            From where to where it reaches.
+        square : scalar [1/m^2]
+            Square of the curvature minus the rest curvature, in space of the size of that vector.
         """
         return ca.SX(1)
 
-    def bending(self, stiffness: ca.SX, params: Params) -> ca.SX:
-        """Bending stiffness (2, 2) [N m^2] of a cable in space about its material axes y and z."""
-        return stiffness
+    def tangent(self, square: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Factor on the stiffness against a small change of the bend k.
 
-    def tangent(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
-        """Factor on the stiffness against a small change of the bend.
-
-        Only the inner unknowns of elements ask for it, of laws that are the same all along the
-        cable, so that it may be approximate.
+        d^2/dk^2 (of_bend k^2 / 2) = m + 2 k^2 m',   m = d(of_bend k^2)/d(k^2)
         """
-        return self.factor(bend, cell, cable, params)
+        q = ca.SX.sym("q")
+        moment = ca.gradient(self.of_bend(q, cable, params) * q, q)
+        return ca.substitute(moment + 2 * q * ca.gradient(moment, q), q, square)
+
+    def bending(self, stiffness: ca.SX, params: Params) -> ca.SX:
+        """Bending stiffness B (2, 2) [N m^2] of a cable in space about its axes y and z."""
+        return stiffness
 
 
 class Kinematics(Effect):

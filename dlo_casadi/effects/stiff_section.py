@@ -19,7 +19,7 @@ SECTIONS = (0.08, 0.2)
 class StiffSection(SectionLaw):
     """A splice, a heat-shrink sleeve, a tape: `factor` times as stiff between two places.
 
-        EI(s) = EI factor     for start <= s <= end,   EI elsewhere
+        EI(s) = EI factor     for start <= s <= end,   EI elsewhere; in space GJ(s) alike
 
     A cell that the section covers by the share c has the compliance (1 - c + c / factor) / EI:
     the moment is continuous, so compliances are averaged, not stiffnesses. The edges of c are
@@ -70,7 +70,7 @@ class StiffSection(SectionLaw):
         """Its middle."""
         return (values["start"] + values["end"]) / 2
 
-    def factor(self, bend: ca.SX, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+    def along(self, cell: Cell, cable: Cable, params: Params) -> ca.SX:
         """Harmonic mean of the stiffness over the cell."""
         low, high, rounding = cell.low, cell.high, 0.25 * cell.mesh
 

@@ -34,7 +34,10 @@ TOLERANCE = 1e-10
 # First shift of the diagonal over its largest entry, how fast it grows and shrinks, and below
 # what it is dropped.
 FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
-MOST_SHIFTS = 12
+# A tangent matrix larger than the first guess's by this factor is made of multipliers that run
+# away: nothing of the cable's own stiffness is left in double precision. Four of 336 descents of
+# very soft cables with a tether came back from beyond 1e6.
+RUNAWAY = 1e16
 
 
 @dataclass(frozen=True)
@@ -73,16 +76,18 @@ def descend(assembly: Assembly, shapes: Shapes, given: Given, max_iterations: in
     node, wanted = assembly.node, assembly.model.n_multipliers
     now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
     balanced, iterations = np.zeros(m, dtype=bool), np.full(m, max_iterations)
-    shift = np.zeros(m)
+    shift, first = np.zeros(m), np.full(m, np.inf)
     active = np.arange(m)
     for iteration in range(max_iterations):
         here = now.subset(active)
         _, force, matrix = assembly.balance(here, given.subset(active))
-        finite = np.flatnonzero(np.isfinite(matrix.diagonal).all(axis=(1, 2, 3)))
-        if len(finite) < len(active):
-            active, here = active[finite], here.subset(finite)
-            force = Vector(force.x[finite], force.y[finite])
-            matrix = matrix.subset(finite)
+        if not iteration:
+            first = RUNAWAY * matrix.scale
+        bounded = np.flatnonzero(matrix.scale <= first[active])
+        if len(bounded) < len(active):
+            active, here = active[bounded], here.subset(bounded)
+            force = Vector(force.x[bounded], force.y[bounded])
+            matrix = matrix.subset(bounded)
         if not len(active):
             break
         factor, shift[active] = _convex(matrix, wanted, shift[active])
@@ -91,7 +96,8 @@ def descend(assembly: Assembly, shapes: Shapes, given: Given, max_iterations: in
         share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
         now.x[active] = node.moved(here.x, share[:, None, None] * step.x[..., 0])
         now.lam[active] = here.lam + share[:, None] * step.y[..., 0]
-        done = size < TOLERANCE
+        # A shift makes steps small where forces do not balance, too.
+        done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
         iterations[active[done]] = iteration + 1
         active = active[~done & np.isfinite(size)]
@@ -107,8 +113,12 @@ def descend(assembly: Assembly, shapes: Shapes, given: Given, max_iterations: in
 
 
 def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFactor, FloatArray]:
-    """Elimination of the matrices shifted until their inertia is a minimum's, and the shifts."""
-    scale = matrix.scale
+    """Elimination of the matrices shifted until their inertia is a minimum's, and the shifts.
+
+    No shift exceeds what makes the nodes' part positive definite: where the inertia is wrong
+    still, the conditions are the cause.
+    """
+    scale, most = matrix.scale, matrix.row_sum
     shift = np.where(before > LEAST_SHIFT * scale, before / SHRINKAGE, 0.0)
     unit = np.eye(matrix.diagonal.shape[2])
 
@@ -122,9 +132,8 @@ def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFa
     wrong = np.flatnonzero(factor.negative != wanted)
     if not len(wrong):
         return factor, shift
-    for _ in range(MOST_SHIFTS):
-        shift[wrong] = np.maximum(GROWTH * shift[wrong], FIRST_SHIFT * scale[wrong])
-        wrong = wrong[shifted(wrong).negative != wanted]
-        if not len(wrong):
-            break
+    while len(wrong):
+        larger = np.maximum(GROWTH * shift[wrong], FIRST_SHIFT * scale[wrong])
+        shift[wrong] = np.minimum(larger, most[wrong])
+        wrong = wrong[(shifted(wrong).negative != wanted) & (larger < most[wrong])]
     return shifted(everyone), shift

@@ -90,14 +90,44 @@ class Fit:
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance (size, size) of theta: inverse of the reduced Hessian."""
-        return np.asarray(np.linalg.pinv(self.normal.hessian, hermitian=True))
+        """Covariance (size, size) of theta: inverse of the reduced Hessian and of `_by_bounds`.
+
+        The place of a mass of zero is as uncertain as its bounds leave it.
+        """
+        return self._inverse(self._by_bounds)
+
+    @cached_property
+    def inflated_covariance(self) -> FloatArray:
+        """`covariance` with the residual's excess over the noise, which bounds do not have."""
+        return self.inflation**2 * self._inverse(self.inflation**2 * self._by_bounds)
+
+    def _inverse(self, more: FloatArray) -> FloatArray:
+        """Inverse of the reduced Hessian and some more precision on its diagonal."""
+        total = self.normal.hessian + more
+        size = np.sqrt(np.maximum(np.diag(total), np.diag(more)))
+        values, vectors = np.linalg.eigh(total / np.outer(size, size))
+        scaled = (vectors / np.maximum(values, np.finfo(float).eps)) @ vectors.T
+        return np.asarray(scaled / np.outer(size, size))
+
+    @property
+    def _by_bounds(self) -> FloatArray:
+        """Precision (size, size) of theta by its bounds alone."""
+        return np.diag(1 / self.problem.unknowns.widest**2)
+
+    def is_determined(self, name: str) -> bool | None:
+        """Whether residuals and priors tell more of a parameter than its bounds; None if fixed."""
+        unknowns = self.problem.unknowns
+        if name not in unknowns.names:
+            return None
+        k = unknowns.names.index(name)
+        return bool(2 * self.inflated_covariance[k, k] < unknowns.widest[k] ** 2)
 
     @cached_property
     def determined_unknowns(self) -> float:
         """Effective number of unknowns that the residuals determine, priors being what they are."""
         problem = self.problem
-        effective = problem.unknowns.size - float(np.trace(self.covariance @ problem.precision))
+        known = problem.precision + self._by_bounds
+        effective = problem.unknowns.size - float(np.trace(self.covariance @ known))
         precision = np.diag(1 / problem.deviation_std**2)
         for block, cross, _ in self.normal.inner:
             inverse = np.linalg.inv(block)
@@ -290,7 +320,7 @@ class Fit:
         slope = unknowns.scales[k]
         if name in self.model.names:
             slope = unknowns.slopes(self.point.theta)[self.model.names.index(name), k]
-        return float(abs(slope) * np.sqrt(max(self.covariance[k, k], 0.0)) * self.inflation)
+        return float(abs(slope) * np.sqrt(self.inflated_covariance[k, k]))
 
     @property
     def named_covariance(self) -> tuple[tuple[str, ...], FloatArray]:
@@ -303,7 +333,7 @@ class Fit:
         by_theta = unknowns.slopes(self.point.theta)
         for k, name in enumerate(unknowns.names[: unknowns.n_parameters]):
             slopes[k] = by_theta[self.model.names.index(name), k]
-        scaled = self.covariance * np.outer(slopes, slopes) * self.inflation**2
+        scaled = self.inflated_covariance * np.outer(slopes, slopes)
         return unknowns.names, np.asarray((scaled + scaled.T) / 2)
 
     def value(self, name: str) -> float:

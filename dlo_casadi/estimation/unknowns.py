@@ -141,6 +141,19 @@ class Unknowns:
         rest = np.full(self.n_rest, 20.0)
         return np.concatenate([lower, -rest]), np.concatenate([upper, rest])
 
+    @property
+    def widest(self) -> FloatArray:
+        """Standard deviations of theta of which nothing is known but its bounds: even between them.
+
+        Those of rest coefficients, which have a prior, are infinite.
+        """
+        width = []
+        for i in self._used:
+            q = self.model.parameters[i]
+            low, high = q.range
+            width.append(np.log(high / low) if q.log else (high - low) / q.scale)
+        return np.concatenate([np.array(width) / np.sqrt(12), np.full(self.n_rest, np.inf)])
+
     def reach(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of theta after one step: logarithms change by FARTHEST at most."""
         far = np.full(self.size, np.inf)

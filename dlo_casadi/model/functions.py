@@ -120,7 +120,7 @@ class Functions:
             ratio = ratio + ca.sqrt(self.terms.axial_compliance) * axial
         inner = ca.SX.sym("inner", kind.n_inner)
         slot = self.terms.slot(ratio, inner, inner**2)
-        energy = kind.expanded(slot, self.terms.slot_energy(slot), self.terms.bending_energy)
+        energy = kind.expanded(slot, self.terms.slot_energy(slot), self.terms.elastic_energy)
         energy += self.model.chain.h * axial**2 / 2
         own = ca.reshape(unknowns[self.model.n_inner - kind.n_inner :], inner.shape)
         reached = ca.gradient(self.terms.work_of_multipliers(slot), self.terms.lam)

@@ -32,7 +32,7 @@ from dlo_casadi.model.cable_model import (
     TORSIONAL_STIFFNESS,
     CableModel,
 )
-from dlo_casadi.rod.element import Cell, Slot, Stiffness
+from dlo_casadi.rod.element import Cell, Section, Slot
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import Forces, SlotInFrame
 
@@ -48,15 +48,14 @@ class _Law:
     cable: Cable
     params: dict[str, ca.SX]
 
-    @property
-    def even(self) -> bool:
-        return self.effect.even
+    def along(self, cell: Cell) -> ca.SX:
+        return self.effect.along(cell, self.cable, self.params)
 
-    def factor(self, bend: ca.SX, cell: Cell) -> ca.SX:
-        return self.effect.factor(bend, cell, self.cable, self.params)
+    def of_bend(self, square: ca.SX) -> ca.SX:
+        return self.effect.of_bend(square, self.cable, self.params)
 
-    def tangent(self, bend: ca.SX, cell: Cell) -> ca.SX:
-        return self.effect.tangent(bend, cell, self.cable, self.params)
+    def tangent(self, square: ca.SX) -> ca.SX:
+        return self.effect.tangent(square, self.cable, self.params)
 
 
 @dataclass(frozen=True)
@@ -289,44 +288,36 @@ class Lagrangian:
             square=square,
         )
 
-    def bending_energy(self, slot: Slot) -> ca.SX:
+    def elastic_energy(self, slot: Slot) -> ca.SX:
         """Energy of bending and twist of a slot [J]."""
-        laws = [
-            _Law(effect, self.model.cable, local) for effect, local in self.effects_of(SectionLaw)
-        ]
-        return self.model.chain.kind.bending(slot, self.stiffness, laws)
+        return self.model.chain.kind.elastic(slot, self.section)
 
     @property
-    def bending_stiffness(self) -> ca.SX:
-        """EI [N m^2], section laws aside."""
-        return self.p[self.model.names.index(BENDING_STIFFNESS)]
-
-    @property
-    def stiffness(self) -> Stiffness:
-        """Stiffness of the section about its axes."""
-        if not self.model.in_space:
-            return Stiffness(self.bending_stiffness, ca.SX(0))
-        bending = self.bending_stiffness * ca.SX.eye(2)
-        for effect, local in self.effects_of(SectionLaw):
+    def section(self) -> Section:
+        """The section, its stiffnesses and laws."""
+        known = dict(zip(self.model.names, ca.vertsplit(self.p), strict=True))
+        bending = known[BENDING_STIFFNESS] * ca.SX.eye(len(self.model.node.curvatures))
+        filling = self.effects_of(SectionLaw)
+        for effect, local in filling:
             bending = effect.bending(bending, local)
-        return Stiffness(bending, self.p[self.model.names.index(TORSIONAL_STIFFNESS)])
+        laws = [_Law(effect, self.model.cable, local) for effect, local in filling]
+        return Section(bending, known.get(TORSIONAL_STIFFNESS, ca.SX(0)), laws)
 
     @cached_property
     def section_moment(self) -> ca.Function:
         """(bend [1/m], p) -> moment [N m] of the section in the middle of the cable.
 
-        M = dW/dk of the energy W = EI/2 k^2 factor(k) per length.
+        M = dW/dk of the energy W per length; in space about the material axis z.
         """
         bend, length = ca.SX.sym("bend"), self.model.cable.length
         cell = Cell(ca.SX(0.499 * length), ca.SX(0.002 * length), 0.002 * length)
-        energy = self.bending_stiffness / 2 * bend**2
-        for effect, local in self.effects_of(SectionLaw):
-            energy *= effect.factor(bend, cell, self.model.cable, local)
+        strain = ca.vertcat(ca.SX.zeros(len(self.model.node.strains) - 1), bend)
+        energy = self.section.density(strain, cell)
         return ca.Function("section_moment", [bend, self.p], [ca.gradient(energy, bend)])
 
     def slot_energy(self, slot: Slot) -> ca.SX:
         """Energy of bending and loads of one slot [J]: of the loads, minus their work along it."""
-        return self.bending_energy(slot) - self.work_along(slot, self.forces_on(slot))
+        return self.elastic_energy(slot) - self.work_along(slot, self.forces_on(slot))
 
     def work_along(self, slot: Slot, forces: list[ca.SX]) -> ca.SX:
         """Work of `_slot_forces` along a slot [J]."""
@@ -401,7 +392,7 @@ class Lagrangian:
         def rigid(expression: ca.SX) -> ca.SX:
             return ca.substitute(expression, ratio, self.stretch)
 
-        condensed = kind.condensed(slot, rigid(plain), self.bending_energy)
+        condensed = kind.condensed(slot, rigid(plain), self.elastic_energy)
         lagrangian, stretched = condensed.lagrangian, self.stretch
         if self.model.extensible:
             (tension,) = ca.substitute(
@@ -461,9 +452,9 @@ class Lagrangian:
         slot = self.slot(ratio, inner, inner**2)
         count = len(self.forces_on(slot)) + self.model.n_springs
         forces = ca.SX.sym("force", self.model.node.dimension, count)
-        energy = self.bending_energy(slot) - self.work_along(slot, ca.horzsplit(forces))
+        energy = self.elastic_energy(slot) - self.work_along(slot, ca.horzsplit(forces))
         tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
-        lagrangian = kind.expanded(slot, energy, self.bending_energy)
+        lagrangian = kind.expanded(slot, energy, self.elastic_energy)
         lagrangian -= self.axial_compliance * h * tension**2 / 2
         local, step = self.local
         own = [self.p, self.rest_strains, self.place, self.deviation, self.share_symbols]

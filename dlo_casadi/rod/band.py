@@ -137,6 +137,14 @@ class BandMatrix:
         """Largest entry of the diagonal blocks (m,)."""
         return np.maximum(np.abs(self.diagonal).max(axis=(1, 2, 3)), 1e-300)
 
+    @property
+    def row_sum(self) -> FloatArray:
+        """Largest sum of the sizes of a row of A (m,): no eigenvalue of A is farther from zero."""
+        rows = np.abs(self.diagonal).sum(axis=3)
+        rows[:, :-1] += np.abs(self.upper).sum(axis=3)
+        rows[:, 1:] += np.abs(self.upper).sum(axis=2)
+        return np.asarray(rows.max(axis=(1, 2)))
+
     def apply(self, vector: Vector) -> Vector:
         """Products of the matrices with (m, n, b, q), (m, k, q)."""
         x = _product(self.diagonal, vector.x)

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import prod
 from typing import ClassVar, Protocol
 
 import casadi as ca
@@ -51,32 +52,57 @@ class Cell:
 
 
 class Law(Protocol):
-    """A section law with its parameters: factors on the bending energy, see `SectionLaw`."""
+    """A section law with its parameters: factors on the elastic energy, see `SectionLaw`."""
 
-    @property
-    def even(self) -> bool:
-        """Whether the law is the same all along the cable."""
+    def along(self, cell: Cell) -> ca.SX:
+        """Factor on bending and torsion in a cell."""
 
-    def factor(self, bend: ca.SX, cell: Cell) -> ca.SX:
-        """Factor on EI/2 bend^2."""
+    def of_bend(self, square: ca.SX) -> ca.SX:
+        """Factor on the energy of bending alone, by the square of the bend."""
 
-    def tangent(self, bend: ca.SX, cell: Cell) -> ca.SX:
-        """Factor on the stiffness against a small change of the bend."""
+    def tangent(self, square: ca.SX) -> ca.SX:
+        """Factor on the stiffness against a small change of such a bend."""
 
 
 @dataclass(frozen=True)
-class Stiffness:
-    """What a section resists with.
+class Section:
+    """What a section resists bending and twist with.
+
+        W = a (b(|k|) k^T B k + GJ tau^2) / 2                           [N]
+
+    of the curvature k and the twist tau beyond those at rest [1/m], with the products a of the
+    laws' factors along the cable and b of their factors by the size of the bend.
 
     Parameters
     ----------
-    bending : scalar EI [N m^2]; in space (2, 2), about the material axes y and z
+    bending : (1, 1) or (2, 2) [N m^2]
+        B: EI in a plane; in space about the material axes y and z.
     torsion : scalar GJ [N m^2]
-        0 in a plane.
+    laws : sequence of Law
     """
 
     bending: ca.SX
     torsion: ca.SX
+    laws: Sequence[Law] = ()
+
+    def density(self, strain: ca.SX, cell: Cell) -> ca.SX:
+        """Energy per length [N] of strains beyond those at rest [1/m], see `Node.strains`."""
+        axes = self.bending.size1()
+        twist, bend = strain[:-axes], strain[-axes:]
+        bent = self.of_bend(ca.sumsqr(bend)) * ca.dot(bend, ca.mtimes(self.bending, bend))
+        return self.along(cell) * (bent + self.torsion * ca.sumsqr(twist)) / 2
+
+    def along(self, cell: Cell) -> ca.SX:
+        """Factor on bending and torsion in a cell."""
+        return prod((law.along(cell) for law in self.laws), start=ca.SX(1))
+
+    def of_bend(self, square: ca.SX) -> ca.SX:
+        """Factor on the energy of bending, by the square of the bend."""
+        return prod((law.of_bend(square) for law in self.laws), start=ca.SX(1))
+
+    def tangent(self, square: ca.SX) -> ca.SX:
+        """Factor on the stiffness against a small change of such a bend, of one law exact."""
+        return prod((law.tangent(square) for law in self.laws), start=ca.SX(1))
 
 
 @dataclass(frozen=True)
@@ -254,24 +280,24 @@ class Element(ABC):
         ]
         return slot.length * u * sum(parts[1:], start=parts[0])
 
-    def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
-        """Elastic energy [J]: of the cell's mean bend, EI/2 (curvature - rest curvature)^2."""
-        bend = self.bend(slot)
-        density = stiffness.bending / 2 * bend**2
-        for law in laws:
-            density = density * law.factor(bend, slot.cell)
-        return slot.has_cell * slot.cell.width * density * slot.stretch
+    def elastic(self, slot: Slot, section: Section) -> ca.SX:
+        """Elastic energy [J] of the cell: the mean over the points of `bends`."""
+        bends = self.bends(slot)
+        cells = [slot.cell] if len(bends) == 1 else list(slot.cell.halves)
+        densities = [section.density(k, cell) for k, cell in zip(bends, cells, strict=True)]
+        mean = sum(densities[1:], start=densities[0]) / len(densities)
+        return slot.has_cell * slot.cell.width * mean * slot.stretch
 
-    def bend(self, slot: Slot) -> ca.SX:
-        """Curvature minus rest curvature of the cell [1/m]."""
-        return self.strain(slot) - slot.rest[0]
+    def bends(self, slot: Slot) -> list[ca.SX]:
+        """Strains minus those at rest [1/m]: of the cell, or at two Gauss points, one a half."""
+        return [self.strain(slot) - slot.rest[::3]]
 
     def condensed(
-        self, slot: Slot, lagrangian: ca.SX, bending: Callable[[Slot], ca.SX]
+        self, slot: Slot, lagrangian: ca.SX, elastic: Callable[[Slot], ca.SX]
     ) -> Condensed:
         """Eliminate the inner unknowns from the slot's Lagrangian, which is given with them."""
         return Condensed(lagrangian, slot.inner, slot.square)
 
-    def expanded(self, slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]) -> ca.SX:
+    def expanded(self, slot: Slot, energy: ca.SX, elastic: Callable[[Slot], ca.SX]) -> ca.SX:
         """Energy that is minimised over the inner unknowns; the same minimum as `condensed`."""
         return energy

@@ -15,14 +15,14 @@ to fourth order: Magnus expansion, e.g. Iserles et al., Acta Numerica 9 (2000).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import factorial
 
 import casadi as ca
 import numpy as np
 
 from dlo_casadi.rod.arc import Arc
-from dlo_casadi.rod.element import Condensed, Element, Law, Layout, Slot, Stiffness
+from dlo_casadi.rod.element import Condensed, Element, Layout, Slot
 from dlo_casadi.rod.node import SINE, Frame, conjugate, quaternion_product, rotated, series
 
 # Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
@@ -75,41 +75,9 @@ class Helix(Element):
         """Mean twist, and mean curvatures about the axes y and z."""
         return slot.local[4:] / (slot.length * slot.stretch)
 
-    def bends(self, slot: Slot) -> list[ca.SX]:
-        """Twist and curvatures minus those at rest (3,) [1/m] at the Gauss points."""
-        return [self.strain(slot) - _rest(slot, 0.0)]
-
-    def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
-        """Energy of bending and twist [J], the mean over the Gauss points.
-
-            W = 1/2 (k - k_0)^T B (k - k_0) + 1/2 GJ (tau - tau_0)^2
-
-        times the factors of the section laws, of each half of the cell at its own point.
-        """
-        bends = self.bends(slot)
-        cells = [slot.cell] if len(bends) == 1 else list(slot.cell.halves)
-        total = ca.SX(0)
-        for bend, cell in zip(bends, cells, strict=True):
-            density = stiffness.torsion / 2 * bend[0] ** 2
-            density += ca.dot(bend[1:], ca.mtimes(stiffness.bending, bend[1:])) / 2
-            for law in laws:
-                density = density * law.factor(_size(bend[1:]), cell)
-            total += density / len(bends)
-        return slot.cell.width * total * slot.stretch
-
     def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
         """The x axis of the frame at the fraction u."""
         return slot.ratio * rotated(slot.local[:4], _turned(slot.local[4:], u - 0.5))
-
-
-def _rest(slot: Slot, x: float) -> ca.SX:
-    """Rest twist and rest curvatures (3,) at x from -1/2 to 1/2 of the element."""
-    return ca.vertcat(*(slot.rest[3 * i] + x * slot.rest[3 * i + 1] for i in range(3)))
-
-
-def _size(bend: ca.SX) -> ca.SX:
-    """Size of a bend about two axes [1/m], rounded at 1e-6/m."""
-    return ca.sqrt(ca.sumsqr(bend) + 1e-12)
 
 
 def _turned(phi: ca.SX, x: ca.SX | float) -> ca.SX:
@@ -145,7 +113,8 @@ class BowedHelix(Helix):
         phi, beta = slot.local[4:], slot.inner
         mean = phi + 2 / 3 * ca.cross(phi, beta)
         width = slot.length * slot.stretch
-        return [(mean - 8 * x * beta) / width - _rest(slot, x) for x in (-_GAUSS, _GAUSS)]
+        rest, slope = slot.rest[::3], slot.rest[1::3]
+        return [(mean - 8 * x * beta) / width - rest - x * slope for x in (-_GAUSS, _GAUSS)]
 
     def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
         """The helix's, turned by the bow to first order."""
@@ -157,28 +126,28 @@ class BowedHelix(Helix):
         return rotated(middle, slot.ratio * _turned(phi, x) + slot.stretch * bowed)
 
     def condensed(
-        self, slot: Slot, lagrangian: ca.SX, bending: Callable[[Slot], ca.SX]
+        self, slot: Slot, lagrangian: ca.SX, elastic: Callable[[Slot], ca.SX]
     ) -> Condensed:
         """Minimum over the bow, resisted by the section alone."""
-        torque, given, elastic = self._of_bow(slot, lagrangian, bending)
-        bow = -ca.mtimes(inverse_of(elastic), torque)
+        torque, given, own = self._of_bow(slot, lagrangian, elastic)
+        bow = -ca.mtimes(inverse_of(own), torque)
         return Condensed(given + ca.dot(torque, bow) / 2, bow, slot.square)
 
-    def expanded(self, slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]) -> ca.SX:
+    def expanded(self, slot: Slot, energy: ca.SX, elastic: Callable[[Slot], ca.SX]) -> ca.SX:
         """To second order in the bow, as in `condensed`."""
-        torque, given, elastic = self._of_bow(slot, energy, bending)
+        torque, given, own = self._of_bow(slot, energy, elastic)
         bow = slot.inner
-        return given + ca.dot(torque, bow) + ca.dot(bow, ca.mtimes(elastic, bow)) / 2
+        return given + ca.dot(torque, bow) + ca.dot(bow, ca.mtimes(own, bow)) / 2
 
     @staticmethod
     def _of_bow(
-        slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]
+        slot: Slot, energy: ca.SX, elastic: Callable[[Slot], ca.SX]
     ) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Slope of an energy by the bow at 0, its value, and the section's own stiffness."""
-        elastic, _ = ca.hessian(bending(slot), slot.inner)
-        whole = [ca.gradient(energy, slot.inner), energy, elastic]
-        torque, given, elastic = ca.substitute(whole, [slot.inner], [ca.SX.zeros(3)])
-        return torque, given, elastic
+        own, _ = ca.hessian(elastic(slot), slot.inner)
+        whole = [ca.gradient(energy, slot.inner), energy, own]
+        torque, given, own = ca.substitute(whole, [slot.inner], [ca.SX.zeros(3)])
+        return torque, given, own
 
 
 def inverse_of(a: ca.SX) -> ca.SX:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
 
 from dlo_casadi.rod.arc import Arc
-from dlo_casadi.rod.element import Condensed, Law, Slot, Stiffness
+from dlo_casadi.rod.element import Condensed, Section, Slot
 from dlo_casadi.rod.node import Heading
 
 
@@ -31,38 +31,31 @@ class Quadratic(Arc):
         bowed = ca.vertcat(-across * s - back * c, across * c - back * s)
         return slot.ratio * ca.vertcat(c, s) + slot.stretch * bowed
 
-    def bending(self, slot: Slot, stiffness: Stiffness, laws: Sequence[Law]) -> ca.SX:
-        """Energy of the mean bend and of the bow; uneven section laws by halves of the cell."""
-        bend, cell = self.bend(slot), slot.cell
-        density, tangent, uneven = stiffness.bending / 2 * bend**2, ca.SX(1), ca.SX(0)
-        for law in laws:
-            if law.even:
-                density = density * law.factor(bend, cell)
-                tangent = tangent * law.tangent(bend, cell)
-                continue
-            first, second = (law.factor(bend, half) for half in cell.halves)
-            density = density * (first + second) / 2
-            tangent = tangent * (first + second) / 2
-            uneven += (first - second) / (first + second)
+    def elastic(self, slot: Slot, section: Section) -> ca.SX:
+        """Energy of the bend at two Gauss points, one a half, to second order in the bow."""
+        (bend,), q = self.bends(slot), ca.SX.sym("q")
+        moment = bend * ca.substitute(ca.gradient(section.of_bend(q) * q, q), q, bend**2)
+        first, second = (section.along(half) for half in slot.cell.halves)
         # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
         bowed = 4 / np.sqrt(3) * slot.inner * (1 / (slot.length * slot.stretch))
+        mean = section.of_bend(bend**2) * bend**2 + section.tangent(bend**2) * bowed**2
         # Where the halves resist differently, a mean bend bows the cell.
-        density += stiffness.bending / 2 * tangent * (bowed**2 + 2 * uneven * bend * bowed)
-        return cell.width * density * slot.stretch
+        density = (first + second) / 2 * mean + (first - second) * moment * bowed
+        return slot.cell.width * section.bending / 2 * density * slot.stretch
 
     def condensed(
-        self, slot: Slot, lagrangian: ca.SX, bending: Callable[[Slot], ca.SX]
+        self, slot: Slot, lagrangian: ca.SX, elastic: Callable[[Slot], ca.SX]
     ) -> Condensed:
         """Second-order minimum over the bow, its stiffness kept positive under compression."""
         torque = ca.gradient(lagrangian, slot.inner)
-        elastic = ca.jacobian(ca.gradient(bending(slot), slot.inner), slot.inner)
-        whole = [lagrangian, torque, ca.jacobian(torque, slot.inner), elastic]
-        given, torque, stiffness, elastic = ca.substitute(whole, [slot.inner], [ca.SX(0)])
-        factor, slope = _stiffening(stiffness / elastic - 1)
-        bow = -torque / (elastic * factor)
+        own = ca.jacobian(ca.gradient(elastic(slot), slot.inner), slot.inner)
+        whole = [lagrangian, torque, ca.jacobian(torque, slot.inner), own]
+        given, torque, stiffness, own = ca.substitute(whole, [slot.inner], [ca.SX(0)])
+        factor, slope = _stiffening(stiffness / own - 1)
+        bow = -torque / (own * factor)
         return Condensed(given + torque * bow / 2, bow, bow**2 * slope)
 
-    def expanded(self, slot: Slot, energy: ca.SX, bending: Callable[[Slot], ca.SX]) -> ca.SX:
+    def expanded(self, slot: Slot, energy: ca.SX, elastic: Callable[[Slot], ca.SX]) -> ca.SX:
         """To second order in the bow, as in `condensed`."""
         torque = ca.gradient(energy, slot.inner)
         stiffness = ca.jacobian(torque, slot.inner)

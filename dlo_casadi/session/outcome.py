@@ -40,7 +40,8 @@ class ParameterEstimate:
     interval_95 : (float or None, float or None), optional
         Profile-likelihood interval; None in it = unbounded; absent = not computed.
     identifiable : bool, optional
-        False where the interval is unbounded or spans more than a factor of ten.
+        False where the interval is unbounded or spans more than a factor of ten; of a parameter
+        without one, where the measurements tell less than its bounds do, whose width std then is.
     at_bound : bool
         Whether the value sits on a physical bound.
     """

@@ -301,7 +301,11 @@ def fitted_parameters(
         value = fit.value(qualified)
         at_bound = min(value - q.lower, q.upper - value) < 1e-9 * q.scale
         parameters[qualified] = ParameterEstimate(
-            value, fit.std(qualified), q.unit, at_bound=at_bound
+            value,
+            fit.std(qualified),
+            q.unit,
+            identifiable=fit.is_determined(qualified),
+            at_bound=at_bound,
         )
     return parameters
 
@@ -315,8 +319,8 @@ def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
     axes = len(model.node.curvatures)
     basis = np.kron(np.eye(axes), model.rest.basis(s))
     tail = slice(unknowns.n_parameters, unknowns.size)
-    scaled = basis * model.cable.curvature_scale * fit.inflation
-    variance = np.einsum("ik,kl,il->i", scaled, fit.covariance[tail, tail], scaled)
+    scaled = basis * model.cable.curvature_scale
+    variance = np.einsum("ik,kl,il->i", scaled, fit.inflated_covariance[tail, tail], scaled)
     std = np.sqrt(np.maximum(variance, 0))
     value = basis @ fit.coefficients
     shape = (axes, len(s)) if model.in_space else (len(s),)

@@ -326,9 +326,10 @@ def test_round_trip_with_noise_within_three_sigma(element, markers):
 
 
 def test_standard_deviations_match_the_scatter_of_the_normal_equations():
-    """Covariance times Hessian is one; correlations are correlations."""
+    """Covariance times Hessian is one, bounds included; correlations are correlations."""
     fit, *_ = round_trip("arc")
-    product = fit.covariance @ fit.normal.hessian
+    bounds = np.diag(1 / fit.problem.unknowns.widest**2)
+    product = fit.covariance @ (fit.normal.hessian + bounds)
     np.testing.assert_allclose(product, np.eye(len(product)), atol=1e-6)
     std = np.sqrt(np.diag(fit.covariance))
     assert np.abs(fit.covariance / np.outer(std, std)).max() < 1 + 1e-9

@@ -11,7 +11,7 @@ import pytest
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.rod.chain import ELEMENTS, Chain
-from dlo_casadi.rod.element import Slot, Stiffness
+from dlo_casadi.rod.element import Section, Slot
 
 LENGTH = 0.8  # m
 ROUNDING = 1e-14  # a dozen sums of numbers of order one
@@ -305,22 +305,22 @@ def test_the_bow_is_the_least_energy_of_its_element(pull):
     plain = slots_of(chain, np.zeros(3))[0]
     slot = Slot(**{**vars(plain), "inner": bow, "square": bow**2})
 
-    def bending(slot: Slot) -> ca.SX:
-        return kind.bending(slot, Stiffness(ca.SX(stiffness), ca.SX(0)), ())
+    def elastic(slot: Slot) -> ca.SX:
+        return kind.elastic(slot, Section(ca.SX(stiffness), ca.SX(0)))
 
-    lagrangian = bending(slot) - ca.dot(ca.DM([pull, across]), kind.advance(slot))
-    found = kind.condensed(slot, lagrangian, bending)
+    lagrangian = elastic(slot) - ca.dot(ca.DM([pull, across]), kind.advance(slot))
+    found = kind.condensed(slot, lagrangian, elastic)
     energy = ca.Function("energy", [bow], [lagrangian])
-    elastic = 16 / 3 * stiffness / chain.h  # int (4 (1 - 2u) / h)^2 h du
+    own = 16 / 3 * stiffness / chain.h  # int (4 (1 - 2u) / h)^2 h du
     geometric = pull * chain.h * 8 / 15  # int (4u (1 - u))^2 h du
     torque = across * chain.h * 2 / 3  # int 4u (1 - u) h du
-    x = geometric / elastic
+    x = geometric / own
     if pull >= 0:
-        exact = torque / (elastic + geometric)
+        exact = torque / (own + geometric)
         assert number(found.inner) == pytest.approx(exact, rel=1e-12)
         assert number(found.lagrangian) == pytest.approx(float(energy(exact)), abs=1e-15)
     else:
-        stiff = torque / number(found.inner) / elastic
+        stiff = torque / number(found.inner) / own
         assert 0.25 < stiff <= 1.0
         if abs(x) < 0.1:
             # 1 + x + O(x^3): a quarter at infinity, so 64/27 / 4 of x^3, twice that in sum.
