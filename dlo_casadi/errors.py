@@ -14,6 +14,11 @@ def well_formed(text: str) -> str:
     return text.encode(errors="backslashreplace").decode()
 
 
+def counted(number: int, noun: str, form: str = "d") -> str:
+    """A number of things with a regular plural: 1 pose, 2 poses."""
+    return f"{number:{form}} {noun}{'' if number == 1 else 's'}"
+
+
 class DloError(Exception):
     """Base class of all errors raised on purpose by dlo_casadi.
 

@@ -18,8 +18,8 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import EDGE, spread_across
-from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.equilibrium.spread import EDGE, displacements, spread_across
+from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.io.parameters import Parameters, load_parameters
 from dlo_casadi.model.assembly import Given, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -52,8 +52,8 @@ class CableCurve(NodeCurve):
         outside = places[~((places >= -slack) & (places <= self.length + slack))]
         if len(outside):
             raise DloError(
-                f"s = {outside[0]:g} m is not on the cable: {len(outside)} of {len(places)} arc "
-                f"lengths lie outside 0 to {self.length:g} m.\n"
+                f"s = {outside[0]:g} m is not on the cable: {len(outside)} of "
+                f"{counted(len(places), 'arc length')} lie outside 0 to {self.length:g} m.\n"
                 "  Try: arc lengths in metres from the start."
             )
         return super().at(np.clip(places, 0.0, self.length), derivative)
@@ -90,8 +90,9 @@ class PredictedShape:
         """
         model, p, rest, metadata = self.cable
         s = np.linspace(0.0, self.curve.length, count)
-        std = spread_across(model, p, rest, self.pose, self.equilibrium, metadata.uncertainty, s)
-        return np.asarray(EDGE * np.linalg.norm(std, axis=1))
+        known = metadata.uncertainty
+        curve, moved = displacements(model, p, rest, self.pose, self.equilibrium, known, s)
+        return np.asarray(EDGE * np.linalg.norm(spread_across(curve, s, moved), axis=1))
 
     def points(self, count: int = 101) -> FloatArray:
         """Points (count, d) [m] evenly spaced along the cable, from start to end.

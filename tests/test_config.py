@@ -18,7 +18,7 @@ from dlo_casadi.config import (
 )
 from dlo_casadi.config.sections import DENSITY
 from dlo_casadi.effects import EFFECTS, Cable
-from dlo_casadi.errors import ConfigError
+from dlo_casadi.errors import ConfigError, counted
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted(ROOT.glob("configs/*.yaml"))
@@ -418,8 +418,8 @@ def test_counts_have_a_range(tmp_path, options, message):
 @pytest.mark.parametrize(
     ("options", "warning"),
     [
-        ("model: {n: 2}", "2 quadratic elements are so coarse that the mesh's own error can look"),
-        ("model: {n: 12, element: link}", "12 link elements are so coarse"),
+        ("model: {n: 2}", "2 quadratic elements: so coarse that the mesh's own error can look"),
+        ("model: {n: 12, element: link}", "12 link elements: so coarse"),
         ("model: {n: 2000}", "2000 elements take minutes and much memory"),
         ("estimation: {algorithm1_inner: cobyla, algorithm1_n: 200}", "COBYLA takes about 400 s"),
     ],
@@ -606,7 +606,7 @@ def test_several_photographs_are_of_space(tmp_path):
             (
                 "1]]}",
                 f"1]], distortion: {[0.1] * n}}}",
-                f"distortion: found {n} numbers; OpenCV knows 4, 5",
+                f"distortion: found {counted(n, 'number')}; OpenCV knows 4, 5",
             )
             for n in (1, 6, 13, 15)
         ),

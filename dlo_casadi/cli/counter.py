@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from dlo_casadi.cli.guard import signals
+from dlo_casadi.errors import counted
 from dlo_casadi.runtime.parallel import Tally
 
 # Without a terminal: no more than one line in so many seconds.
@@ -80,7 +81,7 @@ class Counter:
         done, total = self.size * tally.done, self.size * (tally.total or tally.done)
         if self.count is not None:
             done, total = min(done, self.count), self.count
-        text = f"{done:,} of {total:,} {self.noun}".replace(",", " ")
+        text = f"{done:,} of {counted(total, self.noun, ',')}".replace(",", " ")
         if tally.failed:
             text += f", {tally.failed} lost"
         if tally.remaining is not None and tally.done != tally.total:

@@ -10,6 +10,7 @@ from rich.console import Console
 from dlo_casadi.cli.counter import Counter
 from dlo_casadi.cli.guard import BAD_INPUT, OK
 from dlo_casadi.cli.options import add_jobs, command, console, print_json
+from dlo_casadi.errors import counted
 from dlo_casadi.fleet import FleetResult, Options, find_sessions, fit_fleet
 from dlo_casadi.fleet.outliers import judge
 from dlo_casadi.io.files import make_folder
@@ -60,11 +61,13 @@ def main(argv: Sequence[str]) -> int:
         with (
             Counter(Console(stderr=True), "sessions", chosen.quiet) as counter,
             open_executor(chosen.jobs, chosen.scheduler, logs) as executor,
+            Counter(Console(stderr=True), "session", chosen.quiet) as counter,
+            open_executor(chosen.jobs, chosen.scheduler, output / "logs") as executor,
         ):
 
             def begin(taken_over: int, left: int) -> None:
-                before = f", {taken_over} are finished" if taken_over else ""
-                counter.message(f"{len(sessions)} sessions{before}; results in {output}")
+                before = f", finished of them {taken_over}" if taken_over else ""
+                counter.message(f"{counted(len(sessions), 'session')}{before}; results in {output}")
 
             result = fit_fleet(
                 sessions,
@@ -97,7 +100,7 @@ def _summary(result: FleetResult, output: Path, quiet: bool) -> None:
     if len(odd) > 10:
         page.print(f"and {len(odd) - 10} more", markup=False)
     page.print(
-        f"{len(result.rows)} sessions, {len(result.failed)} without results: "
+        f"{counted(len(result.rows), 'session')}, {len(result.failed)} without results: "
         f"{output / 'index.html'}, {output / 'table.parquet'}",
         soft_wrap=True,
         markup=False,

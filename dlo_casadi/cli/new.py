@@ -12,7 +12,7 @@ from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, print_json
 from dlo_casadi.config.schema import schema_text
 from dlo_casadi.config.template import template
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
 
 EXAMPLES = """\
@@ -72,7 +72,8 @@ def main(argv: Sequence[str]) -> int:
         print_json({"files": [str(path) for path in written], "poses": len(files)})
     elif not chosen.quiet:
         left = text.count("FILL_IN") - 1  # one is in a comment
-        print(f"{target}: {len(files)} poses, {left} places to fill in, each marked FILL_IN")
+        places = f"{counted(left, 'place')} to fill in, each marked FILL_IN"
+        print(f"{target}: {counted(len(files), 'pose')}, {places}")
         print(f"then: dlo check {target}")
     return OK
 

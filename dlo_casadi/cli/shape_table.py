@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> int:
     output = chosen.output.resolve()
     plan = Plan(model, p, rest, chosen.branch, output.with_name(f"{output.name}.parts"))
     with (
-        Counter(Console(stderr=True), "poses", chosen.quiet, plan.chunk, poses.count) as counter,
+        Counter(Console(stderr=True), "pose", chosen.quiet, plan.chunk, poses.count) as counter,
         open_executor(chosen.jobs, chosen.scheduler) as executor,
     ):
         counts = shape_table(

@@ -33,7 +33,7 @@ from dlo_casadi.codegen.shapes import (
     SpaceSlope,
 )
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -197,7 +197,8 @@ class _Compiled(Generic[S]):
             out.ctypes.data,
         )
         if status:
-            raise DloError(f"no clearance ({STATUSES[status]}): {len(obstacles)} obstacles given")
+            count = counted(len(obstacles), "obstacle")
+            raise DloError(f"no clearance ({STATUSES[status]}): {count} given")
         found = out[0]
         return Gap(
             float(found["distance"]),

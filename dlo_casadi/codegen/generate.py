@@ -17,7 +17,7 @@ from dlo_casadi.codegen import plane, space
 from dlo_casadi.codegen.kernels import c_number
 from dlo_casadi.codegen.prefix import check_prefix
 from dlo_casadi.effects import MeasurementEffect, StateEffect
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
 
@@ -111,7 +111,8 @@ def _values(model: CableModel, prefix: str, digest: str) -> dict[str, str]:
         "FILE": f"{prefix}_solver",
         "TITLE": comment(model.cable.name),
         "VERSION": __version__,
-        "MODEL": f"{model.n} {model.element}s, start {model.start}, end {model.end}, effects: "
+        "MODEL": f"{counted(model.n, model.element)}, start {model.start}, end {model.end}, "
+        + "effects: "
         + (comment(", ".join(names)) or "none"),
         "HASH": digest,
         "DIMENSION": str(model.node.dimension),

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from dlo_casadi.config.problems import Place, Problem
 from dlo_casadi.effects.parameter import STIFFNESS_BOUNDS
+from dlo_casadi.errors import counted
 
 
 class Range(NamedTuple):
@@ -159,7 +160,7 @@ def implausible_quaternion(values: Sequence[float]) -> str:
     """What is wrong with an orientation (x, y, z, w); empty if its length is one."""
     belongs = "a unit quaternion [qx, qy, qz, qw] belongs here"
     if len(values) != 4:
-        return f"{belongs}, not {len(values)} numbers"
+        return f"{belongs}, not {counted(len(values), 'number')}"
     size = math.hypot(*values)
     return "" if abs(size - 1) <= _UNIT else f"{belongs}, its length is {size:.4g}"
 

@@ -29,7 +29,7 @@ from dlo_casadi.config.problems import Problem, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, File, Pose, SkippedPose
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS
 from dlo_casadi.effects import Cable as EffectsCable
-from dlo_casadi.errors import ConfigError
+from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS
 
 
@@ -325,13 +325,13 @@ def _oddities(file: File) -> list[str]:
     n, element, links = file.model.n, file.model.element, file.estimation.algorithm1_n
     if n is not None and n < _COARSE[ELEMENTS[element].order]:
         warnings.append(
-            f"model.n: {n} {element} elements are so coarse that the mesh's own error can look "
-            "like a missing effect. Without model.n the mesh is chosen from the data"
+            f"model.n: {counted(n, f'{element} element')}: so coarse that the mesh's own error "
+            "can look like a missing effect. Without model.n the mesh is chosen from the data"
         )
     if n is not None and n > _FINE:
         warnings.append(
-            f"model.n: {n} elements take minutes and much memory; the mesh that is chosen from "
-            f"the data, without model.n, never has more than {_FINE}"
+            f"model.n: {counted(n, 'element')} take minutes and much memory; the mesh that is "
+            f"chosen from the data, without model.n, never has more than {_FINE}"
         )
     if file.estimation.algorithm1_inner == "cobyla" and links > _COBYLA_LINKS:
         warnings.append(

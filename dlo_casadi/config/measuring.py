@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from dlo_casadi.config.limits import COORDINATE, MARKER, implausible_camera, implausible_pixels
 from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean
 from dlo_casadi.config.values import NonNegative, Number, Positive, Row, Section, Vector
+from dlo_casadi.errors import counted
 from dlo_casadi.model.tolerances import Tolerances as Known
 
 _STANDARD = Known()
@@ -32,7 +33,7 @@ class Camera(Section):
             raise Contradiction(Problem(("matrix",), text))
         if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
             text = (
-                f"found {len(self.distortion)} numbers; OpenCV knows 4, 5 "
+                f"found {counted(len(self.distortion), 'number')}; OpenCV knows 4, 5 "
                 "[k1, k2, p1, p2, k3], 8, 12 or 14"
             )
             raise Contradiction(Problem(("distortion",), text))

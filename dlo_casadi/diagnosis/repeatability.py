@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.thresholds import ALIKE, DIFFERENT, REPEATS
@@ -19,7 +20,8 @@ def limiting_spread(fit: Fit) -> float | None:
     spread = repeatability(fit.problem.history, fit.model.cable.length)
     if spread is None or fit.noise.source == "repeats":
         return spread
-    return spread if spread > REPEATS * fit.noise.std else None
+    floor = noise_distance(fit.problem.history, fit.noise.std)
+    return spread if spread > REPEATS * floor else None
 
 
 def alike(fit: Fit) -> list[tuple[str, ...]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -25,7 +25,9 @@ from dlo_casadi.diagnosis.selection import (
     misleads,
     p_with_closed_noise,
     ranking,
+    shortcoming,
     sidak,
+    why_lost,
 )
 from dlo_casadi.diagnosis.structure import (
     Structure,
@@ -51,6 +53,9 @@ from dlo_casadi.thresholds import (
     UNSEEN_LEFT,
     WORTH,
 )
+
+# Of a candidate beside others that explain what the declared model misses by far.
+NOT_NEAR = "does not come near the measured shapes"
 
 
 @dataclass(frozen=True)
@@ -135,6 +140,7 @@ class Search:
         current, validation = self.declared, self.validation
         added: list[AddedEffect] = []
         ranked: list[Ranked] = []
+        lost: dict[str, str] = {}
         for k in range(self.max_effects):
             self.step("search for a missing effect", k, self.max_effects)
             astray = current.noise.source == "misfit"
@@ -156,14 +162,19 @@ class Search:
                 ranked = ranking(screened, p_values, confirmed, tried)
             # What a second effect explains may be what the first one, if wrong, has left.
             apart = np.inf if added and not explaining else BIC_APART
-            chosen = choose(confirmed, apart)
+            chosen, misleading = choose(confirmed, apart), []
             while (
                 chosen
                 and not (explaining or chosen[0].candidate.nuisance)
                 and misleads(chosen[0].fit, current, validation)
             ):
+                misleading.append(chosen[0])
                 confirmed.remove(chosen[0])
                 chosen = choose(confirmed, apart)
+            if k == 0:
+                why = partial(shortcoming, validation=validation, doubt=self.doubt)
+                other = (lambda _: NOT_NEAR) if explaining else why
+                lost = why_lost(tried, confirmed, misleading, chosen, other)
             if chosen is None:
                 break
             winner, rivals = chosen
@@ -176,13 +187,17 @@ class Search:
                 again = p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
             if p_value > self.significance:
+                if not added:
+                    names = [item.candidate.name for item in (winner, *rivals)]
+                    lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
                 break
             current = closed
             after = cross_validate(current)
             added.append(AddedEffect(winner.candidate, p_value, validation, after, tuple(rivals)))
             validation = after
         self.step("search for a missing effect", self.max_effects, self.max_effects)
-        return self._ended(*self._pruned(current, added), tuple(ranked))
+        listed = tuple(replace(row, reason=lost.get(row.name, "")) for row in ranked)
+        return self._ended(*self._pruned(current, added), listed)
 
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
         """Backward step: without the effects that a later one has made superfluous.

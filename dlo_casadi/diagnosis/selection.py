@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,12 +47,16 @@ class AddedEffect:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate in the list of all that were tried."""
+    """A candidate in the list of all that were tried.
+
+    `reason`: why one that was refitted is neither added nor a rival; empty of others.
+    """
 
     name: str
     score: float
     p_value: float
     rmse_cross_validated: float | None
+    reason: str = ""
 
 
 def explained_by(current: Fit, tried: Iterable[Confirmed | None]) -> list[Confirmed]:
@@ -128,26 +132,32 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
 def improving(
     tried: Iterable[Confirmed | None], validation: CrossValidation, doubt: float | None
 ) -> list[Confirmed]:
-    """Refits that improve both the fit and what it predicts.
+    """Refits that improve both the fit and what it predicts."""
+    return [x for x in tried if x is not None and not shortcoming(x, validation, doubt)]
+
+
+def shortcoming(item: Confirmed, validation: CrossValidation, doubt: float | None) -> str:
+    """Why a refit does not improve both the fit and what it predicts; empty if it does.
 
     Hangings of one or two poses have in common whatever is wrong with their measurement. There
     whole hangings decide: a gain as large must have less than the probability `doubt` if those
     left out are predicted no better (Student's t).
     """
-    out = []
-    for item in tried:
-        if item is None or item.bic <= 0 or not item.validation.complete:
-            continue
-        # An effect that explains the fitted poses but predicts the others worse is none. A nuisance
-        # is in the model already; without its prior it predicts about as well.
-        worse = item.validation.error > validation.error
-        if item.candidate.nuisance:
-            worse = item.validation.clearly_worse_than(validation)
-        if worse:
-            continue
-        if doubt is None or validation.chance_of_gain(item.validation) < doubt:
-            out.append(item)
-    return out
+    if item.bic <= 0:
+        return f"explains less than its parameters cost: BIC {-item.bic:.3g} behind no effect"
+    if not item.validation.complete:
+        return "with it a pose that is left out cannot be predicted"
+    # An effect that explains the fitted poses but predicts the others worse is none. A nuisance
+    # is in the model already; without its prior it predicts about as well.
+    worse = item.validation.error > validation.error
+    if item.candidate.nuisance:
+        worse = item.validation.clearly_worse_than(validation)
+    if worse:
+        return _worse(item.validation, validation)
+    chance = 0.0 if doubt is None else validation.chance_of_gain(item.validation)
+    if doubt is not None and chance >= doubt:
+        return f"predicts what is left out no better than by chance: p = {chance:.2g}"
+    return ""
 
 
 def choose(
@@ -166,6 +176,46 @@ def choose(
     winner = max(close, key=lambda item: item.bic)
     rivals = [item for item in close if item is not winner and item.bic > winner.bic - apart]
     return winner, sorted(rivals, key=lambda item: -item.bic)
+
+
+def why_lost(
+    tried: Iterable[Confirmed | None],
+    confirmed: Sequence[Confirmed],
+    misleading: Sequence[Confirmed],
+    chosen: tuple[Confirmed, list[Confirmed]] | None,
+    why: Callable[[Confirmed], str],
+) -> dict[str, str]:
+    """Why refits are neither chosen nor rivals of the one that is, by the candidates' names.
+
+    Parameters
+    ----------
+    confirmed : sequence of Confirmed
+        Among which was chosen, without those that are `misleading`.
+    why : callable
+        Reason of a refit that is in neither of these.
+    """
+    reasons = {item.candidate.name: why(item) for item in tried if item is not None}
+    for item in misleading:
+        reasons[item.candidate.name] = "misleads: where only ends are known it predicts worse"
+    if chosen is None:
+        return reasons
+    winner, rivals = chosen
+    leader = min(confirmed, key=lambda item: item.validation.error)
+    for item in confirmed:
+        if item.validation.clearly_worse_than(leader.validation):
+            reasons[item.candidate.name] = _worse(item.validation, leader.validation)
+            reasons[item.candidate.name] += f" with {leader.candidate.name}"
+        else:
+            behind = winner.bic - item.bic
+            reasons[item.candidate.name] = f"BIC {behind:.3g} behind {winner.candidate.name}"
+    kept = {item.candidate.name for item in (winner, *rivals)}
+    return {name: reason for name, reason in reasons.items() if name not in kept}
+
+
+def _worse(one: CrossValidation, other: CrossValidation) -> str:
+    """That one predicts worse than another."""
+    errors = f"{1e3 * one.error:.3g} mm instead of {1e3 * other.error:.3g} mm"
+    return f"predicts what is left out worse: {errors}"
 
 
 def misleads(fit: Fit, before: Fit, validation: CrossValidation) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
+from math import dist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ class Structure:
         Of all points.
     runs_z : float
         Runs of equal sign along the arcs against independent points, as a normal score;
-        negative = fewer, longer runs. Whitened residuals.
+        negative = fewer, longer runs. Whitened residuals of points, component by component.
     order_z, span_z : float
         Rank correlation of the poses' slow energy with their order and with their span, as a
         normal score, at most LARGEST_SCORE.
@@ -132,18 +133,23 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
             for c, v in zip(coefficients, own, strict=True)
         ]
     )
-    names = [problem.measured[j].pose.name for j in problem.used]
-    spans = np.array([_span(fit, j) for j in problem.used])
+    poses = [problem.measured[j].pose for j in problem.used]
+    spans = np.array([0.0 if x.end is None else dist(x.start, x.end) for x in poses])
+    series = [
+        one
+        for j, e in zip(problem.used, lin.residuals, strict=True)
+        for one in problem.measured[j].along(e)
+    ]
     return Structure(
         statistic,
         dof,
         p_value,
         fit.chi2_per_dof,
-        _runs(lin.residuals),
+        _runs(series),
         _rank_score(energies, np.arange(len(energies), dtype=float)),
         _rank_score(energies, spans),
         _position_score(fit, noise_dof),
-        dict(zip(names, energies.tolist(), strict=True)),
+        dict(zip((pose.name for pose in poses), energies.tolist(), strict=True)),
         _systematic(fit),
     )
 
@@ -192,17 +198,10 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
     return -float(ndtri(np.clip(p_value, _TAIL, 1 - _TAIL)))
 
 
-def _span(fit: Fit, j: int) -> float:
-    pose = fit.problem.measured[j].pose
-    if pose.end is None:
-        return 0.0
-    return float(np.hypot(pose.end[0] - pose.start[0], pose.end[1] - pose.start[1]))
-
-
-def _runs(residuals: list[FloatArray]) -> float:
-    """Wald and Wolfowitz's runs test over all poses, as a normal score."""
+def _runs(series: list[FloatArray]) -> float:
+    """Wald and Wolfowitz's runs test over all series, as a normal score."""
     excess, variance = 0.0, 0.0
-    for e in residuals:
+    for e in series:
         positive = e > 0
         n1, n2 = int(positive.sum()), int((~positive).sum())
         n = n1 + n2

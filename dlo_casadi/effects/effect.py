@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dlo_casadi.effects.cable import Cable
 from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
+from dlo_casadi.errors import counted
 from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.thresholds import NEAR_END
@@ -138,8 +139,9 @@ class Effect:
             return ""
         own, other = ("a plane", "space") if setup.in_space else ("space", "a plane")
         return (
-            f"it is of cables in {own}, and gravity has {len(setup.gravity)} numbers: the cable is "
-            f"in {other}. Try: without it, or experiment.gravity"
+            f"it is of cables in {own}, and gravity has "
+            f"{counted(len(setup.gravity), 'number')}: the cable is in {other}. "
+            "Try: without it, or experiment.gravity"
         )
 
     def prior(self, setup: Setup) -> dict[str, float]:

@@ -54,7 +54,7 @@ def modes_in(model: CableModel) -> FloatArray:
     return np.kron(axes, modes_of(model.chain.cells, model.cable.length))
 
 
-def spread_across(
+def displacements(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
@@ -62,12 +62,12 @@ def spread_across(
     found: Equilibrium,
     uncertainty: Uncertainty,
     s: FloatArray,
-) -> FloatArray:
-    """Standard deviation (K, d - 1) [m] across the cable of the next hanging, at places s [m].
+) -> tuple[NodeCurve, FloatArray]:
+    """Curve of a pose, and displacements (K, d, q) [m] of its places s [m] in the next hanging.
 
-    First order: the fitted parameters' covariance, the fixtures' scatter and the rest curvature
-    of each hanging's own, carried to the shape by the equilibrium; what repeats of one pose differ
-    by, the same all along. The noise of a measurement comes on top.
+    Independent ones, a standard deviation of each. First order: the fitted parameters' covariance,
+    the fixtures' scatter and the rest curvature of each hanging's own, carried to the shape by the
+    equilibrium; what repeats of one pose differ by, the same all along.
     """
     sweep = Sweep(model, [pose])
     shapes, size = found.shapes, len(uncertainty.names)
@@ -81,20 +81,31 @@ def spread_across(
     along = sweep.directions(shapes, p, rest, by_p, by_rest)
     seen = sweep.observe(shapes, p, rest, along)
     curve = NodeCurve.of(model.cable.length, seen.z[0])
-    normals = curve.normals(s)
-
-    def across(slopes: FloatArray) -> FloatArray:
-        return np.einsum("knd,kdq->knq", normals, curve.moved(s, slopes))
-
-    way = across(seen.slopes[0])
-    fitted, own = way[..., :size], way[..., size:]
-    variance = np.einsum("knq,qr,knr->kn", fitted, uncertainty.covariance, fitted)
+    way = curve.moved(s, seen.slopes[0])
     scatter = np.array([uncertainty.scatter.get(name, 0.0) for name in model.deviations])
-    variance += ((own * np.where(np.isfinite(scatter), scatter, 0.0)) ** 2).sum(axis=2)
+    moved = [
+        way[..., :size] @ _root(uncertainty.covariance),
+        way[..., size:] * np.where(np.isfinite(scatter), scatter, 0.0),
+        np.broadcast_to(uncertainty.hanging * np.eye(curve.d), (len(s), curve.d, curve.d)),
+    ]
     if uncertainty.rest_scatter.std > 0:
         modes = modes_in(model)
         hanging = sweep.observe(shapes, p, rest, sweep.by_rest(shapes, p, rest, modes))
         sizes = np.tile(uncertainty.rest_scatter.sizes, modes.shape[1] // MODES)
-        variance += ((across(hanging.slopes[0]) * sizes) ** 2).sum(axis=2)
-    variance += uncertainty.hanging**2
-    return np.sqrt(np.maximum(variance, 0.0))
+        moved.append(curve.moved(s, hanging.slopes[0]) * sizes)
+    return curve, np.concatenate(moved, axis=2)
+
+
+def spread_across(curve: NodeCurve, s: FloatArray, moved: FloatArray) -> FloatArray:
+    """Standard deviation (K, d - 1) [m] across the cable of `displacements` at places s [m].
+
+    The noise of a measurement comes on top.
+    """
+    return np.linalg.norm(np.einsum("knd,kdq->knq", curve.normals(s), moved), axis=2)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Matrix A with A A^T = covariance, which may be singular."""
+    std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
+    return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

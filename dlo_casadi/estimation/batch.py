@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.curve import ObservedChange
 from dlo_casadi.equilibrium.ipopt import run_ipopt
-from dlo_casadi.errors import EstimationError
+from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.model.assembly import Shapes
@@ -83,8 +83,9 @@ def solve_batch(problem: BatchProblem, start: Point, max_solves: int = 4) -> Bat
         solves += 1
         if not stats["success"]:
             raise EstimationError(
-                f"the batch problem of {len(problem.used)} poses was not solved (IPOPT: "
-                f"{stats['return_status']} after {stats['iter_count']} iterations).\n"
+                f"the batch problem of {counted(len(problem.used), 'pose')} was not solved (IPOPT: "
+                f"{stats['return_status']} after "
+                f"{counted(int(stats['iter_count']), 'iteration')}).\n"
                 "  Try: more poses, or estimation.robust: true if some points are far off."
             )
         theta, shapes = nlp.unpack(vector, point.shapes)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.errors import EstimationError
+from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.linearization import Linearization, Point
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
@@ -253,14 +253,15 @@ def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
     spare = problem.n_residuals - fit.determined_unknowns - float(free[~on_points].sum())
     if spare < LEAST_SPARE:
         raise EstimationError(
-            f"the {on_points.sum()} distances of {len(problem.used)} fit poses determine "
+            f"the {counted(int(on_points.sum()), 'distance')} of "
+            f"{counted(len(problem.used), 'fit pose')} determine "
             f"{fit.determined_unknowns:.1f} unknowns (stiffness, rest curvature, deviations within "
             f"the tolerances): {max(spare, 0.0):.1f} degrees of freedom are left to estimate the "
             f"noise from, {LEAST_SPARE:g} are needed.\n"
             "  Try: more points on each line, more poses, the noise as measurement.std, or "
             "rest_shape: straight."
         )
-    weight = np.concatenate([x.relative_std[x.point_of[x.on_points]] for x in items])
+    weight = np.concatenate([x.relative_white[x.point_of[x.on_points]] for x in items])
     raw = np.concatenate(fit.linearization.raw)[on_points] / weight
     return NoiseModel(float(np.sqrt((raw**2).sum() / spare)), slow_dof=spare)
 
@@ -299,8 +300,8 @@ def _noise_samples(
     samples = []
     for j, raw, s, own, block in zip(problem.used, raws, point.feet, bases, blocks, strict=True):
         samples += [
-            NoiseSample(raw[rows], s[points], sensor.weight, own[rows], block[rows], sensor.grain)
-            for sensor, points, rows in problem.measured[j].slices
+            NoiseSample(raw[rows], s[points], x.weight, own[rows], block[rows], x.grain, x.count)
+            for x, points, rows in problem.measured[j].slices
         ]
     return samples
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.batch import Sweep
-from dlo_casadi.errors import EstimationError
+from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SMOOTH_MODES
 from dlo_casadi.estimation.result import Fit
@@ -52,8 +52,9 @@ def discretization_error(fit: Fit) -> float:
     sweep, shapes, rest, ok = on_mesh(fit, 2 * fit.model.n)
     if not ok:
         raise EstimationError(
-            f"the fitted shapes are no equilibria on a mesh of {2 * fit.model.n} elements: the "
-            f"mesh of {fit.model.n} is far too coarse.\n  Try: model.n larger."
+            "the fitted shapes are no equilibria on a mesh of "
+            f"{counted(2 * fit.model.n, 'element')}: the mesh of {fit.model.n} is far too coarse.\n"
+            "  Try: model.n larger."
         )
     fine = sweep.seen(shapes, fit.p, rest)
     coarse = fit.problem.observed(fit.point.theta, fit.point.shapes)
@@ -96,7 +97,7 @@ def mesh_error(fit: Fit) -> float:
 def allowed_mesh_error(fit: Fit) -> float:
     """Error of the mesh [m] that is far below the noise, or below what else is left."""
     left = LACKING_SHARE if fit.beyond_noise else MESH_SHARE
-    return max(MESH_SHARE * fit.noise.std, left * fit.residual_rms)
+    return max(MESH_SHARE * fit.compared_std, left * fit.residual_rms)
 
 
 def _finer(n: int, excess: float, element: str) -> int:

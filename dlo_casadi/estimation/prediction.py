@@ -317,6 +317,16 @@ def _continues(
     return False
 
 
+def noise_distance(measured: Sequence[MeasuredPose], std: float) -> float:
+    """RMS distance [m] of all measured points from the true curve, by noise of one coordinate.
+
+    Of white points sqrt(d - 1) `std` [m] for a line, which is compared across, and sqrt(d) `std`
+    for markers.
+    """
+    found = [item.noise_distances for item in measured if item.readable]
+    return std * float(np.sqrt((np.concatenate(found) ** 2).mean()))
+
+
 def rms_distance(
     predictions: Sequence[Prediction | None],
     measured: Sequence[MeasuredPose],

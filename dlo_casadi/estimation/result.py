@@ -211,16 +211,23 @@ class Fit:
         rows = [raw[on] for raw, on in zip(self.linearization.raw, self._on_points, strict=True)]
         return float(np.sqrt((np.concatenate(rows) ** 2).mean()))
 
+    @property
+    def compared_std(self) -> float:
+        """Standard deviation [m] of what the fit compares: of points, or of means of several."""
+        noise, items = self.noise, [self.problem.measured[j] for j in self.problem.used]
+        white = float(np.median(np.concatenate([item.relative_white for item in items])))
+        return noise.std * float(np.sqrt((1 - noise.share) * white**2 + noise.share))
+
     @cached_property
     def fixture_error(self) -> float:
-        """RMS displacement of a shape [m] by what its ends differ from where they are declared.
+        """RMS displacement of points [m] by what ends differ from where they are declared.
 
         The scatter of the poses' ends and headings, carried to the curve by the equilibrium. The
         fit estimates each pose's own; of a pose that is only predicted nobody knows them.
         """
         moved = self._by_fixtures
         rows = [square[on] for square, on in zip(moved, self._on_points, strict=True)]
-        return float(np.sqrt(np.concatenate(rows).mean()))
+        return float(np.sqrt(np.concatenate(rows).sum() / self._n_points))
 
     @property
     def _by_fixtures(self) -> list[FloatArray]:

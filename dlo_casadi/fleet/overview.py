@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from dlo_casadi import __version__
+from dlo_casadi.errors import counted
 from dlo_casadi.fleet.columns import Row, last_error
 from dlo_casadi.fleet.outliers import OUTLYING, Judged, judge
 
@@ -38,7 +39,7 @@ HEAD = (
     ("z of EI", ""),
     ("error [mm]", ""),
     ("z of error", ""),
-    ("noise [mm]", ""),
+    ("noise std [mm]", ""),
     ("effects", "text"),
     ("time [s]", ""),
 )
@@ -59,8 +60,8 @@ def overview_html(rows: Sequence[Row], output: Path) -> str:
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{len(rows)} sessions</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<h1>{len(rows)} sessions</h1>\n<p>{escape(_summary(judged))}</p>\n"
+        f"<title>{counted(len(rows), 'session')}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<h1>{counted(len(rows), 'session')}</h1>\n<p>{escape(_summary(judged))}</p>\n"
         f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{body}\n</tbody>\n</table></div>\n"
         "<p>Error: root mean square distance of the measured centre-lines from the prediction of "

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.codegen.compiled import Branch, CompiledSolver
 from dlo_casadi.codegen.generate import solver_hash
+from dlo_casadi.errors import counted
 from dlo_casadi.io.files import write_file
 from dlo_casadi.model.cable_model import CableModel
 
@@ -70,7 +71,7 @@ class Chunk:
     poses: FloatArray
 
     def __repr__(self) -> str:
-        return f"chunk {self.index} of {len(self.poses)} poses"
+        return f"chunk {self.index} of {counted(len(self.poses), 'pose')}"
 
 
 def part_type(n: int) -> np.dtype[Any]:

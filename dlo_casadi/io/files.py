@@ -6,7 +6,6 @@ as it was, no draft is left, and the error names the place, the system's reason 
 
 from __future__ import annotations
 
-import fcntl
 import os
 import secrets
 import shutil
@@ -15,6 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
+
+from filelock import FileLock, Timeout
 
 from dlo_casadi.errors import OutputError, well_formed
 
@@ -223,14 +224,13 @@ def only_run(folder: Path) -> Iterator[None]:
     """
     make_folder(folder)
     with _explained(folder):
-        stream = (folder / ".lock").open("w")
-    with stream:
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            held = FileLock(folder / ".lock", timeout=0).acquire()
+        except Timeout:
             raise OutputError(
                 f"another run is writing to {folder}; wait for its end", folder
             ) from None
+    with held:
         yield
 
 

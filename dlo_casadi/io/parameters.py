@@ -32,7 +32,7 @@ from dlo_casadi.config import (
 from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
 from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.errors import ConfigError, DloError
+from dlo_casadi.errors import ConfigError, DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import RestScatter
 from dlo_casadi.rod.chain import ELEMENTS
@@ -244,7 +244,8 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
     values = [_within_bounds(q, rows[q.name]) for q in model.parameters]
     metadata = metadata_of(document, source)
     if len(metadata.coefficients) != model.n_coefficients:
-        found = f": {model.n_coefficients} numbers belong here, found {len(metadata.coefficients)}"
+        count = len(metadata.coefficients)
+        found = f": {counted(model.n_coefficients, 'number')} belong here, found {count}"
         raise _DamagedError(("rest_curvature",), found)
     coefficients = [f"rest_curvature[{k}]" for k in range(model.n_coefficients)]
     for name in metadata.names:
@@ -374,7 +375,7 @@ def _within_bounds(q: Parameter, row: Mapping[str, Any]) -> float:
 def _numbers(values: ArrayLike, size: int, *where: str) -> FloatArray:
     array = np.array(values, dtype=float)
     if array.shape != (size,):
-        raise _DamagedError(where, f": {size} numbers belong here, found {array.size}")
+        raise _DamagedError(where, f": {counted(size, 'number')} belong here, found {array.size}")
     if not np.all(np.isfinite(array)):
         raise _DamagedError(where, ": all numbers must be finite")
     return array

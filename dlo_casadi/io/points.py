@@ -32,10 +32,40 @@ _COUNTS = {2: "two", 3: "three", 4: "four"}
 
 @dataclass(frozen=True)
 class MeasuredPoints:
-    """Points (K, d) [m] from start to end; of markers also the arc lengths `s` (K,) [m]."""
+    """Points along a cable.
+
+    Parameters
+    ----------
+    points : (K, d) [m]
+        From start to end.
+    s : (K,) [m], optional
+        Arc lengths of markers.
+    count : (K,) or one for all
+        Measured points of which each is the mean.
+    """
 
     points: npt.NDArray[np.float64]
     s: npt.NDArray[np.float64] | None = None
+    count: npt.NDArray[np.float64] | float = 1.0
+
+    def means(self, most: int) -> MeasuredPoints:
+        """Means of the points on each of at most so many equally long stretches.
+
+        White errors average out; a stretch that was not measured has no mean. The mean of a bow of
+        length h and curvature k lies k h^2 / 24 beside it: 5 um of a full circle of 1 m in 240.
+        """
+        along, every = self.s, np.arange(len(self.points))
+        if along is None:
+            # By chords that are longer than the noise: stretches must not depend on it.
+            ends = np.linspace(0, every[-1], min(most, len(every))).astype(int)
+            chords = np.linalg.norm(np.diff(self.points[ends], axis=0), axis=1)
+            along = np.interp(every, ends, np.concatenate([[0.0], np.cumsum(chords)]))
+        share = (along - along[0]) / (along[-1] - along[0])
+        stretch = np.minimum(most * share, most - 1).astype(int)
+        _, first, count = np.unique(stretch, return_index=True, return_counts=True)
+        points = np.add.reduceat(self.points, first) / count[:, None]
+        s = None if self.s is None else np.add.reduceat(self.s, first) / count
+        return MeasuredPoints(points, s, count.astype(float))
 
 
 def read_points(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.effects import Cable, Effect, Kinematics, Load, StateEffect
 from dlo_casadi.effects.parameter import STIFFNESS_BOUNDS, Parameter
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.rest_curvature import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
 from dlo_casadi.rod.ends import EndConditions, deviation_names
@@ -86,7 +86,7 @@ class CableModel:
     def __post_init__(self) -> None:
         if len(self.gravity) != len(self.cable.axes):
             raise DloError(
-                f"gravity has {len(self.gravity)} numbers, but the cable "
+                f"gravity has {counted(len(self.gravity), 'number')}, but the cable "
                 f"{'has no' if len(self.gravity) == 3 else 'has a'} torsional stiffness: in space "
                 "give both, in a plane neither"
             )

@@ -33,7 +33,7 @@ from dlo_casadi.equilibrium.initial_arcs import arc_headings
 from dlo_casadi.equilibrium.ipopt import run_ipopt
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import check_pose
-from dlo_casadi.errors import EquilibriumError, EstimationError
+from dlo_casadi.errors import EquilibriumError, EstimationError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -500,9 +500,10 @@ def _message(
     """Say in words how the loop ended."""
     count = len(history) - 1
     text = (
-        f"After {count} iteration{'' if count == 1 else 's'} ({seconds:.1f} s) {status.value}; "
+        f"After {counted(count, 'iteration')} ({seconds:.1f} s) {status.value}; "
         f"k_theta went from {history[0]:.3g} to {history[-1]:.3g} N m/rad."
     )
     if failed:
-        text += f" The shapes of {failed} of {n_poses} poses did not converge in the last one."
+        shapes = f"{failed} of {counted(n_poses, 'pose')}"
+        text += f" The shapes of {shapes} did not converge in the last one."
     return text

@@ -21,6 +21,8 @@ BLACK, GREY = "#000000", "#6B6B6B"
 ORANGE, SKY, GREEN = "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION = "#0072B2", "#D55E00"
 HELD_OUT = "#CC79A7"  # poses that no fit saw
+# By what name tables and charts have the RMS distance that the noise of points gives by itself.
+NOISE_ALONE = "noise alone"
 
 STAGE_LABELS: dict[StageName, str] = {
     "initial": "initial guess",

@@ -19,6 +19,7 @@ from dlo_casadi.report.canvas import (
     GREEN,
     GREY,
     HELD_OUT,
+    NOISE_ALONE,
     ORANGE,
     SKY,
     VERMILLION,
@@ -36,6 +37,7 @@ from dlo_casadi.report.geometry import (
     rest_about,
 )
 from dlo_casadi.report.scene import pull_marks, scene_of
+from dlo_casadi.report.text_findings import finding_of
 from dlo_casadi.session.outcome import Outcome
 
 # A candidate that was not refitted.
@@ -100,7 +102,7 @@ def draw_residuals(path: Path, outcome: Outcome) -> None:
         handles.append(_noise_band())
         drawing.legend(handles=handles, loc="outside lower center", ncols=3)
         drawing.suptitle(
-            f"{outcome.config.cable.name}: measured minus predicted, noise "
+            f"{outcome.config.cable.name}: measured minus predicted, noise std "
             f"{millimetres(outcome.measurement.std)} ({outcome.measurement.std_source})",
             fontsize=12,
         )
@@ -213,7 +215,7 @@ def draw_moment(path: Path, outcome: Outcome) -> None:
 
 
 def draw_errors(path: Path, outcome: Outcome) -> None:
-    """Errors of all stages as points on a logarithmic axis, with the noise of the lines."""
+    """Errors of all stages as points on a logarithmic axis, with that of noise alone."""
     rows: list[tuple[str, str, float | None]] = []
     for stage in outcome.stages:
         label = label_of(stage, outcome)
@@ -221,7 +223,7 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
         if outcome.measurement.poses_held_out:
             rows.append((label, "held_out", stage.rmse_held_out))
     known = [value for *_, value in rows if value and np.isfinite(value)]
-    floor = outcome.measurement.std
+    floor = outcome.measurement.noise_distance
     left, right = min([*known, floor]) / 2, 3.5 * max([*known, floor])
     per_stage = 2 if outcome.measurement.poses_held_out else 1
     with figure(path, (8.5, 1.7 + 0.36 * len(rows))) as drawing:
@@ -259,7 +261,7 @@ def draw_errors(path: Path, outcome: Outcome) -> None:
         if per_stage == 2:
             handles.append(_dot("s", HELD_OUT, "held-out poses"))
         handles.append(
-            Line2D([], [], color=BLACK, ls="--", label=f"noise floor {millimetres(floor)}")
+            Line2D([], [], color=BLACK, ls="--", label=f"{NOISE_ALONE} {millimetres(floor)}")
         )
         drawing.legend(handles=handles, loc="outside lower center", ncols=3)
         drawing.suptitle(f"{outcome.config.cable.name}: error of each stage", fontsize=12)
@@ -278,19 +280,23 @@ def draw_candidates(path: Path, outcome: Outcome) -> None:
     tied = {name for effect in outcome.effects for name in effect["indistinguishable_from"]}
     rows = list(outcome.candidates)
     scores = [row["score"] or 0.0 for row in rows]
-    with figure(path, (8.5, 1.9 + 0.3 * len(rows))) as drawing:
+    with figure(path, (8.5, 1.9 + 0.36 * len(rows))) as drawing:
         axes = drawing.subplots()
         for k, (row, score) in enumerate(zip(rows, scores, strict=True)):
-            lost = _UNTRIED if row["rmse_cross_validated"] is None else GREY
+            tried = row["reason"] or row["rmse_cross_validated"] is not None
+            lost = GREY if tried else _UNTRIED
             known = BLUE if row["name"] in added else lost
             color = ORANGE if row["name"] in tied else known
-            axes.barh(-k, score, height=0.72, color=color)
+            axes.barh(-k, score, height=0.5, color=color)
+            if color == GREY:
+                axes.text(0, -k - 0.38, f" {finding_of(outcome, row)[1]}", va="center", fontsize=7)
             error = row["rmse_cross_validated"]
             text = f" {score:,.0f}" if score >= 100 else f" {score:.2g}"
             text += "" if error is None else f"   cross-validated {millimetres(error)}"
             axes.text(score, -k, text, va="center", fontsize=9)
         axes.set_yticks([-k for k in range(len(rows))], [row["name"] for row in rows])
         axes.set_xlim(0, 1.55 * max([*scores, 1e-9]))
+        axes.set_ylim(0.5 - len(rows), 0.5)
         axes.grid(visible=False, axis="y")
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
         axes.set_xlabel("score: fall of chi-square that adding it promises")
@@ -300,7 +306,7 @@ def draw_candidates(path: Path, outcome: Outcome) -> None:
             Patch(color=GREY, label="refitted, not added"),
             Patch(color=_UNTRIED, label="not refitted"),
         ]
-        refitted = [row["rmse_cross_validated"] is not None for row in rows]
+        refitted = [bool(row["reason"]) or row["rmse_cross_validated"] is not None for row in rows]
         shown = [bool(added), bool(tied), sum(refitted) > len(added | tied), not all(refitted)]
         handles = [handle for handle, show in zip(handles, shown, strict=True) if show]
         drawing.legend(handles=handles, loc="outside lower center", ncols=2)

@@ -10,7 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dlo_casadi.report.canvas import BLACK, BLUE, HELD_OUT, label_of, styled
+from dlo_casadi.errors import counted
+from dlo_casadi.report.canvas import BLACK, BLUE, HELD_OUT, NOISE_ALONE, label_of, styled
 from dlo_casadi.report.figures_room import draw_marks, frame_room
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.room import seen
@@ -34,7 +35,7 @@ def outcome_text(outcome: Outcome) -> str:
     lines += ["  " + "  ".join(row) for row in _errors(outcome)]
     warnings = len(all_warnings(outcome))
     if warnings:
-        lines.append(f"  {warnings} warnings: see .warnings")
+        lines.append(f"  {counted(warnings, 'warning')}: see .warnings")
     return "\n".join(lines)
 
 
@@ -98,7 +99,7 @@ def _parameters(outcome: Outcome) -> list[tuple[str, ...]]:
 
 
 def _errors(outcome: Outcome) -> list[tuple[str, ...]]:
-    """RMS distance of the measured points from the predicted shapes, and the noise."""
+    """RMS distance of the measured points from the predicted shapes, and by noise alone."""
     stage = outcome.stages[-1]
     rows = [("error of the fit", _mm(stage.rmse_fit))]
     if stage.rmse_held_out is not None:
@@ -108,7 +109,8 @@ def _errors(outcome: Outcome) -> list[tuple[str, ...]]:
         both = (stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch)
         rows.append((ON_BRANCH, ", ".join(_mm(value) for value in both if value is not None)))
     measurement = outcome.measurement
-    return [*rows, (f"noise ({measurement.std_source})", _mm(measurement.std))]
+    floor = (f"{NOISE_ALONE} ({measurement.std_source})", _mm(measurement.noise_distance))
+    return [*rows, floor]
 
 
 def _mm(value: float | None) -> str:

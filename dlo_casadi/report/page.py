@@ -11,6 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from dlo_casadi.errors import counted
 from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.page_pictures import pictures, scene_pictures
 from dlo_casadi.report.page_views import view_pictures_of
@@ -105,7 +106,12 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"units": units, "breakable": breakable, "vector": vector}
+    environment.filters |= {
+        "units": units,
+        "breakable": breakable,
+        "vector": vector,
+        "counted": counted,
+    }
     return environment
 
 

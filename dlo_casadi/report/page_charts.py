@@ -53,7 +53,7 @@ def charts(outcome: Outcome) -> dict[str, str]:
 
 
 def errors_chart(outcome: Outcome) -> Model:
-    """Errors of the stages as points on a logarithmic scale, beside the noise floor."""
+    """Errors of the stages as points on a logarithmic scale, beside that of noise alone."""
     validated = cross_validated(outcome)
     rows: list[tuple[str, str, float]] = []
     for stage in outcome.stages:
@@ -65,7 +65,7 @@ def errors_chart(outcome: Outcome) -> Model:
         label = label_of(stage, outcome)
         rows += [(label, kind, 1e3 * value) for kind, value in values.items() if value]
     labels = [label_of(stage, outcome) for stage in outcome.stages]
-    floor = 1e3 * outcome.measurement.std
+    floor = 1e3 * outcome.measurement.noise_distance
     chart = empty_chart(
         70 + 42 * len(labels),
         y_range=labels[::-1],
@@ -121,7 +121,7 @@ def poses_chart(outcome: Outcome) -> Model:
     """Error of every pose, before and after; a pose is chosen by a click."""
     before, after = before_after(outcome)
     names = [pose.name for pose in outcome.poses]
-    floor = 1e3 * outcome.measurement.std
+    floor = 1e3 * outcome.measurement.noise_distance
     found: list[tuple[Stage, str, str, list[float]]] = []
     for stage, color, marker in ((before, BEFORE, "triangle"), (after, AFTER, "circle")):
         if stage is not None:

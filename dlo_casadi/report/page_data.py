@@ -7,7 +7,8 @@ from typing import Any
 
 from dlo_casadi.config import Config
 from dlo_casadi.effects import EFFECTS
-from dlo_casadi.report.canvas import before_after, label_of, millimetres
+from dlo_casadi.errors import counted
+from dlo_casadi.report.canvas import NOISE_ALONE, before_after, label_of, millimetres
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.text_findings import (
     CANDIDATE_ORDER,
@@ -60,6 +61,8 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "rest_before": before is not None and before.name == "batch",
         "stages": stage_rows(outcome),
         "noise": millimetres(m.std),
+        "noise_alone": NOISE_ALONE,
+        "noise_distance": millimetres(m.noise_distance),
         "noise_source": m.std_source,
         "correlation": millimetres(m.correlation_length) if m.correlation_length > 0 else None,
         "held_out": m.poses_held_out,
@@ -75,7 +78,7 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "next_pose_said": outcome.next_pose and _said_of(outcome.next_pose),
         "unexplained": outcome.unexplained,
         "timing": timing_rows(outcome),
-        "mesh": f"{outcome.discretization.n} {outcome.discretization.element}s, "
+        "mesh": f"{counted(outcome.discretization.n, outcome.discretization.element)}, "
         f"mesh error {millimetres(outcome.discretization.error)}",
         "versions": outcome.versions,
         "configuration": configuration_text(outcome.config),
@@ -122,7 +125,7 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
             was = before.rmse_held_out if after.rmse_held_out is not None else before.rmse_fit
         said = "" if was is None or before is None else f"{label_of(before, outcome)}: "
         rows.append((f"error, {role}", _mm(now), f"{said}{_mm(was)}" if said else ""))
-    rows.append(("noise floor", millimetres(m.std), f"of the centre-lines, {m.std_source}"))
+    rows.append((NOISE_ALONE, millimetres(m.noise_distance), f"of the points, {m.std_source}"))
     lost = f"; {len(m.held_out_missing)} held out were not measured" if m.held_out_missing else ""
     said = f"to fit + held out to check{lost}"
     rows.append(("poses", f"{m.poses_fit} + {m.poses_held_out}", said))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
+from dlo_casadi.errors import counted
 from dlo_casadi.report.arrows import forces_read
 from dlo_casadi.report.canvas import before_after, label_of, millimetres
 from dlo_casadi.report.geometry import beside
@@ -286,7 +287,7 @@ def _readings(outcome: Outcome, shape: PoseShape) -> list[tuple[str, str]]:
 
 
 def _seen(pose: PoseInput) -> str:
-    text = f"{len(pose.points)} points"
+    text = counted(len(pose.points), "point")
     return text if pose.coverage is None else f"{text}, {pose.coverage:.0%} of the cable"
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.errors import counted
 from dlo_casadi.report.canvas import before_after, label_of
 from dlo_casadi.report.page_backgrounds import PHOTOGRAPHS, Background, photograph_of
 from dlo_casadi.report.page_pictures import Line, Picture, svg
@@ -60,7 +61,7 @@ def _picture(
         rms = float(np.sqrt(np.mean(np.sum((pixels - near) ** 2, axis=1))))
         facts.append((kind, label, f"{rms:.2g} px"))
     lines.append(Line("measured", svg(pixels, 2)))
-    facts.append(("measured", "measured", f"{len(pixels)} pixels"))
+    facts.append(("measured", "measured", counted(len(pixels), "pixel")))
     height, width = viewpoint.shape
     photograph = photograph_of(view.image, budget)
     whole = (-0.5, -0.5, float(width), float(height))

@@ -11,7 +11,8 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dlo_casadi.report.canvas import label_of, millimetres
+from dlo_casadi.errors import counted
+from dlo_casadi.report.canvas import NOISE_ALONE, label_of, millimetres
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.text_findings import (
     CANDIDATE_ORDER,
@@ -69,7 +70,7 @@ def _table(title: str) -> Table:
 
 def _heading(outcome: Outcome) -> Text:
     m = outcome.measurement
-    noise = f"noise {millimetres(m.std)} ({m.std_source})"
+    noise = f"noise std {millimetres(m.std)} ({m.std_source})"
     if m.correlation_length > 0:
         noise += f", correlated over {millimetres(m.correlation_length)}"
     declared = m.poses_held_out + len(m.held_out_missing)
@@ -77,8 +78,8 @@ def _heading(outcome: Outcome) -> Text:
     if m.held_out_missing:
         held_out = f"{m.poses_held_out} of {declared} held out"
     text = (
-        f"{m.poses_fit} fit poses, {held_out}, {m.points} points; {noise}; "
-        f"{outcome.discretization.n} {outcome.discretization.element}s, "
+        f"{counted(m.poses_fit, 'fit pose')}, {held_out}, {counted(m.points, 'point')}; {noise}; "
+        f"{counted(outcome.discretization.n, outcome.discretization.element)}, "
         f"mesh error {millimetres(outcome.discretization.error)}"
     )
     return Text.assemble((outcome.config.cable.name, "bold"), ": ", text)
@@ -138,8 +139,8 @@ def error_table(outcome: Outcome) -> Table:
         }
         table.add_row("  forces, moments", *(cells.get(column, "") for column in columns))
     table.add_section()
-    floor = [millimetres(outcome.measurement.std)] + [""] * (len(columns) - 1)
-    table.add_row(f"noise ({outcome.measurement.std_source})", *floor)
+    floor = [millimetres(outcome.measurement.noise_distance)] + [""] * (len(columns) - 1)
+    table.add_row(f"{NOISE_ALONE} ({outcome.measurement.std_source})", *floor)
     return table
 
 

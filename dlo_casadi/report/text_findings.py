@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
-from dlo_casadi.report.canvas import millimetres
+from dlo_casadi.report.canvas import NOISE_ALONE, millimetres
 from dlo_casadi.report.text_parameters import plus_minus, vector
 from dlo_casadi.session.outcome import BranchShape, Outcome, Stage, StageName
 from dlo_casadi.thresholds import APART, NOTABLE
@@ -150,7 +150,7 @@ def _verdict(outcome: Outcome) -> str:
             return (
                 f"Verdict: unexplained. With {names} every pose is fitted, but one that is left "
                 f"out is predicted {millimetres(error)} off "
-                f"(noise {millimetres(outcome.measurement.std)})."
+                f"({NOISE_ALONE}: {millimetres(outcome.measurement.noise_distance)})."
             )
         found = f" even with {names}" if names else ""
         return f"Verdict: unexplained. The residual is not noise{found}."
@@ -191,9 +191,13 @@ def finding_of(outcome: Outcome, row: dict[str, Any]) -> tuple[str, str]:
             return "added", "added to the model"
         if name in effect["indistinguishable_from"]:
             return "tied", f"cannot be told apart from {effect['name']}"
+    if row["reason"]:
+        return "", str(row["reason"])
     if row["rmse_cross_validated"] is None:
         return "", "not refitted"
-    return "", "does not explain it" if outcome.verdict == "unexplained" else "not needed"
+    if outcome.verdict == "unexplained":
+        return "", "withdrawn: it leaves the residual unexplained"
+    return "", "withdrawn: not needed beside what was added later"
 
 
 def p_value_note(outcome: Outcome) -> str:

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 
 # Signals by which a command is interrupted.
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+# Whether signals can be blocked, in processes that are started meanwhile, too: a matter of POSIX.
+BLOCKABLE = hasattr(signal, "pthread_sigmask")
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from dlo_casadi.runtime.interrupts import INTERRUPTS, interrupts_held
+from dlo_casadi.runtime.interrupts import BLOCKABLE, INTERRUPTS, interrupts_held
 
 # Read by BLAS, OpenMP and OpenCV when they are loaded.
 THREADS = dict.fromkeys(
@@ -71,6 +71,9 @@ def starting_processes() -> Iterator[None]:
     A process that is interrupted half way in its start, or whose parent is, prints its stack.
     """
     with interrupts_held():
+        if not BLOCKABLE:
+            yield
+            return
         resource_tracker.ensure_running()  # which lets go of the signals when it starts
         # What is started inherits the mask.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
@@ -83,7 +86,8 @@ def starting_processes() -> Iterator[None]:
 def begin_worker(logs: str | None, libraries: Sequence[str] = ()) -> None:
     """Leave interrupts to the parent, end with it, keep the stack of a crash; import libraries."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)
+    if BLOCKABLE:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()

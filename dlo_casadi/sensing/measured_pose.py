@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench
+from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench, line_or_markers
 
 FloatArray = NDArray[np.floating]
 
@@ -32,15 +32,16 @@ class MeasuredPose:
         Those of points first; empty if the pose could not be read.
     held_out : bool
         Whether the pose is kept for the final test.
-    line : (M, d) [m], optional
-        The cable's line that the sensors show together, where their points are no line by
-        themselves; without points where they show none.
+    line : Centerline or Markers, optional
+        Measured points of the cable from which distances are taken, where those of the sensors are
+        others: the line that photographs show together, without points where they show none; or
+        the points themselves where the sensors have their means.
     """
 
     pose: Pose
     sensors: tuple[Sensor, ...] = ()
     held_out: bool = False
-    line: FloatArray | None = None
+    line: Centerline | Markers | None = None
 
     @classmethod
     def of_points(
@@ -57,9 +58,7 @@ class MeasuredPose:
         """
         if not len(points):
             return cls(pose, (), held_out)
-        weight = np.ones(len(points)) if weight is None else weight
-        sensor = Centerline(points, weight) if s is None else Markers(points, weight, s)
-        return cls(pose, (sensor,), held_out)
+        return cls(pose, (line_or_markers(points, weight, s),), held_out)
 
     def with_readings(self, readings: Mapping[str, Sequence[float]]) -> Self:
         """The same pose with forces and moments on its fixtures, by names of `ends.REACTIONS`.
@@ -80,15 +79,15 @@ class MeasuredPose:
     @property
     def has_line(self) -> bool:
         """Whether it is known where in space points of the cable lie."""
-        return self.readable and (self.line is None or len(self.line) > 0)
+        return self.readable and (self.line is None or len(self.line.points) > 0)
 
     @cached_property
     def traced(self) -> MeasuredPose:
         """The same pose with its line alone; about where its points lie if they show none."""
         if self.line is None:
             return self
-        line = self.line if len(self.line) else self.points
-        return MeasuredPose.of_points(self.pose, line, held_out=self.held_out)
+        line = self.line if self.has_line else line_or_markers(self.points)
+        return MeasuredPose(self.pose, (line,), self.held_out)
 
     @cached_property
     def points(self) -> FloatArray:
@@ -100,6 +99,11 @@ class MeasuredPose:
     def relative_std(self) -> FloatArray:
         """Relative standard deviation of each point (K,)."""
         return np.concatenate([sensor.weight for sensor in self.sensors])
+
+    @property
+    def relative_white(self) -> FloatArray:
+        """The same where errors are white, so that means of points have smaller ones."""
+        return np.concatenate([sensor.weight / np.sqrt(sensor.count) for sensor in self.sensors])
 
     @property
     def n_residuals(self) -> int:
@@ -142,6 +146,14 @@ class MeasuredPose:
                 out.append((sensor, slice(point, point + count), slice(row, row + rows)))
             point, row = point + count, row + rows
         return out
+
+    def along(self, residual: FloatArray) -> list[FloatArray]:
+        """Residuals (R,) of points as series along the cable: each component of each sensor."""
+        return [
+            series
+            for sensor, _, rows in self.slices
+            for series in residual[rows].reshape((-1, sensor.per_point)).T
+        ]
 
     def slow_rows(self, modes: FloatArray) -> FloatArray:
         """Displacements (K, count) along the cable, in each of the residuals' directions.
@@ -208,6 +220,12 @@ class MeasuredPose:
             return self.misses(curve)
         item = self.traced
         return np.linalg.norm(item.points - curve.at(item.nearest(curve)), axis=1)
+
+    @property
+    def noise_distances(self) -> FloatArray:
+        """RMS `distances` (K,) from the true curve, over the noise of one coordinate."""
+        item = self.traced if self.has_line else self
+        return np.sqrt(np.bincount(item.point_of, item.relative_std[item.point_of] ** 2))
 
     def misses(self, curve: NodeCurve) -> FloatArray:
         """Size (K,) [m] of the residuals of each point of a sensor."""

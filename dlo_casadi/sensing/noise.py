@@ -1,10 +1,11 @@
 """Noise of measured points: white plus correlated along the cable.
 
-    cov(d_i, d_k) = std^2 w_i w_k [ (1 - share) delta_ik + share k(|s_i - s_k| / l) ]
+    cov(d_i, d_k) = std^2 w_i w_k [ (1 - share) delta_ik / c_i + share k(|s_i - s_k| / l) ]
 
-for one component d of the errors at arc lengths s with relative weights w. Whether the correlated
-part is rough (exponential), once differentiable (Matern 3/2) or smooth (squared exponential) is
-chosen by likelihood.
+for one component d of the errors at arc lengths s with relative weights w. A point may be the mean
+of c measured neighbours, whose white errors average out. Whether the correlated part is rough
+(exponential), once differentiable (Matern 3/2) or smooth (squared exponential) is chosen by
+likelihood.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from scipy.optimize import minimize
 
 FloatArray = NDArray[np.floating]
 Kernel = Literal["exponential", "matern", "gaussian"]
+Count = FloatArray | float
 Source = Literal["declared", "repeats", "estimated", "misfit"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 # Slow sines per pose in which a missing effect would show.
@@ -68,7 +70,7 @@ class NoiseModel:
     Parameters
     ----------
     std : float [m]
-        Standard deviation of one coordinate of a point of weight one.
+        Standard deviation of one coordinate of a measured point of weight one.
     share : float, in [0, 1)
         Share of the variance that is correlated along the cable.
     length : float [m]
@@ -115,15 +117,20 @@ class NoiseModel:
         """Whether it does not depend on the model that is fitted."""
         return self.source != "estimated"
 
-    def covariance(self, s: FloatArray, weight: FloatArray, grain: float = 0.0) -> FloatArray:
+    def covariance(
+        self, s: FloatArray, weight: FloatArray, grain: float = 0.0, count: Count = 1.0
+    ) -> FloatArray:
         """Covariance matrix (K, K) [m^2] at arc lengths s."""
-        unit = self.correlation(np.abs(s[:, None] - s[None]), grain)
+        unit = self.correlation(np.abs(s[:, None] - s[None]), grain, count)
         return self.std**2 * unit * np.outer(weight, weight)
 
-    def correlation(self, distance: FloatArray, grain: float = 0.0) -> FloatArray:
-        """Correlation matrix (K, K) of points at distances (K, K) [m] along the cable.
+    def correlation(
+        self, distance: FloatArray, grain: float = 0.0, count: Count = 1.0
+    ) -> FloatArray:
+        """Covariance (K, K), over std^2, of points at distances (K, K) [m] along the cable.
 
-        Over `grain` [m] they share the errors that are white otherwise, by a Gaussian.
+        Each is the mean of `count` measured ones. Over `grain` [m] they share the errors that are
+        white otherwise, by a Gaussian.
         """
         if self.share > 0:
             unit = self.share * correlation(self.kernel, distance / self.length)
@@ -132,7 +139,7 @@ class NoiseModel:
         if grain:
             unit += (1 - self.share) * correlation("gaussian", distance / grain)
         else:
-            unit.flat[:: len(unit) + 1] += 1 - self.share
+            unit.flat[:: len(unit) + 1] += (1 - self.share) / count
         unit.flat[:: len(unit) + 1] += 1e-9
         return unit
 
@@ -152,11 +159,13 @@ class NoiseModel:
         grown = replace(own, force=factor * own.force, moment=factor * own.moment)
         return NoiseModel(std, readings=grown)
 
-    def whitening(self, s: FloatArray, weight: FloatArray, grain: float = 0.0) -> FloatArray:
+    def whitening(
+        self, s: FloatArray, weight: FloatArray, grain: float = 0.0, count: Count = 1.0
+    ) -> FloatArray:
         """Matrix W (K, K) with W cov W^T = 1."""
         if self.share == 0 and grain == 0:
-            return np.diag(1 / (self.std * weight))
-        factor = np.linalg.cholesky(self.covariance(s, weight, grain))
+            return np.diag(np.sqrt(count) / (self.std * weight))
+        factor = np.linalg.cholesky(self.covariance(s, weight, grain, count))
         return solve_triangular(factor, np.eye(len(s)), lower=True)
 
 
@@ -185,6 +194,8 @@ class NoiseSample:
         they are independent of one another and of the poses' own directions.
     grain : scalar [m]
         Over which the points share the errors that are white otherwise.
+    count : (K,) or one for all
+        Measured points of which each is the mean.
     """
 
     residuals: FloatArray
@@ -193,6 +204,7 @@ class NoiseSample:
     own: FloatArray
     shared: FloatArray
     grain: float = 0.0
+    count: Count = 1.0
 
     def thinned(self, most: int) -> NoiseSample:
         """Keep at most so many points, evenly picked, and of the own directions what they tell.
@@ -210,6 +222,7 @@ class NoiseSample:
             basis[:, values > _DEPENDENT * values.max(initial=0.0)],
             self.shared[rows],
             self.grain,
+            np.broadcast_to(self.count, len(self.places))[kept],
         )
 
     @property
@@ -243,7 +256,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
     logdet, count = 0.0, 0
     gram = np.zeros((samples[0].shared.shape[1] + 1,) * 2)
     for sample in samples:
-        factor = np.linalg.cholesky(unit.correlation(sample.distance, sample.grain))
+        factor = np.linalg.cholesky(unit.correlation(sample.distance, sample.grain, sample.count))
         points, each, columns = sample.scaled.shape
         # LAPACK itself: of matrices this small SciPy's checks take longer than the solution.
         y = dtrtrs(factor.T, sample.scaled.reshape((points, -1)), lower=0, trans=1)[0]

@@ -8,7 +8,7 @@ fixed own unknowns.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, Self
 
 import numpy as np
@@ -19,7 +19,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.node import Node
-from dlo_casadi.sensing.noise import NoiseModel
+from dlo_casadi.sensing.noise import Count, NoiseModel
 
 FloatArray = NDArray[np.floating]
 
@@ -48,6 +48,11 @@ class Sensor(Protocol):
     @property
     def grain(self) -> float:
         """Length [m] over which points share the errors that are white otherwise."""
+        ...
+
+    @property
+    def count(self) -> Count:
+        """Measured points of which each (K,) of its points is the mean; or one for all."""
         ...
 
     @property
@@ -111,6 +116,11 @@ class OfPoints(ABC):
         return 0.0
 
     @property
+    def count(self) -> Count:
+        """One: points as they were measured."""
+        return 1.0
+
+    @property
     @abstractmethod
     def per_point(self) -> int:
         """Residuals of a point."""
@@ -127,6 +137,7 @@ class _Points(OfPoints):
 
     points: FloatArray
     weight: FloatArray
+    count: Count = field(default=1.0, kw_only=True)
 
     def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Measured minus model (R,) [m]."""
@@ -153,7 +164,8 @@ class _Points(OfPoints):
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) [1/m] with W cov W^T = 1; the errors of a point are independent."""
-        return np.kron(noise.whitening(places, self.weight), np.eye(self.per_point))
+        own = noise.whitening(places, self.weight, count=self.count)
+        return np.kron(own, np.eye(self.per_point))
 
     def weighing(self, weight: FloatArray) -> Self:
         """The same points with other relative standard deviations."""
@@ -240,6 +252,22 @@ class Markers(_Points):
         return self.s
 
 
+def line_or_markers(
+    points: FloatArray,
+    weight: FloatArray | None = None,
+    s: FloatArray | None = None,
+    count: Count = 1.0,
+) -> Centerline | Markers:
+    """A line of points (K, d) [m], or markers where their arc lengths s (K,) [m] are known.
+
+    `weight` (K,) is one by default.
+    """
+    weight = np.ones(len(points)) if weight is None else weight
+    if s is None:
+        return Centerline(points, weight, count=count)
+    return Markers(points, weight, s, count=count)
+
+
 @dataclass(frozen=True)
 class Wrench:
     """Forces and moments on the fixtures, component by component: R residuals [N], [N m].
@@ -257,6 +285,7 @@ class Wrench:
     per_point = 0
     marked = True
     grain = 0.0
+    count = 1.0
 
     @property
     def _rows(self) -> dict[str, slice]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from dlo_casadi import vision
 from dlo_casadi.config import Camera, Config
-from dlo_casadi.errors import MeasurementError
+from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.session.measure import board_of
 
 # Relative standard deviation of the focal length from which on a session's own photographs tell
@@ -102,6 +102,6 @@ def summary(found: vision.Calibration) -> str:
     matrix, std = found.camera.matrix, found.matrix_std
     return (
         f"focal lengths {matrix[0, 0]:.1f} +- {std[0]:.1f} and {matrix[1, 1]:.1f} +- "
-        f"{std[1]:.1f} px from {len(found.errors)} photographs of the session, "
+        f"{std[1]:.1f} px from {counted(len(found.errors), 'photograph')} of the session, "
         f"{found.reprojection_error:.2f} px RMS"
     )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
-from dlo_casadi.errors import MeasurementError
+from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.session.coarse import coarse_fit, some, tells_weight
@@ -73,7 +73,7 @@ def without_implausible(
     refused = [item.message for item in found if item.certain]
     if not refused and bad and (2 * len(bad) > len(read) or not fit_left):
         refused = [
-            f"{len(bad)} of {len(read)} poses contradict the configuration:",
+            f"the configuration is contradicted by {len(bad)} of {counted(len(read), 'pose')}:",
             *(f"  {message}" for message in bad.values()),
         ]
     if refused:

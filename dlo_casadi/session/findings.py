@@ -60,6 +60,7 @@ def candidate_rows(diagnosis: Diagnosis) -> tuple[dict[str, Any], ...]:
             "score": row.score,
             "p_value": row.p_value,
             "rmse_cross_validated": row.rmse_cross_validated,
+            "reason": row.reason or None,
         }
         for row in diagnosis.ranked
     )

@@ -129,7 +129,7 @@ def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:
     for k, d in zip(fit.problem.fitted, fit.linearization.raw, strict=True):
         item = out[k]
         square = np.bincount(item.point_of, d[item.on_points] ** 2) / np.bincount(item.point_of)
-        score = np.sqrt(square) / (fit.noise.std * item.relative_std)
+        score = np.sqrt(square) / (fit.noise.std * item.relative_white)
         grown = np.sqrt(np.maximum(1.0, score / HUBER))
         out[k] = item.weighing(item.relative_std * grown)
     return tuple(out)

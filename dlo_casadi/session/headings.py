@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config, Pose
+from dlo_casadi.errors import counted
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.plausibility import Suspicion
 from dlo_casadi.thresholds import FITS, HEADING_NEAR, HEADING_OFF
@@ -50,7 +51,7 @@ def wrong_headings(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion
         }
         if wrong and 2 * len(wrong) > judged:
             name = next(iter(wrong))
-            text = f"{side}_heading contradicts {len(wrong)} of {judged} lines. {name}: "
+            text = f"{side}_heading contradicts {len(wrong)} of {counted(judged, 'line')}. {name}: "
             found.append(Suspicion(text + texts[name], True))
         else:
             found += [Suspicion(f"{name}: {text}", False, name) for name, text in texts.items()]

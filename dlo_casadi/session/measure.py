@@ -17,11 +17,13 @@ from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import read_points
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.pixels import ViewInput, pixel_std, pixels_of
+from dlo_casadi.sensing.sensors import line_or_markers
 from dlo_casadi.session.outcome import PoseInput
 
 # Photographs read at a time: two cores take 0.66 of the time of one.
 READERS = 2
-# Points kept of one centre-line; more only repeat their neighbours' noise.
+# Points of one line that a fit compares, and that errors and pictures are made from. Those of a
+# photograph repeat their neighbours' noise if they are more; of others the fit has their means.
 MOST_POINTS = 240
 
 
@@ -105,7 +107,10 @@ def _measured(pose: DeclaredPose, item: PoseInput, std: float) -> MeasuredPose:
     if item.views:
         found = [pixels_of(view, std, len(item.points) > 0) for view in item.views]
         sensors = tuple(sensor for sensor in found if sensor is not None)
-        seen = MeasuredPose(held, sensors, held_out, item.points)
+        seen = MeasuredPose(held, sensors, held_out, line_or_markers(item.points))
+    elif item.means is not None:
+        means = line_or_markers(item.means.points, s=item.means.s, count=item.means.count)
+        seen = MeasuredPose(held, (means,), held_out, line_or_markers(item.points, s=item.s))
     else:
         seen = MeasuredPose.of_points(held, item.points, item.weight, held_out, item.s)
     return seen.with_readings(pose.readings)
@@ -148,9 +153,11 @@ def _reader(config: Config, pose: DeclaredPose) -> Callable[[Config, DeclaredPos
 
 def _read_csv(config: Config, pose: DeclaredPose) -> PoseInput:
     read = read_points(pose.paths[0], pose.start, pose.end, config.cable.length)
-    kept = slice(None, None, max(1, -(-len(read.points) // MOST_POINTS)))
+    if len(read.points) <= MOST_POINTS:
+        return PoseInput(pose.name, pose.role, read.points, s=read.s)
+    kept = slice(None, None, -(-len(read.points) // MOST_POINTS))
     s = None if read.s is None else read.s[kept]
-    return PoseInput(pose.name, pose.role, read.points[kept], s=s)
+    return PoseInput(pose.name, pose.role, read.points[kept], s=s, means=read.means(MOST_POINTS))
 
 
 def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:

@@ -16,6 +16,7 @@ from dlo_casadi.equilibrium.pose import PoseBranch
 from dlo_casadi.equilibrium.spread import COVERED
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.thresholds import DIFFERENT
 
@@ -120,6 +121,9 @@ class PoseShape:
     spread : (M,) or (M, 2) or None [m]
         Standard deviation across the curve of the next hanging, as the residual; None if it was
         not computed.
+    expected : (K,) or None [m]
+        RMS distance of each measured point from the prediction that the noise and the next hanging
+        let expect, in the directions in which it is compared; None if it was not computed.
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
     tipping : float or None [rad]
@@ -137,21 +141,17 @@ class PoseShape:
     measured_branch: BranchShape | None = None
     tipping: float | None = None
     spread: FloatArray | None = None
+    expected: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
 
-    def expected(self, length: float, noise: float) -> FloatArray:
-        """Standard deviations of the residual (K,), in space (K, 2), [m], noise included."""
+    def inside_band(self, length: float, noise: float) -> NDArray[np.bool_]:
+        """Whether each measured point (K,) lies in its 90 % band, noise included."""
         assert self.spread is not None
         places = np.linspace(0.0, length, len(self.spread))
         spread = self.spread.reshape((len(places), -1))
         std = np.stack([np.interp(self.s, places, column) for column in spread.T], axis=1)
-        return np.hypot(std, noise).reshape(self.residual.shape)
-
-    def inside_band(self, length: float, noise: float) -> NDArray[np.bool_]:
-        """Whether each measured point (K,) lies in its 90 % band, noise included."""
-        score = (self.residual / self.expected(length, noise)) ** 2
-        by_point = score.reshape((len(score), -1))
-        return by_point.sum(axis=1) <= float(chdtri(by_point.shape[1], 1 - COVERED))
+        score = (self.residual.reshape(std.shape) / np.hypot(std, noise)) ** 2
+        return np.asarray(score.sum(axis=1) <= float(chdtri(std.shape[1], 1 - COVERED)))
 
 
 @dataclass(frozen=True)
@@ -249,6 +249,8 @@ class PoseInput:
         What the camera step noticed.
     s : (K,), optional [m]
         Known arc lengths of markers.
+    means : MeasuredPoints, optional
+        Of neighbouring points, for the fit, where more were measured than `points` has.
     views : tuple of ViewInput
         Usable photographs of a cable in space; `points` are the line that they show together, none
         where fewer than two agree.
@@ -270,6 +272,7 @@ class PoseInput:
     markers: tuple[int, ...] | None = None
     messages: tuple[str, ...] = ()
     s: FloatArray | None = None
+    means: MeasuredPoints | None = None
     views: tuple[ViewInput, ...] = ()
 
     @property
@@ -290,6 +293,9 @@ class MeasurementSummary:
         Held-out poses without one: no error counts them.
     points : int
     std, correlation_length : float [m]
+        Of the noise of one coordinate of a point.
+    noise_distance : float [m]
+        RMS distance of the points from the predicted shapes that this noise alone gives.
     readings : int
         Forces and moments on the fixtures, those of held-out poses too.
     force_std, moment_std : float or None [N], [N m]
@@ -303,6 +309,7 @@ class MeasurementSummary:
     std: float
     std_source: Literal["declared", "estimated"]
     correlation_length: float
+    noise_distance: float
     readings: int = 0
     force_std: float | None = None
     moment_std: float | None = None

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.errors import counted
 from dlo_casadi.session.plausibility import (
     Lines,
     Suspicion,
@@ -147,7 +148,8 @@ def stretched(
     advice = ". Try: s_m in metres along the cable, each beside its own point."
     if texts and 2 * len(texts) > len(names):
         name = next(iter(texts))
-        said = f"s_m contradicts the points of {len(texts)} of {len(names)} poses. {name}: "
+        told = f"{len(texts)} of {counted(len(names), 'pose')}"
+        said = f"s_m contradicts the points of {told}. {name}: "
         return (Suspicion(said + texts[name] + advice, True),)
     return tuple(Suspicion(f"{name}: {text}{advice}", False, name) for name, text in texts.items())
 

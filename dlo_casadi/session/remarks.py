@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.equilibrium.pose import SIGNS
+from dlo_casadi.errors import counted
 from dlo_casadi.estimation.mesh import allowed_mesh_error
+from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
 from dlo_casadi.thresholds import EITHER, FIXTURES, UNSEEN
@@ -38,7 +40,7 @@ def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
         declared = len({item.name for item in inputs if item.role == "held_out"} | set(missing))
         lines.append(
             f"held out and in no error, because there is no measured line: {', '.join(missing)}, "
-            f"{len(missing)} of {declared} held-out poses"
+            f"{len(missing)} of {counted(declared, 'held-out pose')}"
         )
     return lines
 
@@ -159,7 +161,7 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
     equilibrium has no name but the way that led there tells of the model what it tells there; but
     where that holds for all poses, and a simpler model comes nearer, nothing is predicted.
     """
-    lines, stage, noise = [], stages[-1], fit.noise.of_points.beside_hangings
+    lines, stage = [], stages[-1]
     if fit.failed:
         lines.append(
             f"the fit of stage {stage.name} has not converged: its numbers are where it stopped, "
@@ -168,7 +170,7 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
         )
     for role, said in (("fit", "fit poses"), ("held_out", "held-out poses")):
         errors = {
-            pose.name: _errors(stage.shapes[pose.name], fit.model.cable.length, noise)
+            pose.name: _errors(stage.shapes[pose.name])
             for pose in poses
             if pose.role == role and pose.name in stage.shapes and len(pose.points)
         }
@@ -214,15 +216,13 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
     ]
 
 
-def _errors(shape: PoseShape, length: float, noise: float) -> FloatArray:
+def _errors(shape: PoseShape) -> FloatArray:
     """Squares (2, K) [m^2] of a pose's distances from its prediction: measured, expected."""
-    if shape.spread is None:
+    if shape.expected is None:
         return np.zeros((2, 0))
     if shape.measured_branch is not None and shape.tipping is not None and shape.tipping < EITHER:
         return np.zeros((2, 0))
-    across = shape.expected(length, noise).reshape((len(shape.s), -1))
-    expected = (across**2).sum(axis=1) + noise**2
-    there = shape.measured_branch
+    expected, there = shape.expected**2, shape.measured_branch
     if there is not None and there.branch not in SIGNS:
         return np.stack([np.full_like(expected, there.rmse**2), expected])
     return np.stack([(shape.gap**2).sum(axis=1), expected])
@@ -239,7 +239,7 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
         Noise of the points.
     """
     lines = []
-    points = fit.noise.of_points
+    points, floor = fit.noise.of_points, noise_distance(fit.problem.history, fit.noise.std)
     if declared is not None and points.source == "estimated":
         lines.append(
             f"the points scatter more about any shape that a cable could take than measurement.std "
@@ -250,7 +250,7 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
     if spread is not None:
         lines.append(
             f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
-            f"others), {_beside(fit)}: repeatability limits any prediction"
+            f"others), {_beside(fit, floor)}: repeatability limits any prediction"
         )
     if fit.noise.source == "misfit":
         lines.append(
@@ -262,19 +262,19 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
         lines.append(
             "the cable does not come back to the same shape: two hangings of a pose differ by "
             f"{1e3 * np.sqrt(2) * fit.hanging_error:.2g} mm RMS, as if each had a rest curvature "
-            f"of its own of {rest.std:.2g} 1/m; the noise is {1e3 * fit.noise.std:.2g} mm. A "
-            "model predicts their mean"
+            f"of its own of {rest.std:.2g} 1/m; noise alone gives "
+            f"{1e3 * np.sqrt(2) * floor:.2g} mm. A model predicts their mean"
         )
     if spread is not None or rest.std > 0:
         lines += [
             f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
         ]
-    if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * fit.noise.std:
-        apart = float(np.hypot(fit.fixture_error, fit.noise.std))
+    if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * floor:
+        apart = float(np.hypot(fit.fixture_error, floor))
         lines.append(
             f"the fixtures are not quite where they are declared, {_scatter(fit)} in each pose: a "
             f"pose that is not fitted is measured {1e3 * apart:.2g} mm from its prediction, "
-            f"however good the model (the noise is {1e3 * fit.noise.std:.2g} mm); ends measured "
+            f"however good the model (noise alone gives {1e3 * floor:.2g} mm); ends measured "
             "pose by pose would help"
         )
     if not fit.converged and not fit.failed:
@@ -288,23 +288,24 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
         lines.append(f"not a stable equilibrium at the fitted parameters: {', '.join(unstable)}")
     if not np.isfinite(error):
         lines.append(
-            f"the fitted shapes cannot be followed to a mesh finer than {fit.model.n} elements: "
-            "some pose is close to losing its stability"
+            f"the fitted shapes cannot be followed to a mesh finer than "
+            f"{counted(fit.model.n, 'element')}: some pose is close to losing its stability"
         )
     elif error > allowed_mesh_error(fit):
         lines.append(
-            f"the mesh of {fit.model.n} elements is off by {1e3 * error:.3g} mm, more than the "
-            f"{1e3 * allowed_mesh_error(fit):.2g} mm that noise or misfit hide: model.n larger?"
+            f"the mesh of {counted(fit.model.n, 'element')} is off by {1e3 * error:.3g} mm, "
+            f"more than the {1e3 * allowed_mesh_error(fit):.2g} mm that noise or misfit hide: "
+            "model.n larger?"
         )
     return lines
 
 
-def _beside(fit: Fit) -> str:
-    """What the noise is to the repeats of a pose."""
+def _beside(fit: Fit, floor: float) -> str:
+    """What the noise, which alone gives a distance `floor` [m], is to the repeats of a pose."""
     std, length = 1e3 * fit.noise.std, 1e3 * fit.noise.length
     if fit.noise.source == "repeats":
         return f"which counts as noise of {std:.2g} mm, correlated over {length:.2g} mm of cable"
-    return f"the noise is {std:.2g} mm, and intervals from this session are too narrow"
+    return f"noise alone gives {1e3 * floor:.2g} mm, and intervals from this session are too narrow"
 
 
 def _scatter(fit: Fit) -> str:

@@ -16,6 +16,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SETTLED_MODES
 from dlo_casadi.estimation.mesh import SEARCH_MESH, fine_enough, mesh_error
+from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel
@@ -304,6 +305,7 @@ def _summary(
         std=points.std,
         std_source="declared" if points.source == "declared" else "estimated",
         correlation_length=fit.noise.length if fit.noise.share > 0 else 0.0,
+        noise_distance=noise_distance(measured, points.std),
         readings=len(readings),
         force_std=noise.force if "force" in kinds else None,
         moment_std=noise.moment if "moment" in kinds else None,

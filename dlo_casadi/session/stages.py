@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.spread import Uncertainty, spread_across
+from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
 from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
@@ -121,6 +121,7 @@ def _stage(
     note: str = "",
     uncertainty: Uncertainty | None = None,
     fitted: Mapping[str, FloatArray] | None = None,
+    noise: float = 0.0,
 ) -> Stage:
     predictions = predict_poses(model, p, rest, [item.pose for item in measured])
     others = measured_branches(model, p, rest, measured, predictions, fitted)
@@ -132,8 +133,9 @@ def _stage(
     if uncertainty is not None:
         for item, known in zip(measured, predictions, strict=True):
             if known is not None:
-                spread = _spread(model, p, item, known, uncertainty)
-                shapes[item.pose.name] = replace(shapes[item.pose.name], spread=spread)
+                shape = shapes[item.pose.name]
+                shape = _expected(model, p, item, known, shape, uncertainty, noise)
+                shapes[item.pose.name] = shape
     lost = [item for item in measured if item.pose.name not in shapes]
     if lost:
         names = ", ".join(item.pose.name for item in lost)
@@ -159,17 +161,28 @@ def _stage(
     )
 
 
-def _spread(
+def _expected(
     model: CableModel,
     p: FloatArray,
     item: MeasuredPose,
     known: Prediction,
+    shape: PoseShape,
     uncertainty: Uncertainty,
-) -> FloatArray:
-    """Standard deviation (M,), in space (M, 2), [m] across a curve of the next hanging."""
+    noise: float,
+) -> PoseShape:
+    """A predicted pose with what the next hanging of it lets expect."""
     places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
-    found = spread_across(model, p, known.rest, item.pose, known.equilibrium, uncertainty, places)
-    return found if model.in_space else found[:, 0]
+    both = np.concatenate([places, shape.s])
+    eq = known.equilibrium
+    curve, moved = displacements(model, p, known.rest, item.pose, eq, uncertainty, both)
+    spread = spread_across(curve, places, moved[: len(places)])
+    expected = np.zeros(0)
+    if len(shape.s):
+        line = item.traced
+        rows = line.components(curve, shape.s, moved[len(places) :])
+        hanging = np.bincount(line.point_of, (rows**2).sum(axis=1))
+        expected = np.sqrt(hanging + (noise * line.noise_distances) ** 2)
+    return replace(shape, spread=spread if model.in_space else spread[:, 0], expected=expected)
 
 
 def _no_rest(model: CableModel) -> RestCurvatureEstimate:
@@ -274,6 +287,7 @@ def fit_stage(
         fit.chi2_of_points,
         uncertainty=uncertainty_of(fit),
         fitted={fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used},
+        noise=fit.noise.of_points.beside_hangings,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
 
-from dlo_casadi.errors import VisionError
+from dlo_casadi.errors import VisionError, counted
 
 _WHITE, _MUCH_WHITE = 250, 0.3  # grey level, and share of a picture that is overexposed
 _BLURRED_PX = 2.0  # standard deviation of edges from which markers of some 30 px are not read
@@ -70,8 +70,8 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
         raise VisionError("the file is empty. Try: copy the photograph again.", pose=path.name)
     if _is_truncated(data):
         raise VisionError(
-            f"the image is truncated: it ends after {len(data)} bytes, before its end marker. "
-            "Try: copy the photograph again.",
+            f"the image is truncated: it ends after {counted(len(data), 'byte')}, before its end "
+            "marker. Try: copy the photograph again.",
             pose=path.name,
         )
     width, height = _declared_size(data)
@@ -85,7 +85,7 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
     image = _decode(data) if width * height else None
     if image is None:
         raise VisionError(
-            f"the file is not an image that can be decoded ({len(data)} bytes). "
+            f"the file is not an image that can be decoded ({counted(len(data), 'byte')}). "
             "Try: JPEG or PNG; is it the photograph?",
             pose=path.name,
         )

@@ -66,6 +66,15 @@ def test_held_out_poses_are_not_looked_at(session, found):
     assert found.after.p == pytest.approx(again.after.p, rel=1e-12)
 
 
+def test_every_refit_that_is_not_chosen_says_why(found):
+    chosen = {x.candidate.name for item in found.added for x in (item, *item.rivals)}
+    lost = {row.name: row.reason for row in found.ranked if row.reason}
+    refitted = {row.name for row in found.ranked if row.rmse_cross_validated is not None}
+    assert lost
+    assert refitted <= chosen | set(lost)
+    assert not chosen & set(lost)
+
+
 def test_without_the_cause_nothing_false_is_claimed(fit):
     found = diagnose(fit, exclude=("bending_softening",))
     tied = all(item.rivals for item in found.added)

@@ -8,7 +8,7 @@ import pytest
 
 from dlo_casadi.config import load_config
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.equilibrium.spread import spread_across
+from dlo_casadi.equilibrium.spread import displacements, spread_across
 from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
 from dlo_casadi.estimation.repeats import (
@@ -104,8 +104,10 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     uncertainty = uncertainty_of(fit)
     assert floor / 2 < uncertainty.hanging < floor
     (found,) = (item.equilibrium for item in predictions[left_out : left_out + 1])
-    at = (poses[left_out], found, uncertainty, np.array([0.4, 0.7]))
-    assert np.all(spread_across(fit.model, fit.p, fit.rest, *at) > uncertainty.hanging)
+    at = np.array([0.4, 0.7])
+    known = (fit.model, fit.p, fit.rest, poses[left_out], found, uncertainty)
+    curve, moved = displacements(*known, at)
+    assert np.all(spread_across(curve, at, moved) > uncertainty.hanging)
     assert fit_dict(fit)["scatter"]["hanging"] == uncertainty.hanging
     # Noise that repeats tell is no declared one.
     assert np.isfinite(fit.variance_degrees("bending_stiffness"))

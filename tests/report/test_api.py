@@ -64,7 +64,7 @@ def test_text_says_what_was_found(result):
     assert text.startswith("short_clean: ")
     assert re.search(r"bending_stiffness  0\.\d+ ± 0\.\d+ N m\^2", text)
     assert "held out  0." in text
-    assert re.search(r"noise \(estimated\)  0\.\d+ mm", text)
+    assert re.search(r"noise alone \(estimated\)  0\.\d+ mm", text)
     assert repr(result) == text
     assert len(text.splitlines()) < 12
 
@@ -144,8 +144,8 @@ def test_the_solver_of_a_folder_of_results(written, tmp_path, capsys):
 
 
 def test_the_candidates_are_printed_in_their_order(outcome):
-    row = {"score": 12.34, "p_value": 1e-9, "rmse_cross_validated": 2e-4}
-    weak = {"score": 0.5, "p_value": None, "rmse_cross_validated": None}
+    row = {"score": 12.34, "p_value": 1e-9, "rmse_cross_validated": 2e-4, "reason": None}
+    weak = {"score": 0.5, "p_value": None, "rmse_cross_validated": None, "reason": None}
     effect = {"name": "lumped_mass", "indistinguishable_from": ["point_force"]}
     diagnosed = dataclasses.replace(
         outcome,

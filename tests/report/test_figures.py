@@ -14,10 +14,13 @@ from dlo_casadi.report.geometry import magnified
 from dlo_casadi.session.outcome import PoseInput
 
 PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"
-CANDIDATES = (
-    {"name": "lumped_mass", "score": 700.0, "p_value": 0.0, "rmse_cross_validated": 1e-4},
-    {"name": "point_force", "score": 690.0, "p_value": 0.0, "rmse_cross_validated": 1.1e-4},
-    {"name": "end_offset", "score": 0.0, "p_value": 1.0, "rmse_cross_validated": None},
+CANDIDATES = tuple(
+    {"name": name, "score": score, "p_value": p, "rmse_cross_validated": error, "reason": None}
+    for name, score, p, error in (
+        ("lumped_mass", 700.0, 0.0, 1e-4),
+        ("point_force", 690.0, 0.0, 1.1e-4),
+        ("end_offset", 0.0, 1.0, None),
+    )
 )
 EFFECT = {
     "name": "lumped_mass",

@@ -43,7 +43,7 @@ def test_a_summary_tells_units_what_was_fixed_and_the_noise(outcome):
     assert "of its tolerance 0.0005 m" in text
     assert "initial guess" in text
     assert "declared model, fitted" in text
-    assert "noise (estimated)" in text
+    assert "noise alone (estimated)" in text
     assert "warning: stage algorithm1: switched off" in text
     assert "Diagnosis: switched off" in text
     assert "without imports and writing; of it or beside it IPOPT" in text

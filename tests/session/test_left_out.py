@@ -152,6 +152,6 @@ def test_mostly_bad_poses_are_refused(session):
 
     with pytest.raises(
         MeasurementError,
-        match=r"4 of 7 poses contradict the configuration:\n  pose_\d+: its line runs from",
+        match=r"the configuration is contradicted by 4 of 7 poses:\n  pose_\d+: its line runs from",
     ):
         left_out(session(change))

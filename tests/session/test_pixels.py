@@ -12,6 +12,7 @@ from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.pixels import Pixels, ViewInput, pixel_std, pixels_of
+from dlo_casadi.sensing.sensors import line_or_markers
 from dlo_casadi.vision import Camera, Sight, Viewpoint, project_outline
 
 LENGTH, DIAMETER = 0.9, 0.008
@@ -127,7 +128,9 @@ def test_a_pose_of_photographs(line):
     shown = curve()
     points = shown.at(S) if line else np.zeros((0, 3))
     item = MeasuredPose(
-        Pose((0.0, 0.0, 0.0)), (sensor(0.4, shown), sensor(-0.4, shown)), line=points
+        Pose((0.0, 0.0, 0.0)),
+        (sensor(0.4, shown), sensor(-0.4, shown)),
+        line=line_or_markers(points),
     )
     assert item.has_line is line
     assert len(item.distances(shown)) == (len(S) if line else 2 * len(S))
