@@ -19,7 +19,9 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import EDGE, displacements, spread_across
+from dlo_casadi.equilibrium.tipping import Tipping, tipping_of
 from dlo_casadi.errors import DloError, EquilibriumError, counted
+from dlo_casadi.estimation.prediction import sides_of
 from dlo_casadi.io.parameters import Parameters, load_parameters
 from dlo_casadi.model.assembly import Given, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -68,13 +70,20 @@ class PredictedShape:
     cable : Parameters
         The fitted cable.
     pose : Pose
-        How its ends are held.
+        How its ends are held; where the cable may hang on either side, with the `turns` or the
+        `branch` of this one.
     equilibrium : Equilibrium
         Nodes, reactions, energy and stability.
     curve : CableCurve
         The cable itself, at any arc length: `curve.at(s)`.
     seen : CableCurve
         The same as the session's camera would measure it.
+    other_side : PredictedShape or None
+        The same pose on the other side: between two clamps in space twisted the other way round,
+        of a free end fallen to the other side. Only where the uncertain parameters and fixtures do
+        not tell which side is the lower one, and the pose does not name its side.
+    tipping : Tipping or None
+        How near the clamp then is to where both are equally low.
     """
 
     cable: Parameters
@@ -82,6 +91,8 @@ class PredictedShape:
     equilibrium: Equilibrium
     curve: CableCurve
     seen: CableCurve
+    other_side: PredictedShape | None = None
+    tipping: Tipping | None = None
 
     def band(self, count: int = 101) -> FloatArray:
         """Half width (count,) [m] of the band across the cable that holds 90 % of next hangings.
@@ -147,9 +158,24 @@ class PredictedShape:
             "moment_on_start": eq.moments[0].tolist(),
             "moment_on_end": eq.moments[1].tolist(),
             "min_bend_radius": eq.min_bend_radius,
-            "tipping": eq.tipping,
             "points": self.points(count).tolist(),
             "band_90": self.band(count).tolist(),
+            "other_side": self._other_side(count),
+        }
+
+    def _other_side(self, count: int) -> dict[str, Any] | None:
+        """The other side as plain data, with its greatest distance [m] from this one."""
+        other, near = self.other_side, self.tipping
+        if other is None or near is None:
+            return None
+        apart = np.linalg.norm(other.points(count) - self.points(count), axis=1)
+        shape = other.as_dict(count)
+        del shape["other_side"]
+        return {
+            "tipping": near.angle,
+            "tipping_std": near.std,
+            "greatest_distance": float(apart.max()),
+            **shape,
         }
 
 
@@ -171,7 +197,8 @@ def predict(
 ) -> PredictedShape:
     """Predict the shape of a fitted cable.
 
-    Of several equilibria the stable one of lowest energy, unless `branch` names one.
+    Of several equilibria the stable one of lowest energy, unless `branch` or `turns` name one;
+    where nobody knows which of two sides is the lower one, with the other one as `other_side`.
 
     Parameters
     ----------
@@ -222,7 +249,7 @@ def predict(
         turns,
         branch,
     )
-    model, p, rest, _ = cable
+    model, p, rest, metadata = cable
     try:
         eq = solve_equilibrium(model, p, rest, pose)
     except EquilibriumError as error:
@@ -233,9 +260,19 @@ def predict(
             f"{happened}\n  Try: an end in metres, nearer to the start; other {other}.",
             p_des=error.p_des,
         ) from None
-    return PredictedShape(
-        cable, pose, eq, _true_curve(model, p, rest, pose, eq), _curve(model, p, rest, pose, eq)
-    )
+
+    def shape(pose: Pose, eq: Equilibrium) -> PredictedShape:
+        true, seen = (curve(model, p, rest, pose, eq) for curve in (_true_curve, _curve))
+        return PredictedShape(cable, pose, eq, true, seen)
+
+    beyond = eq.other_side
+    if beyond is None:
+        return shape(pose, eq)
+    near = tipping_of(model, p, rest, pose, eq, beyond, metadata.uncertainty)
+    if not near.either:
+        return shape(pose, eq)
+    own, others = sides_of(model, pose, eq, beyond)
+    return replace(shape(own, eq), other_side=shape(others, beyond), tipping=near)
 
 
 def _pose(

@@ -151,8 +151,8 @@ HEADING_OFF, HEADING_NEAR = 1.0, 0.5
 
 # Normal scores of the residual's structure beyond it are worth a word: one in 370 by chance.
 NOTABLE = 3.0
-# Nearer than this to where both ways to fall are equally low, nobody knows which one a cable takes
-# [rad]: heavy ones differ by 0.3 1/m from hanging to hanging, over 0.6 m of length.
-EITHER = 0.2
+# Standard deviations of where two sides are equally low within which nobody knows which one a
+# cable takes: 95 % of a normal distribution.
+EITHER = 2.0
 # Rivals so many standard deviations apart are told from one another: one in 370 by chance.
 APART = 3.0

@@ -38,6 +38,7 @@ from simulated import random_session
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.effects import EFFECTS
+from dlo_casadi.equilibrium.equilibrium import tipping
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.spread import modes_in
 from dlo_casadi.estimation.mesh import SEARCH_MESH
@@ -67,6 +68,8 @@ HIDDEN = (
 )
 # Boundaries of the cables that do not repeat: a clamp, and a free tip.
 HANGING = "overhang"
+# Nearer than this [rad] to where two sides are equally low such a cable falls to either one.
+EITHER_SIDE = 0.2
 
 
 def hanging(config, generator):
@@ -98,7 +101,10 @@ def hanging(config, generator):
         held = Pose((0.0, 0.0), start_heading=float(heading), name=f"pose_{k:02d}")
         turned = replace(held, start_heading=float(heading + offset))
         found = predict_poses(model, p, rest, [turned])[0]
-        if found is None or found.either:
+        if found is None:
+            continue
+        eq = found.equilibrium
+        if eq.other_side is not None and tipping(model, eq, eq.other_side) < EITHER_SIDE:
             continue
         points = found.curve.at(s) + noise * generator.standard_normal((len(s), 2))
         measured.append(MeasuredPose.of_points(held, points, held_out=k % 6 == 5, s=s))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.text import Text
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.cli import main
@@ -231,6 +232,70 @@ def test_turns_twist_the_cable(loom):
     twist = [predict(loom, **IN_SPACE, turns=turns).equilibrium.twist for turns in (-1, 0, 1)]
     total = [values.mean() * 0.6 for values in twist]
     assert total[0] < total[1] - 1 < total[1] + 1 < total[2]
+
+
+@pytest.fixture(scope="module")
+def evenly_rolled(loom):
+    """Ends of the loom of which both ways round are equally low; rolled by so much more [rad]."""
+    held = load_parameters(loom).metadata.fixtures
+    frame = Rotation.from_quat(held["start_orientation"])
+    end = held["start"] + frame.apply([0.45, 0.0, 0.0])
+
+    def rolled(angle):
+        turned = frame * Rotation.from_rotvec([angle, 0.0, 0.0])
+        return {"end": tuple(end), "end_orientation": tuple(turned.as_quat())}
+
+    def excess(angle):
+        ways = [predict(loom, **rolled(angle), turns=turns) for turns in (0.5, -0.5)]
+        return ways[0].equilibrium.energy - ways[1].equilibrium.energy
+
+    even = brentq(excess, 2.4, 3.9, xtol=1e-5)
+    return lambda more: rolled(even + more)
+
+
+def test_near_half_a_turn_both_ways_round_are_predicted(loom, evenly_rolled):
+    """By how much more the clamp is rolled is the angle; it is known no better than end_roll."""
+    std = load_parameters(loom).std["end_roll"]
+    for more, turns in ((-0.5 * std, 0.5), (0.5 * std, -0.5)):
+        ends = evenly_rolled(more)
+        shape = predict(loom, **ends)
+        assert (shape.pose.turns, shape.other_side.pose.turns) == (turns, -turns)
+        assert shape.tipping.angle == pytest.approx(0.5 * std, abs=1e-4)
+        assert std < shape.tipping.std
+        for side in (shape, shape.other_side):
+            told = predict(loom, **ends, turns=side.pose.turns)
+            assert told.other_side is None
+            assert side.points() == pytest.approx(told.points(), abs=1e-8)
+        assert shape.equilibrium.energy < shape.other_side.equilibrium.energy
+    for far in (-1.0, 1.0):
+        assert predict(loom, **evenly_rolled(far)).other_side is None
+
+
+def test_the_command_tells_both_ways_round(loom, evenly_rolled, capsys):
+    std = load_parameters(loom).std["end_roll"]
+    ends = evenly_rolled(-0.5 * std)
+    numbers = {key: [str(x) for x in ends[key]] for key in ("end", "end_orientation")}
+    asked = ["--end", *numbers["end"], "--end-orientation", *numbers["end_orientation"]]
+    assert main(["predict", str(loom), *asked, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    other = printed["other_side"]
+    assert (printed["turns"], other["turns"]) == (0.5, -0.5)
+    assert printed["energy"] < other["energy"]
+    apart = np.linalg.norm(np.subtract(printed["points"], other["points"]), axis=1).max()
+    assert other["greatest_distance"] == pytest.approx(apart)
+    assert main(["predict", str(loom), *asked]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "this side `turns: 0.5`" in said
+    assert f"`turns: -0.5`: {other['energy']:.6g} J, up to {1e3 * apart:.3g} mm away" in said
+    assert main(["predict", str(loom), *asked, "--turns", "0.5", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["other_side"] is None
+    assert np.allclose(told["points"], printed["points"], rtol=0, atol=1e-8)
+    shape = predict(loom, **ends)
+    assert [line.get_label() for line in shape.plot().axes[0].lines][:2] == [
+        "cable",
+        "on the other side",
+    ]
 
 
 def test_the_command_takes_what_the_function_takes(loom, capsys):

@@ -22,7 +22,7 @@ from dlo_casadi.estimation.fit import (
 )
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes, twists
+from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes
 from dlo_casadi.estimation.starting_points import FIRST_LOOK, MORE
 from dlo_casadi.estimation.transfer import with_border_of
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -75,7 +75,7 @@ def origins_of(base: Fit) -> tuple[Origin, ...]:
     names, problem = base.model.names, _searched_problem(base, base.model)
     declared = np.where(problem.unknowns.free, base.model.nominal, base.p)
     # Either way round, as the fit has found to fit best.
-    turns = twists(base.model, base.point.shapes.x) / (2 * np.pi)
+    turns = base.model.node.turning(base.point.shapes.x) / (2 * np.pi)
     found = []
     for p, own in ((base.p, turns), (declared, None)):
         values = dict(zip(names, map(float, p), strict=True))

@@ -148,7 +148,7 @@ def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
             item.curve.at(places)
             for item in pair
             # Near a clamp that points up the cable may fall to either side: no clean test.
-            if item is not None and item.equilibrium.tipping is None
+            if item is not None and item.equilibrium.other_side is None
         ]
         gap = curves[0] - curves[1] if len(curves) == 2 else np.zeros((1, 2))
         differences.append(float(np.sqrt((gap**2).sum(axis=1).mean())))

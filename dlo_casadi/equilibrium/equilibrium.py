@@ -67,9 +67,9 @@ class Equilibrium:
         Largest violation of an end condition [m or rad].
     status : Status
     iterations : int
-    tipping : float or None [rad]
-        By how much the clamp of a cable with a free end must turn until the lowest equilibrium on
-        the other branch is as low; None if no stable one was found there, or none looked for.
+    other_side : Equilibrium or None
+        The stable equilibrium of the same pose if it tells the other side, see
+        `Composition.tipped_by`; None where there is none, and where the pose tells its side.
     """
 
     x: FloatArray
@@ -86,7 +86,7 @@ class Equilibrium:
     residual: float
     status: Status
     iterations: int
-    tipping: float | None = None
+    other_side: Equilibrium | None = None
 
     @property
     def shapes(self) -> Shapes:
@@ -116,6 +116,21 @@ class Equilibrium:
     def stable(self) -> bool:
         """Whether the energy has a strict minimum here under the end conditions."""
         return self.status is Status.STABLE
+
+
+def tipping(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
+    """Angle [rad] by which the clamp must turn until two sides are equally low, to first order.
+
+    dV/d(angle) of a clamp is the moment on it.
+    """
+    return abs(other.energy - eq.energy) / tipping_lever(model, eq, other)
+
+
+def tipping_lever(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
+    """Difference [N m] of the moments on the clamp that tips the cable."""
+    assert model.tipped_by is not None
+    k = model.border_names.index(model.tipped_by)
+    return max(abs(float(other.multipliers[k] - eq.multipliers[k])), 1e-300)
 
 
 def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:

@@ -31,8 +31,10 @@ IntArray = NDArray[np.intp]
 # Farther no end is moved at once [lengths, rad]: shapes near a fold are followed, not jumped over.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
 # In space first guesses are followed on a coarse mesh, and so many of the lowest minima that they
-# lead to on the model's own.
+# lead to, and the lowest on the other side, on the model's own.
 FEW = 2
+# Turns that tell which way round a clamp is rolled by half a turn, see `Pose`.
+WAYS_ROUND = (0.5, -0.5)
 # Turns by which the twist of a cable may differ from those asked for until it has shed some. Of
 # 7,500 random problems with up to four turns 1,369 differ by more than 1.35, 7 by 1.15 to 1.35.
 MOST_SHED = 1.3
@@ -138,12 +140,34 @@ def solve_equilibria(
     asked = [j for j in range(len(poses)) if j not in errors]
     reached = _reached(model, p, rest, [poses[j] for j in asked], [given[j] for j in asked])
     found: dict[int, Equilibrium] = {}
+    sided: list[int] = []
     for j, minima in zip(asked, reached, strict=True):
         try:
             found[j] = _chosen(model, poses[j], given[j], minima)
         except EquilibriumError as error:
             errors[j] = error
+            continue
+        stable = [eq.x for eq in minima if eq.stable and given[j] is None]
+        if stable and on_other_side(model, poses[j], found[j].x, np.array(stable)).any():
+            sided.append(j)
+    told = [way for j in sided for way in ways_of(model, poses[j])]
+    ways = solve_equilibria(model, p, rest, told) if told else []
+    for j, *pair in zip(sided, ways[::2], ways[1::2], strict=True):
+        for own, other in (pair, pair[::-1]):
+            if not (isinstance(own, Equilibrium) and isinstance(other, Equilibrium)):
+                continue
+            same = model.node.same(own.x, found[j].x, NEARBY)
+            apart = on_other_side(model, poses[j], found[j].x, other.x[None])[0]
+            if same and apart and other.stable:
+                found[j] = replace(found[j], other_side=other)
     return [found[j] if j in found else errors[j] for j in range(len(poses))]
+
+
+def ways_of(model: CableModel, pose: Pose) -> list[Pose]:
+    """A pose with each branch, or way round, that it may tell: first the counter-clockwise one."""
+    if not model.in_space:
+        return [replace(pose, branch=name) for name in SIGNS]
+    return [replace(pose, turns=turns) for turns in WAYS_ROUND] if model.tipped_by else []
 
 
 def _chosen(
@@ -192,7 +216,7 @@ def _chosen(
     lowest = found[0]
     for eq in found:
         if eq.turns(named) and eq.stable is lowest.stable:
-            return replace(eq, tipping=_tipping(model, eq, found))
+            return eq
     there = next((f"branch {branch}" for branch in SIGNS if lowest.turns(branch)), "neither branch")
     kind = "stable equilibrium" if lowest.stable else "equilibrium"
     raise EquilibriumError(
@@ -283,17 +307,20 @@ def _likely(
         coarse, assembly_of(coarse).strain(found.shapes, given)[:, : coarse.chain.n_cells]
     )
     held = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
-    kept: list[int] = []
+    x, kept = found.shapes.x, []
     for j in range(len(poses)):
         rows = np.flatnonzero((of == j) & held)
+        rows = rows[np.argsort(found.energy[rows], kind="stable")]
         mine: list[int] = []
-        for k in rows[np.argsort(found.energy[rows], kind="stable")]:
-            x = found.shapes.x
+        for k in rows:
             differs = all(not model.node.same(x[k], x[other], NEARBY) for other in mine)
             if differs and len(mine) < FEW:
                 mine.append(int(k))
+        if mine:
+            there = rows[on_other_side(model, poses[j], x[mine[0]], x[rows])]
+            mine += [int(k) for k in there[:1] if k not in mine]
         kept += mine
-    nodes = model.node.interpolated(fine.places, coarse.chain.places, found.shapes.x[kept])
+    nodes = model.node.interpolated(fine.places, coarse.chain.places, x[kept])
     return of[kept], Shapes.declared(nodes, found.shapes.lam[kept])
 
 
@@ -324,16 +351,18 @@ def _holds(twist: FloatArray, turns: FloatArray | float) -> NDArray[np.bool_]:
     return (np.abs(twist - turns) <= MOST_SHED) | (turns == 0)
 
 
-def _tipping(model: CableModel, eq: Equilibrium, found: list[Equilibrium]) -> float | None:
-    """Angle [rad] of the clamp at which another way to fall is as low, to first order.
+def on_other_side(
+    model: CableModel, pose: Pose, x: FloatArray, others: FloatArray
+) -> NDArray[np.bool_]:
+    """Whether other shapes (m, n_nodes, coordinates) hang on the other side of a shape.
 
-    dV/d(heading) of the clamp is the moment on it.
+    They turn the other way; between two clamps, whole turns apart, by more than half a turn less
+    or more. None does where the pose tells its side, or the cable has none.
     """
-    others = [other for other in found if other.stable and other.turn * eq.turn < 0]
-    if (model.start, model.end) != ("clamped", "free") or not others:
-        return None
-    lever = abs(float(others[0].moments[0] - eq.moments[0]))
-    return abs(others[0].energy - eq.energy) / max(lever, 1e-300)
+    turn, turns = float(model.node.turning(x)), model.node.turning(others)
+    least = 0.0 if pose.end is None else np.pi
+    apart = (turns * turn < 0) & (np.abs(turns - turn) > least)
+    return np.asarray(apart & (model.tipped_by is not None and not pose.turns and not pose.branch))
 
 
 def continued(

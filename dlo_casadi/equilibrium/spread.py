@@ -47,6 +47,28 @@ class Uncertainty:
     rest_scatter: RestScatter
     hanging: float = 0.0
 
+    def unknowns_in(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
+        """What each of `names` moves: parameters (n_parameters, N) and rests (n_rests, N)."""
+        size = len(self.names)
+        by_p, by_rest = np.zeros((len(model.names), size)), np.zeros((model.chain.n_rests, size))
+        for k, name in enumerate(self.names):
+            if name in model.names:
+                by_p[model.names.index(name), k] = 1.0
+            else:
+                coefficient = int(name.removeprefix("rest_curvature[").removesuffix("]"))
+                by_rest[:, k] = model.rest_basis[:, coefficient]
+        return by_p, by_rest
+
+    def scatter_in(self, model: CableModel) -> FloatArray:
+        """Standard deviations of a model's deviations; 0 of pulls, of which nothing is known."""
+        scatter = np.array([self.scatter.get(name, 0.0) for name in model.deviations])
+        return np.where(np.isfinite(scatter), scatter, 0.0)
+
+    def rest_modes_in(self, model: CableModel) -> FloatArray:
+        """Rest curvatures (n_rests, axes MODES) of a hanging's own, one standard deviation each."""
+        modes = modes_in(model)
+        return modes * np.tile(self.rest_scatter.sizes, modes.shape[1] // MODES)
+
 
 def modes_in(model: CableModel) -> FloatArray:
     """The same as rest curvatures of a model's cells, axis by axis: (n_rests, axes MODES)."""
@@ -71,28 +93,20 @@ def displacements(
     """
     sweep = Sweep(model, [pose])
     shapes, size = found.shapes, len(uncertainty.names)
-    by_p, by_rest = np.zeros((len(p), size)), np.zeros((len(rest), size))
-    for k, name in enumerate(uncertainty.names):
-        if name in model.names:
-            by_p[model.names.index(name), k] = 1.0
-        else:
-            coefficient = int(name.removeprefix("rest_curvature[").removesuffix("]"))
-            by_rest[:, k] = model.rest_basis[:, coefficient]
+    by_p, by_rest = uncertainty.unknowns_in(model)
     along = sweep.directions(shapes, p, rest, by_p, by_rest)
     seen = sweep.observe(shapes, p, rest, along)
     curve = NodeCurve.of(model.cable.length, seen.z[0])
     way = curve.moved(s, seen.slopes[0])
-    scatter = np.array([uncertainty.scatter.get(name, 0.0) for name in model.deviations])
-    moved = [
+    moved: list[FloatArray] = [
         way[..., :size] @ _root(uncertainty.covariance),
-        way[..., size:] * np.where(np.isfinite(scatter), scatter, 0.0),
+        way[..., size:] * uncertainty.scatter_in(model),
         np.broadcast_to(uncertainty.hanging * np.eye(curve.d), (len(s), curve.d, curve.d)),
     ]
     if uncertainty.rest_scatter.std > 0:
-        modes = modes_in(model)
+        modes = uncertainty.rest_modes_in(model)
         hanging = sweep.observe(shapes, p, rest, sweep.by_rest(shapes, p, rest, modes))
-        sizes = np.tile(uncertainty.rest_scatter.sizes, modes.shape[1] // MODES)
-        moved.append(curve.moved(s, hanging.slopes[0]) * sizes)
+        moved.append(curve.moved(s, hanging.slopes[0]))
     return curve, np.concatenate(moved, axis=2)
 
 

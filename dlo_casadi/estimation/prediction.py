@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.chords import line_nodes
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
-from dlo_casadi.equilibrium.pose import SIGNS, Pose, PoseBranch
-from dlo_casadi.equilibrium.solve import continued, solve_equilibria
+from dlo_casadi.equilibrium.pose import Pose, PoseBranch
+from dlo_casadi.equilibrium.solve import continued, solve_equilibria, ways_of
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.thresholds import EITHER
 
 FloatArray = NDArray[np.floating]
 
@@ -46,16 +45,6 @@ class Prediction:
         """As the camera would see it."""
         return self.seen.curve
 
-    @property
-    def either(self) -> bool:
-        """Whether the cable may as well fall to the other side."""
-        tipping = self.equilibrium.tipping
-        return tipping is not None and tipping < EITHER
-
-
-# Turns that tell which way round a clamp is rolled by half a turn, see `Pose`.
-WAYS_ROUND = (0.5, -0.5)
-
 
 @dataclass(frozen=True)
 class MeasuredBranch:
@@ -70,11 +59,14 @@ class MeasuredBranch:
         What the pose has to name for this equilibrium to be predicted; None if no name does.
     turns : 0.5, -0.5 or None
         The same of a cable in space that is twisted the other way round, see `Pose`.
+    other_side : bool
+        Whether it is a side of the cable, see `Composition.tipped_by`, and the pose tells none.
     """
 
     prediction: Prediction
     branch: PoseBranch | None
     turns: float | None = None
+    other_side: bool = False
 
 
 def predict_each(
@@ -168,17 +160,40 @@ def predicted_shapes(
 ) -> Shapes:
     """Shapes of a problem's poses as a user is told them, who knows their ends alone.
 
-    Where there is no prediction, or where the cable may fall to either side, they are those of
-    `shapes`. A prediction takes 3 ms in the plane.
+    Where there is no prediction, or one on the other side (see `Composition.tipped_by`), they are
+    those of `shapes`. A prediction takes 3 ms in the plane.
     """
-    poses = [item.pose for item in problem.history]
-    predictions = predict_poses(problem.unknowns.model, p, rest, poses)
+    model, history = problem.unknowns.model, [item.pose for item in problem.history]
+    predictions = predict_poses(model, p, rest, history)
+    poses = [history[index] for index in problem.indices]
+    known = [predictions[index] for index in problem.indices]
+    elsewhere = [
+        replace(one, equilibrium=replace(one.equilibrium, x=x))
+        if one is not None
+        and _tells_no_side(model, pose)
+        and not model.node.same(one.equilibrium.x, x, NEARBY)
+        else None
+        for one, pose, x in zip(known, poses, shapes.x, strict=True)
+    ]
+    told = _told(model, p, poses, elsewhere)
     x, lam = shapes.x.copy(), shapes.lam.copy()
-    for j, index in enumerate(problem.indices):
-        prediction = predictions[index]
-        if prediction is not None and not prediction.either:
-            x[j], lam[j] = prediction.equilibrium.x, prediction.equilibrium.multipliers
+    for j, (one, way) in enumerate(zip(known, told, strict=True)):
+        if one is not None and way is None:
+            x[j], lam[j] = one.equilibrium.x, one.equilibrium.multipliers
     return Shapes.declared(x, lam)
+
+
+def _tells_no_side(model: CableModel, pose: Pose) -> bool:
+    """Whether a cable has sides, see `Composition.tipped_by`, of which the pose tells none."""
+    return model.tipped_by is not None and not pose.branch and not pose.turns
+
+
+def predict_other_side(
+    model: CableModel, p: FloatArray, pose: Pose, known: Prediction
+) -> Prediction | None:
+    """What a prediction would be on the other side, see `Equilibrium`; None where there is none."""
+    other = known.equilibrium.other_side
+    return None if other is None else _seen(model, p, known.rest, [pose], [other])[0]
 
 
 def measured_elsewhere(
@@ -228,15 +243,10 @@ def _along_line(model: CableModel, p: FloatArray, line: MeasuredPose) -> list[Fl
     pose = line.pose
     if END_ROLL in model.names:
         pose = pose.rolled(float(p[model.names.index(END_ROLL)]))
-    either = _either_way(model, pose) and not model.has_state
-    ways = [replace(pose, turns=turns) for turns in WAYS_ROUND] if either else [pose]
+    either = model.in_space and not pose.turns and not model.has_state
+    ways = (ways_of(model, pose) if either else []) or [pose]
     places = line.places(model.cable.length)
     return [line_nodes(line.points, way, model.chain, places) for way in ways]
-
-
-def _either_way(model: CableModel, pose: Pose) -> bool:
-    """Whether a cable may be twisted either way round: in space, between clamps, not told."""
-    return model.in_space and not pose.turns and (model.start, model.end) == ("clamped", "clamped")
 
 
 def measured_branches(
@@ -256,10 +266,9 @@ def measured_branches(
         branch = None
         if found is not None:
             branch = MeasuredBranch(found, None)
-            if way is not None and _either_way(model, item.pose):
-                branch = MeasuredBranch(found, None, way.turns)
-            elif way is not None:
-                branch = MeasuredBranch(found, way.branch)
+            if way is not None:
+                named, side = None if way.turns else way.branch, _tells_no_side(model, item.pose)
+                branch = MeasuredBranch(found, named, way.turns or None, side)
             elif _continues(model, p, item.pose, found, last):
                 branch = MeasuredBranch(found, "previous")
         out.append(branch)
@@ -278,7 +287,7 @@ def _told(
 ) -> list[Pose | None]:
     """Poses that tell the branch or the turns for which others are predicted, where one does."""
     ways = [
-        [] if found is None else _ways(model, pose)
+        [] if found is None or pose.turns else ways_of(model, pose)
         for pose, found in zip(poses, others, strict=True)
     ]
     out: list[Pose | None] = [None] * len(poses)
@@ -295,11 +304,11 @@ def _told(
     return out
 
 
-def _ways(model: CableModel, pose: Pose) -> list[Pose]:
-    """A pose with each branch, or way round, that it may name."""
-    if _either_way(model, pose):
-        return [replace(pose, turns=turns) for turns in WAYS_ROUND]
-    return [] if model.in_space else [replace(pose, branch=name) for name in SIGNS]
+def sides_of(model: CableModel, pose: Pose, *pair: Equilibrium) -> list[Pose]:
+    """A pose that tells the side of each of two equilibria on either side."""
+    ways = ways_of(model, pose)
+    turned = [float(model.node.turning(eq.x)) for eq in pair]
+    return ways if turned[0] > turned[1] else ways[::-1]
 
 
 def _continues(

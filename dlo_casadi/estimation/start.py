@@ -83,11 +83,6 @@ def measured_shapes(
     return shapes, feet
 
 
-def twists(model: CableModel, x: FloatArray) -> FloatArray:
-    """Twist (m,) [rad] of cables in space with nodes x (m, n_nodes, coordinates)."""
-    return np.asarray(model.node.difference(x[:, :-1], x[:, 1:])[..., 0].sum(axis=1))
-
-
 def turned_either_way(
     problem: BatchProblem, guess: Guess, held: NDArray[np.bool_], roll: float
 ) -> Guess:
@@ -104,7 +99,7 @@ def turned_either_way(
     roll : float [rad]
         Of the cable in its end clamp, by which the guess's shapes were found.
     """
-    twist = twists(problem.unknowns.model, guess.shapes.x)
+    twist = problem.unknowns.model.node.turning(guess.shapes.x)
     order = [j for j in np.argsort(-np.abs(twist)) if abs(twist[j]) > EITHER_WAY]
     order = [j for j in order if j in problem.used and not problem.measured[j].pose.turns]
     first = all_at_once(problem, guess, held, LOOK) if order else None

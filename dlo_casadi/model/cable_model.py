@@ -276,6 +276,17 @@ class CableModel:
         return tuple(names)
 
     @cached_property
+    def tipped_by(self) -> str | None:
+        """The end condition whose angle decides on which of two sides the cable hangs lower.
+
+        A free end falls to either side of a clamp that points up; between two clamps in space the
+        cable is twisted either way round where one is rolled by half a turn. Others have no sides.
+        """
+        turned = {("clamped", "free"): "start_heading", ("clamped", "clamped"): "end_rotation_x"}
+        name = turned.get((self.start, self.end))
+        return name if name in self.condition_names else None
+
+    @cached_property
     def deviations(self) -> tuple[str, ...]:
         """Which deviations of a pose can matter for these boundaries."""
         axes, turns = self.node.axes, self.node.turns

@@ -47,6 +47,9 @@ def _draw(drawing: Figure, shape: dict[str, Any]) -> None:
         band = band_outline(points, np.array(shape["band_90"]))
         axes.fill(*band.T, color=BLUE, alpha=0.15, lw=0, label="90 % of next hangings")
     axes.plot(*points.T, color=BLUE, lw=2.5, label="cable")
+    if shape["other_side"] is not None:
+        other = np.array(shape["other_side"]["points"])
+        axes.plot(*other.T, "--", color=BLUE, lw=1.5, label="on the other side")
     for at, (side, force) in zip((points[0], points[-1]), forces.items(), strict=True):
         held = side == "start" or shape["end"] is not None
         if not held:

@@ -66,6 +66,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "effects": list(outcome.effects),
         "candidates": list(outcome.candidates),
         "verdict": outcome.verdict,
+        "either_side": {name: asdict(found) for name, found in outcome.either_side.items()},
         "unexplained": outcome.unexplained,
         "next_pose": outcome.next_pose,
         "structure": outcome.structure,
@@ -133,6 +134,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
             "rmse_fit_measured_branch": None,
             "rmse_held_out_measured_branch": None,
             "other_branch": {},
+            "measured_side": {},
             "held_out": None,
             "chi2_per_dof": None,
             "parameters": {
@@ -168,6 +170,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
             }
             for pose, found in stage.other_branch.items()
         },
+        "measured_side": {pose: asdict(found) for pose, found in stage.measured_side.items()},
         "held_out": asdict(outcome.held_out(stage)),
         "chi2_per_dof": stage.chi2_per_dof,
         "parameters": parameters,

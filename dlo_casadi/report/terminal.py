@@ -32,8 +32,7 @@ from dlo_casadi.report.text_parameters import (
     rest_rows,
     vector,
 )
-from dlo_casadi.session.outcome import Outcome, ReadingErrors
-from dlo_casadi.thresholds import EITHER
+from dlo_casadi.session.outcome import BranchShape, Outcome, ReadingErrors
 
 # Distances [m] that the table of a prediction shows.
 _SHOWN = 5e-6
@@ -217,6 +216,11 @@ def prediction_table(shape: dict[str, Any], notes: Iterable[str] = ()) -> Render
     return Group(table, points, *(Text(note) for note in notes))
 
 
+def _side(shape: dict[str, Any]) -> str | None:
+    """What tells the side on which a predicted cable hangs."""
+    return BranchShape(0.0, shape["branch"], shape.get("turns")).chosen_by
+
+
 def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
     """Quantities of a predicted pose, as from `PredictedShape.as_dict`, and their values."""
     rows = []
@@ -241,7 +245,14 @@ def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("smallest bend radius", millimetres(shape["min_bend_radius"])))
     stable = "yes" if shape["stable"] else "NO: the cable would not stay there"
     rows.append(("stable", stable))
-    if shape["tipping"] is not None and shape["tipping"] < EITHER:
-        turned = f"equally low with the clamp turned by {shape['tipping']:.2g} rad"
-        rows.append(("also stable", f"falling to the other side, {turned}"))
+    other = shape["other_side"]
+    if other is not None:
+        rows.append(("this side", f"`{_side(shape)}`"))
+        near = f"{other['tipping']:.2g} rad (known to {other['tipping_std']:.2g} rad)"
+        text = (
+            f"`{_side(other)}`: {other['energy']:.6g} J, up to "
+            f"{millimetres(other['greatest_distance'])} away; equally low with the clamp turned by "
+            f"{near}"
+        )
+        rows.append(("also stable", text))
     return rows

@@ -10,7 +10,7 @@ import numpy as np
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.canvas import NOISE_ALONE, millimetres
 from dlo_casadi.report.text_parameters import plus_minus, vector
-from dlo_casadi.session.outcome import BranchShape, Outcome, Stage, StageName
+from dlo_casadi.session.outcome import BranchShape, EitherSide, Outcome, Stage, StageName
 from dlo_casadi.thresholds import APART, NOTABLE
 
 # The errors of a stage, of which some poses were measured in another equilibrium.
@@ -52,6 +52,7 @@ def verdict_lines(outcome: Outcome) -> list[str]:
         lines = [_verdict(outcome)]
     else:
         lines = ["Diagnosis: switched off; nothing was looked for in the residual."]
+    lines += [_either_side(name, found) for name, found in outcome.either_side.items()]
     lines += structure_lines(outcome)
     for effect in outcome.effects:
         lines += _effect_lines(effect)
@@ -75,6 +76,21 @@ def verdict_lines(outcome: Outcome) -> list[str]:
         )
         lines.append(f"  {reading_text(outcome.next_pose['reading'])}")
     return lines
+
+
+def _either_side(name: str, found: EitherSide) -> str:
+    """A held-out pose on both of its sides, and what chooses each."""
+    predicted, other, near = found.predicted, found.other, found.tipping
+    text = f"  {name} (held out): "
+    if near is not None:
+        text += (
+            f"its clamp is {near.angle:.2g} rad (known to {near.std:.2g} rad) from the angle at "
+            "which both ways to hang are equally low; "
+        )
+    return text + (
+        f"`{predicted.chosen_by or 'turns: 0'}` (predicted) {millimetres(predicted.rmse)} off, "
+        f"`{other.chosen_by}` {millimetres(other.rmse)} off."
+    )
 
 
 # Nobody measures a pose more often.

@@ -95,6 +95,14 @@ class Node(ABC):
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
         """Whether two rows of nodes (n_nodes, coordinates) are one shape, to a tolerance [rad]."""
 
+    @classmethod
+    def turning(cls, x: FloatArray) -> FloatArray:
+        """Angles (...) [rad] by which shapes (..., n_nodes, coordinates) turn from start to end.
+
+        In a plane between the headings, in space about the cable: its twist.
+        """
+        return np.asarray(cls.difference(x[..., :-1, :], x[..., 1:, :])[..., 0].sum(axis=-1))
+
 
 class Heading(Node):
     """The direction of a planar cable: one angle against the board's x axis [rad]."""

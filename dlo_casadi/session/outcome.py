@@ -14,6 +14,7 @@ from scipy.special import chdtri
 from dlo_casadi.config import Config
 from dlo_casadi.equilibrium.pose import PoseBranch
 from dlo_casadi.equilibrium.spread import COVERED
+from dlo_casadi.equilibrium.tipping import Tipping
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
@@ -94,6 +95,30 @@ class BranchShape:
 
 
 @dataclass(frozen=True)
+class EitherSide:
+    """A pose on both of the sides on which its cable may hang, see `Composition.tipped_by`.
+
+    Parameters
+    ----------
+    predicted, other : BranchShape
+        On the predicted side, and on the other one.
+    tipping : Tipping or None
+        How near the clamp is to where both are equally low; None where no angle of it makes them
+        so, to first order: `turns` may also tell between arcs to different sides.
+    """
+
+    predicted: BranchShape
+    other: BranchShape
+    tipping: Tipping | None
+
+    @property
+    def told(self) -> bool:
+        """Whether the pose was measured on the other side, or nobody knows the lower one."""
+        near = self.tipping is not None and self.tipping.either
+        return near or self.other.rmse < self.predicted.rmse
+
+
+@dataclass(frozen=True)
 class PoseShape:
     """One pose as one stage sees it.
 
@@ -126,8 +151,10 @@ class PoseShape:
         let expect, in the directions in which it is compared; None if it was not computed.
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
-    tipping : float or None [rad]
-        See `Equilibrium`; None where the pose names its branch.
+    measured_side : BranchShape or None
+        Of a fit pose that is compared on the side where it was measured, not the lower one.
+    either_side : EitherSide or None
+        Of a held-out pose that tells no side, where there are two; None if it was not computed.
     """
 
     curve: FloatArray
@@ -139,7 +166,8 @@ class PoseShape:
     stable: bool
     forces: FloatArray
     measured_branch: BranchShape | None = None
-    tipping: float | None = None
+    measured_side: BranchShape | None = None
+    either_side: EitherSide | None = None
     spread: FloatArray | None = None
     expected: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
@@ -210,6 +238,12 @@ class Stage:
         """By name the poses that were measured in another equilibrium than the predicted one."""
         found = {name: shape.measured_branch for name, shape in self.shapes.items()}
         return {name: branch for name, branch in found.items() if branch is not None}
+
+    @property
+    def measured_side(self) -> dict[str, BranchShape]:
+        """By name the fit poses that are compared on another side than a prediction takes."""
+        found = {name: shape.measured_side for name, shape in self.shapes.items()}
+        return {name: side for name, side in found.items() if side is not None}
 
 
 @dataclass(frozen=True)
@@ -431,6 +465,12 @@ class Outcome:
                 continue
             inside.append(shape.inside_band(self.fit.model.cable.length, noise))
         return float(np.concatenate(inside).mean()) if inside else None
+
+    @property
+    def either_side(self) -> dict[str, EitherSide]:
+        """Held-out poses by name of which the side is to be told, as the last stage sees them."""
+        found = {name: shape.either_side for name, shape in self.stages[-1].shapes.items()}
+        return {name: either for name, either in found.items() if either and either.told}
 
     def held_out(self, stage: Stage) -> HeldOut:
         """How many of the declared held-out poses a stage has predicted."""

@@ -16,7 +16,7 @@ from dlo_casadi.estimation.mesh import allowed_mesh_error
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
-from dlo_casadi.thresholds import EITHER, FIXTURES, UNSEEN
+from dlo_casadi.thresholds import FIXTURES, UNSEEN
 
 FloatArray = NDArray[np.floating]
 
@@ -67,12 +67,20 @@ def held_out_missing(
 
 
 def branch_warnings(stages: Sequence[Stage]) -> list[str]:
-    """Poses predicted in another stable equilibrium than the measured one, or that may be."""
+    """Poses measured in another stable equilibrium than the one of lowest energy.
+
+    Held-out poses on the other side are told with the verdict.
+    """
     lines = []
     for stage in stages:
         if stage.name not in ("batch", "closed"):
             continue
-        others = stage.other_branch
+        either = {name: shape.either_side for name, shape in stage.shapes.items()}
+        others = {
+            name: shape
+            for name, shape in stage.other_branch.items()
+            if not (side := either[name]) or side.other.chosen_by != shape.chosen_by
+        }
         for chosen_by in dict.fromkeys(shape.chosen_by for shape in others.values()):
             found = {k: shape for k, shape in others.items() if shape.chosen_by == chosen_by}
             predicted = max(stage.shapes[name].rmse or 0.0 for name in found)
@@ -82,19 +90,13 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
                 f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
                 f"off, on the measured branch {1e3 * measured:.3g} mm; {_cure(chosen_by)}"
             )
-    for stage in stages[-1:]:
-        either = [
-            name
-            for name, shape in stage.shapes.items()
-            if shape.tipping is not None and shape.tipping < EITHER
-        ]
-        if either:
-            nearest = min(stage.shapes[name].tipping or 0.0 for name in either)
+        sides = stage.measured_side
+        for chosen_by in dict.fromkeys(side.chosen_by for side in sides.values()):
+            names = ", ".join(k for k, side in sides.items() if side.chosen_by == chosen_by)
             lines.append(
-                f"stage {stage.name}: {', '.join(either)}: the cable may fall to either side. Both "
-                "are stable, and the one of lower energy is predicted; with the clamp turned by "
-                f"{nearest:.2g} rad it would be the other. `branch: ccw`, `cw` or `previous` (as "
-                "in the pose before it) says which"
+                f"stage {stage.name}: {names}: the cable of these fit poses hangs on another side "
+                "than that of lowest energy; they are compared where they hang, and a prediction "
+                f"of the same ends needs `{chosen_by}`"
             )
     return lines
 
@@ -156,10 +158,10 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
     """Why the numbers of the last stage do not hold, whatever its residual looks like.
 
     Its fit has not converged; or poses are predicted, from their ends alone, worse than UNSEEN
-    times what noise, fixtures, parameters and the cable's scatter let expect. Where a cable may
-    fall to either side, a pose on the other one is what its scatter lets expect. A pose whose
-    equilibrium has no name but the way that led there tells of the model what it tells there; but
-    where that holds for all poses, and a simpler model comes nearer, nothing is predicted.
+    times what noise, fixtures, parameters and the cable's scatter let expect. A held-out pose that
+    hangs on the other side (see `EitherSide`), and one whose equilibrium has no name but the way
+    that led there, tells of the model what it tells there; but where all poses were measured in
+    another equilibrium, and a simpler model comes nearer, nothing is predicted.
     """
     lines, stage = [], stages[-1]
     if fit.failed:
@@ -220,10 +222,8 @@ def _errors(shape: PoseShape) -> FloatArray:
     """Squares (2, K) [m^2] of a pose's distances from its prediction: measured, expected."""
     if shape.expected is None:
         return np.zeros((2, 0))
-    if shape.measured_branch is not None and shape.tipping is not None and shape.tipping < EITHER:
-        return np.zeros((2, 0))
     expected, there = shape.expected**2, shape.measured_branch
-    if there is not None and there.branch not in SIGNS:
+    if there is not None and (there.branch not in SIGNS or shape.either_side is not None):
         return np.stack([np.full_like(expected, there.rmse**2), expected])
     return np.stack([(shape.gap**2).sum(axis=1), expected])
 

@@ -10,14 +10,18 @@ from numpy.typing import NDArray
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
+from dlo_casadi.equilibrium.tipping import tipping_of
 from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
     Prediction,
     measured_branches,
+    predict_other_side,
     predict_poses,
     rms_distance,
+    sides_of,
 )
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit
@@ -29,6 +33,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import (
     MASS,
     BranchShape,
+    EitherSide,
     ParameterEstimate,
     PoseShape,
     ReadingErrors,
@@ -55,13 +60,12 @@ def pose_shape(
     gap: FloatArray = np.zeros((0, curve.d))
     rmse = branch = None
     if item.readable:
-        rmse = float(np.sqrt((item.distances(curve) ** 2).mean()))
+        rmse = _rmse(prediction, item)
     if item.has_line:
         s = item.traced.nearest(curve)
         gap = item.traced.points - curve.at(s)
     if item.readable and other is not None:
-        distances = item.distances(other.prediction.curve)
-        branch = BranchShape(float(np.sqrt((distances**2).mean())), other.branch, other.turns)
+        branch = _branch_shape(other, item)
     return PoseShape(
         curve.at(places),
         rmse,
@@ -72,9 +76,47 @@ def pose_shape(
         eq.stable,
         np.stack([eq.lam_start, eq.lam]),
         branch,
-        None if item.pose.branch else eq.tipping,
         readings=item.readings_beside(prediction.seen),
     )
+
+
+def _rmse(prediction: Prediction, item: MeasuredPose) -> float:
+    """Root mean square distance [m] of a pose's points to a prediction."""
+    return float(np.sqrt((item.distances(prediction.curve) ** 2).mean()))
+
+
+def _branch_shape(found: MeasuredBranch, item: MeasuredPose) -> BranchShape:
+    return BranchShape(_rmse(found.prediction, item), found.branch, found.turns)
+
+
+def _either_side(
+    model: CableModel,
+    p: FloatArray,
+    item: MeasuredPose,
+    known: Prediction,
+    measured: MeasuredBranch | None,
+    uncertainty: Uncertainty,
+) -> EitherSide | None:
+    """A held-out pose on both sides, see `EitherSide`; None where there is but one."""
+    if not (item.held_out and item.readable):
+        return None
+    if measured is not None and measured.other_side:
+        other: Prediction | None = measured.prediction
+    else:
+        other = predict_other_side(model, p, item.pose, known)
+    if other is None:
+        return None
+    pair = known.equilibrium, other.equilibrium
+    if measured is not None and not on_other_side(model, item.pose, pair[0].x, pair[1].x[None])[0]:
+        predicted = BranchShape(_rmse(known, item), None)
+        return EitherSide(predicted, _branch_shape(measured, item), None)
+    ways = sides_of(model, item.pose, *pair)
+    shapes = [
+        BranchShape(_rmse(one, item), way.branch, way.turns or None)
+        for one, way in zip((known, other), ways, strict=True)
+    ]
+    tipping = tipping_of(model, p, known.rest, item.pose, *pair, uncertainty)
+    return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
 
 
 def _reading_errors(
@@ -125,17 +167,26 @@ def _stage(
 ) -> Stage:
     predictions = predict_poses(model, p, rest, [item.pose for item in measured])
     others = measured_branches(model, p, rest, measured, predictions, fitted)
+    sides: dict[str, BranchShape] = {}
+    for j, (item, other) in enumerate(zip(measured, others, strict=True)):
+        if other is not None and other.other_side and not item.held_out:
+            # A fit has used on which side the cable of its poses hangs.
+            predictions[j], others[j] = other.prediction, None
+            sides[item.pose.name] = _branch_shape(other, item)
     shapes = {
-        item.pose.name: pose_shape(prediction, item, other)
+        item.pose.name: replace(
+            pose_shape(prediction, item, other), measured_side=sides.get(item.pose.name)
+        )
         for prediction, item, other in zip(predictions, measured, others, strict=True)
         if prediction is not None
     }
     if uncertainty is not None:
-        for item, known in zip(measured, predictions, strict=True):
+        for item, known, other in zip(measured, predictions, others, strict=True):
             if known is not None:
                 shape = shapes[item.pose.name]
                 shape = _expected(model, p, item, known, shape, uncertainty, noise)
-                shapes[item.pose.name] = shape
+                either = _either_side(model, p, item, known, other, uncertainty)
+                shapes[item.pose.name] = replace(shape, either_side=either)
     lost = [item for item in measured if item.pose.name not in shapes]
     if lost:
         names = ", ".join(item.pose.name for item in lost)

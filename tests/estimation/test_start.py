@@ -12,7 +12,7 @@ from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation import starting_points
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way, twists
+from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel
 from dlo_casadi.model.tolerances import Tolerances
@@ -57,8 +57,8 @@ def test_twists_are_turned_the_way_that_fits():
     problem.refresh(theta, shapes, feet)
     begun = turned_either_way(problem, Guess(theta, shapes, feet), held, roll)
 
-    true = twists(model, measured_shapes(problem, ROLL)[0].x)
-    before, after = (twists(model, x) for x in (shapes.x, begun.shapes.x))
+    true = model.node.turning(measured_shapes(problem, ROLL)[0].x)
+    before, after = (model.node.turning(x) for x in (shapes.x, begun.shapes.x))
     assert true[0] > 2.0
     assert before[0] < -2.0
     np.testing.assert_allclose(after, true + OFF, atol=0.2)

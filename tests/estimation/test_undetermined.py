@@ -5,7 +5,7 @@ import pytest
 
 from dlo_casadi.effects import Cable, LumpedMass
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.equilibrium.spread import Uncertainty, spread_across
+from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
 from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -76,7 +76,9 @@ def test_an_unknown_place_widens_no_band(fitted):
     s = np.linspace(0.0, LENGTH, 11)
 
     def band(uncertainty):
-        return spread_across(fit.model, fit.p, shape.rest, pose, shape.equilibrium, uncertainty, s)
+        known = (shape.rest, pose, shape.equilibrium, uncertainty)
+        curve, moved = displacements(fit.model, fit.p, *known, s)
+        return spread_across(curve, s, moved)
 
     whole = uncertainty_of(fit)
     without = covariance.copy()

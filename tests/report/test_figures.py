@@ -173,6 +173,7 @@ def test_a_prediction_is_drawn(tmp_path, end):
         "energy": 1.0,
         "min_bend_radius": 0.1,
         "stable": end is None,
+        "other_side": None if end is None else {"points": (-points).tolist()},
     }
     draw_prediction(tmp_path / "shape.png", shape)
 

@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dlo_casadi.equilibrium.tipping import Tipping
 from dlo_casadi.report.json_report import all_warnings, finite, report_dict, report_text
+from dlo_casadi.report.page_data import page_data
+from dlo_casadi.report.text_findings import verdict_lines
 from dlo_casadi.session.outcome import (
     BranchShape,
+    EitherSide,
     ParameterEstimate,
     RestCurvatureEstimate,
     Stage,
@@ -28,6 +32,7 @@ KEYS = {
     "effects": list,
     "candidates": list,
     "verdict": type(None),  # the diagnosis is switched off
+    "either_side": dict,
     "unexplained": type(None),
     "next_pose": type(None),
     "structure": type(None),
@@ -86,6 +91,7 @@ def test_every_key_of_the_schema_is_there(outcome):
             "rmse_fit_measured_branch",
             "rmse_held_out_measured_branch",
             "other_branch",
+            "measured_side",
             "held_out",
             "chi2_per_dof",
             "parameters",
@@ -116,6 +122,42 @@ def test_a_pose_on_another_branch_is_there_with_both_errors(outcome):
     row = {"rmse": shape.rmse, "rmse_measured_branch": 1e-4, "branch": "cw", "turns": None}
     assert entry["other_branch"] == {name: row}
     assert entry["held_out"] == {"predicted": 3, "declared": 3, "missing": []}
+
+
+def test_a_held_out_pose_on_either_side_stands_beside_the_verdict(outcome):
+    batch = outcome.stage("batch")
+    sides = BranchShape(0.054, None, 0.5), BranchShape(0.0031, None, -0.5)
+    either = EitherSide(*sides, Tipping(0.03, 0.02))
+    usual = EitherSide(sides[1], sides[0], Tipping(0.3, 0.02))  # known to be the lower one
+    arcs = EitherSide(
+        BranchShape(0.02, None), sides[1], None
+    )  # no roll leads from one to the other
+    names = [pose.name for pose in outcome.poses if pose.role == "held_out"][:3]
+    shapes = {
+        name: replace(batch.shapes[name], either_side=found)
+        for name, found in zip(names, (either, usual, arcs), strict=True)
+    }
+    found = replace(batch, shapes=batch.shapes | shapes)
+    found = replace(outcome, stages=(*outcome.stages[:-1], found))
+
+    row = {
+        "predicted": {"rmse": 0.054, "branch": None, "turns": 0.5},
+        "other": {"rmse": 0.0031, "branch": None, "turns": -0.5},
+        "tipping": {"angle": 0.03, "std": 0.02},
+    }
+    assert report_dict(found)["either_side"][names[0]] == row
+    assert list(report_dict(found)["either_side"]) == [names[0], names[2]]
+    assert report_dict(outcome)["either_side"] == {}
+    text = (
+        f"{names[0]} (held out): its clamp is 0.03 rad (known to 0.02 rad) from the angle at which "
+        "both ways to hang are equally low; `turns: 0.5` (predicted) 54 mm off, `turns: -0.5` "
+        "3.1 mm off."
+    )
+    said = verdict_lines(found)
+    other = f"{names[2]} (held out): `turns: 0` (predicted) 20 mm off, `turns: -0.5` 3.1 mm off."
+    assert [line.strip() for line in said if "held out" in line] == [text, other]
+    assert text in page_data(found)["details"]
+    assert not any("turns" in line for line in all_warnings(found))
 
 
 def test_a_stage_that_did_not_run_is_null_with_a_warning(outcome):

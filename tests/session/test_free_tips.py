@@ -7,17 +7,22 @@ import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.equilibrium import tipping
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
+from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.equilibrium.tipping import tipping_of
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.rest_curvature import RestScatter
 from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.remarks import branch_warnings
-from dlo_casadi.session.stages import initial_stage
+from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.remarks import branch_warnings, doubts_of
+from dlo_casadi.session.stages import fit_stage
 
 EI, STD = 0.028, 1e-3
 MODEL = CableModel(Cable(0.5, 0.3, 0.012, EI), 12, start="clamped", end="free", n_rest=5)
@@ -59,8 +64,10 @@ def test_near_a_gripper_that_points_up_a_cable_may_fall_to_either_side(beyond):
     assert other.energy > lowest.energy
     assert other.energy == pytest.approx(mirrored.energy, rel=1e-9)
     # By symmetry both are as low with the gripper straight up; the angle is of first order.
-    assert lowest.tipping == pytest.approx(beyond, rel=0.01)
-    assert fallen(held(1.5)).tipping is None
+    assert tipping(MODEL, lowest, lowest.other_side) == pytest.approx(beyond, rel=0.01)
+    assert lowest.other_side.energy == pytest.approx(other.energy, rel=1e-9)
+    assert other.other_side is None  # the pose tells its branch
+    assert fallen(held(1.5)).other_side is None
 
 
 def test_a_cable_is_followed_over_the_top_until_it_snaps():
@@ -76,19 +83,59 @@ def test_a_cable_is_followed_over_the_top_until_it_snaps():
     assert back.energy == pytest.approx(stays.energy, rel=1e-9)
 
 
-def test_a_pose_on_the_other_side_is_named_with_its_remedy():
-    stage = replace(initial_stage(MODEL, turned_over()), name="batch")
-    assert {name: found.branch for name, found in stage.other_branch.items()} == {"-0.30": "ccw"}
-    other, either = branch_warnings([stage])
-    assert "-0.30: the equilibrium of lowest energy" in other
-    assert "`branch: ccw` in these poses chooses it" in other
-    assert "+0.10: the cable may fall to either side" in either
-    assert "with the clamp turned by 0.1 rad" in either
+def judged(measured):
+    """The stage of a fit, and what is said of it: doubts and warnings."""
+    fit = fit_model(MODEL, measured, Tolerances(), STD)
+    stage = fit_stage("batch", fit, measured, {})
+    shown = [
+        PoseInput(item.pose.name, "held_out" if item.held_out else "fit", item.points)
+        for item in measured
+    ]
+    return stage, [*doubts_of([stage], shown, fit), *branch_warnings([stage])]
 
-    told = replace(initial_stage(MODEL, turned_over(branch="previous")), name="batch")
-    assert told.other_branch == {}
-    assert branch_warnings([told]) == []
+
+def test_a_fit_pose_on_the_other_side_is_compared_there_and_named():
+    stage, (said,) = judged(turned_over())
+    assert {name: side.branch for name, side in stage.measured_side.items()} == {"-0.30": "ccw"}
+    assert said.startswith("stage batch: -0.30: the cable of these fit poses hangs on another")
+    assert said.endswith("needs `branch: ccw`")
+    assert stage.rmse_fit == stage.rmse_fit_measured_branch < 2 * STD
+
+    told, said = judged(turned_over(branch="previous"))
+    assert told.measured_side == {}
+    assert said == []
     assert told.rmse_fit < 2 * STD
+
+
+def test_held_out_poses_on_either_side_are_told_with_both_errors():
+    """Both are fallen counter-clockwise, -0.30 from before; the lower side is the other one."""
+    held_out = ("+0.10", "-0.30")
+    measured = [replace(item, held_out=item.pose.name in held_out) for item in turned_over()]
+    stage, said = judged(measured)
+    assert said == []
+    usual, other = (stage.shapes[name].either_side for name in held_out)
+    assert (usual.predicted.branch, usual.other.branch) == ("ccw", "cw")
+    assert (other.predicted.branch, other.other.branch) == ("cw", "ccw")
+    assert other.other.rmse < 2 * STD < 0.1 < other.predicted.rmse
+    assert other.told
+    # The clamp is known to a hundredth of a radian, and so is the cable at rest.
+    assert usual.tipping.std < 0.03
+    assert not usual.told
+
+
+def test_a_cable_that_does_not_repeat_may_fall_to_either_side():
+    """Heavy ones differ by 0.3 1/m from hanging to hanging: over 0.5 m, by 0.15 rad at most."""
+    pose = held(0.08)
+    eq = fallen(pose)
+
+    def near(std):
+        known = Uncertainty((), np.zeros((0, 0)), {}, RestScatter(std))
+        return tipping_of(MODEL, MODEL.nominal, STRAIGHT, pose, eq, eq.other_side, known)
+
+    assert near(0.3).std == pytest.approx(10 * near(0.03).std, rel=1e-6)
+    assert near(0.3).std < 0.15
+    assert near(0.3).either
+    assert not near(0.1).either
 
 
 @pytest.mark.parametrize("factor", [0.25, 10])
