@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from dlo_casadi.api import PredictedShape as PredictedShape
     from dlo_casadi.api import Result as Result
     from dlo_casadi.api import fit as fit
+    from dlo_casadi.api import predict as predict
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Config as Config
     from dlo_casadi.config import load_config as load_config
@@ -23,15 +25,13 @@ if TYPE_CHECKING:
     from dlo_casadi.errors import MeasurementError as MeasurementError
     from dlo_casadi.errors import VisionError as VisionError
     from dlo_casadi.model.cable_model import CableModel as CableModel
-    from dlo_casadi.prediction import PredictedShape as PredictedShape
-    from dlo_casadi.prediction import predict as predict
     from dlo_casadi.session import Outcome as Outcome
     from dlo_casadi.session import run_session as run_session
 
 # Module -> its public names. They are imported when they are first asked for, so that the command
 # answers at once and an interrupt finds it ready.
 _PUBLIC = {
-    "api": ("Result", "fit"),
+    "api": ("PredictedShape", "Result", "fit", "predict"),
     "codegen": ("CompiledSolver",),
     "config": ("Config", "load_config"),
     "effects": ("EFFECTS", "Cable"),
@@ -47,7 +47,6 @@ _PUBLIC = {
         "VisionError",
     ),
     "model.cable_model": ("CableModel",),
-    "prediction": ("PredictedShape", "predict"),
     "session": ("Outcome", "run_session"),
 }
 _HOMES = {name: f"{__name__}.{module}" for module, names in _PUBLIC.items() for name in names}

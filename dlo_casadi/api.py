@@ -11,21 +11,51 @@ result.predict(end=(0.3, -0.1)).points()
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any, get_args
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from dlo_casadi.config import Config, load_config
-from dlo_casadi.equilibrium.pose import Branch
+from dlo_casadi.config import Config, implausible_quaternion, load_config
+from dlo_casadi.equilibrium.cable_shape import CableShape, shape_in
+from dlo_casadi.equilibrium.fitted_cable import FittedCable
+from dlo_casadi.equilibrium.pose import Branch, Pose
 from dlo_casadi.errors import ConfigError, DloError
-from dlo_casadi.prediction import PredictedShape, predict
-from dlo_casadi.report.notebook import outcome_figure, outcome_html, outcome_text
+from dlo_casadi.io.parameters import load_parameters
+from dlo_casadi.report.drawing import prediction_figure
+from dlo_casadi.report.notebook import (
+    outcome_figure,
+    outcome_html,
+    outcome_text,
+    shape_html,
+    shape_text,
+)
 from dlo_casadi.report.parameters_text import parameters_of
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
+
+
+class PredictedShape(CableShape):
+    """A `CableShape` that can show itself.
+
+    In a notebook it is a short table; `print` gives the same as text.
+    """
+
+    def plot(self) -> Figure:
+        """The shape with the forces of the cable on its fixtures."""
+        return prediction_figure(self.as_dict())
+
+    def __str__(self) -> str:
+        return shape_text(self.as_dict())
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return shape_html(self.as_dict())
 
 
 class Result(Outcome):
@@ -141,3 +171,188 @@ def fit(
         config = replace(config, diagnosis=options)
     outcome = run_session(config, progress, executor)
     return Result(**{field.name: getattr(outcome, field.name) for field in fields(outcome)})
+
+
+def predict(
+    parameters: str | Path | FittedCable,
+    end: Sequence[float] | None = None,
+    *,
+    start: Sequence[float] | None = None,
+    start_heading: float | None = None,
+    end_heading: float | None = None,
+    start_orientation: Sequence[float] | None = None,
+    end_orientation: Sequence[float] | None = None,
+    turns: float = 0.0,
+    branch: Branch | None = None,
+) -> PredictedShape:
+    """Predict the shape of a fitted cable.
+
+    Of several equilibria the stable one of lowest energy, unless `branch` or `turns` name one;
+    where nobody knows which of two sides is the lower one, with the other one as `other_side`.
+
+    Parameters
+    ----------
+    parameters : str, Path or FittedCable
+        A parameters.yaml, the folder of results that holds it, or what was read from it.
+    end : (d,) [m]
+        Where the end is held, d = 2 or 3 in space; None for a free end.
+    start : (d,) [m], optional
+        Where the start is held; where all poses of the session had it, or the origin, by default.
+    start_heading, end_heading : float [rad], optional
+        Directions of clamped ends in a plane, continuous along the cable; those that all poses of
+        the session shared by default.
+    start_orientation, end_orientation : (4,), optional
+        Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable;
+        those that all poses of the session shared by default.
+    turns : float
+        In space, the twist nearest to so many full turns, see `Pose`. A cable may shed two of them
+        over a loop; that is an error.
+    branch : "ccw" or "cw", optional
+        In a plane, which way the cable turns from start to end.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be used.
+    EquilibriumError
+        If the pose has no equilibrium, e.g. because the end is out of reach, or none is found on
+        the branch.
+    DloError
+        If the ends are not held as the cable's boundary asks, or are no finite numbers.
+    """
+    if not isinstance(parameters, str | os.PathLike | FittedCable):
+        raise DloError(
+            f"parameters: {parameters!r} is no path.\n"
+            "  Try: the parameters.yaml or the results folder of a fit."
+        )
+    cable = parameters if isinstance(parameters, FittedCable) else load_parameters(parameters)
+    pose = _pose(
+        cable,
+        end,
+        start,
+        {
+            "start_heading": start_heading,
+            "end_heading": end_heading,
+            "start_orientation": start_orientation,
+            "end_orientation": end_orientation,
+        },
+        turns,
+        branch,
+    )
+    return _shown(shape_in(cable, pose))
+
+
+def _shown(shape: CableShape) -> PredictedShape:
+    """The same shape, and its other side if it has one, as those that show themselves."""
+    values = {field.name: getattr(shape, field.name) for field in fields(shape)}
+    if shape.other_side is not None:
+        values["other_side"] = _shown(shape.other_side)
+    return PredictedShape(**values)
+
+
+def _pose(
+    cable: FittedCable,
+    end: Sequence[float] | None,
+    start: Sequence[float] | None,
+    directions: Mapping[str, Any],
+    turns: float,
+    branch: Branch | None,
+) -> Pose:
+    """End conditions, checked against the boundary; what is not given is as in the session."""
+    model, shared = cable.model, cable.metadata.fixtures
+    name, size = model.cable.name, model.node.dimension
+    if branch is not None and branch not in get_args(Branch):
+        raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
+    if branch is not None and model.in_space:
+        raise DloError(f"{name!r} is in space: a branch has no meaning")
+    if model.end == "free" and end is not None:
+        raise DloError(f"the end of {name!r} is free: it cannot be held at {end} m")
+    if model.end != "free" and end is None:
+        place = "X Y Z" if model.in_space else "X Y"
+        raise DloError(
+            f"the end of {name!r} is {model.end}: where is it?\n"
+            f"  Try: --end {place} [m], in Python end."
+        )
+    turns = _number(turns, "turns", "full turns")
+    if turns and not (model.in_space and model.start == model.end == "clamped"):
+        raise DloError(f"{name!r} has no turns: it is not in space and clamped at both ends")
+    if start is None:
+        start = shared.get("start") or (0.0,) * size
+    return Pose(
+        start=_point(start, "start", size),
+        end=None if end is None else _point(end, "end", size),
+        turns=turns,
+        branch=branch,
+        name=name or "cable",
+        **_held(cable, directions),
+    )
+
+
+def _held(cable: FittedCable, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Directions of the clamps, by their key; none of pins."""
+    model, shared = cable.model, cable.metadata.fixtures
+    kind, other, unit = "heading", "orientation", " [rad]"
+    where = ("a plane", "two numbers of gravity")
+    if model.in_space:
+        kind, other, unit = other, kind, " [qx, qy, qz, qw]"
+        where = ("space", "three numbers of gravity")
+    found: dict[str, Any] = {}
+    for side, held in (("start", model.start), ("end", model.end)):
+        key, value = f"{side}_{kind}", given[f"{side}_{kind}"]
+        if given[f"{side}_{other}"] is not None:
+            raise DloError(
+                f"{side}_{other}: {model.cable.name!r} is in {where[0]} ({where[1]}).\n  Try: {key}"
+                f"{unit}"
+            )
+        if held != "clamped" and value is not None:
+            raise DloError(f"the {side} of {model.cable.name!r} is {held}: {key} has no meaning")
+        if held != "clamped":
+            continue
+        value = shared.get(key) if value is None else value
+        if value is None:
+            raise DloError(
+                f"the {side} of {model.cable.name!r} is clamped, and its {kind} differed "
+                f"from pose to pose: give {key}{unit}"
+            )
+        found[key] = _orientation(value, key) if model.in_space else _number(value, key, "rad")
+    return found
+
+
+_WORDS = {2: "two finite numbers (x, y)", 3: "three finite numbers (x, y, z)"}
+
+
+def _point(values: Sequence[float], what: str, size: int) -> tuple[float, ...]:
+    point = _finite(values)
+    if len(point) != size:
+        raise DloError(f"{what}: {_WORDS[size]} in metres belong here, found {values!r}")
+    return point
+
+
+def _orientation(values: Sequence[float], what: str) -> tuple[float, ...]:
+    quaternion = _finite(values)
+    if not quaternion:
+        raise DloError(
+            f"{what}: four finite numbers [qx, qy, qz, qw] belong here, found {values!r}"
+        )
+    if wrong := implausible_quaternion(quaternion):
+        raise DloError(f"{what}: {wrong}, found {values!r}")
+    return quaternion
+
+
+def _finite(values: Any) -> tuple[float, ...]:
+    """Finite numbers, or nothing."""
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        return ()
+    return tuple(array.tolist()) if array.ndim == 1 and np.all(np.isfinite(array)) else ()
+
+
+def _number(value: Any, what: str, unit: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise DloError(f"{what}: a finite number [{unit}] belongs here, found {value!r}")
+    return number

@@ -37,8 +37,7 @@ MAY_IMPORT["session"] = {*FITTING, "paper", "config", "io", "vision", "runtime"}
 MAY_IMPORT["report"] = {*MAY_IMPORT["session"], "session"} - {"equilibrium", "paper", "sensing"}
 MAY_IMPORT["report"] |= {"equilibrium", "sensing"}  # types of what they hold
 MAY_IMPORT["fleet"] = {"config", "io", "session", "report", "runtime", "codegen", "model"}
-MAY_IMPORT["prediction"] = {*MECHANICS, "config", "io", "report"}
-MAY_IMPORT["api"] = {"config", "equilibrium", "io", "prediction", "session", "report"}
+MAY_IMPORT["api"] = {"config", "equilibrium", "io", "session", "report"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 
@@ -101,7 +100,7 @@ def test_no_file_imports_itself_by_way_of_others():
 
 def test_the_top_holds_rooms_and_little_else():
     at_the_top = {file.name for file in FILES if file.parent == PACKAGE}
-    assert at_the_top == {"__init__.py", "api.py", "errors.py", "prediction.py", "thresholds.py"}
+    assert at_the_top == {"__init__.py", "api.py", "errors.py", "thresholds.py"}
 
 
 @pytest.mark.parametrize(

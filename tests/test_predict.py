@@ -11,12 +11,12 @@ from matplotlib.text import Text
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.api import predict
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.io.parameters import load_parameters, parameters_hash
-from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_text import fit_dict, shared_fixtures
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import read_poses

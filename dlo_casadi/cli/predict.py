@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dlo_casadi.api import PredictedShape, predict
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, console, print_json
 from dlo_casadi.errors import DloError
-from dlo_casadi.prediction import PredictedShape, predict
 from dlo_casadi.report.drawing import draw_prediction
 from dlo_casadi.report.terminal import prediction_table
 

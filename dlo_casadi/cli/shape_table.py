@@ -11,12 +11,13 @@ from dlo_casadi.cli.counter import Counter
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import add_jobs, command, console, print_json
 from dlo_casadi.cli.predict import plain_numbers
+from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet.shape_poses import Grid, PoseList, Poses
 from dlo_casadi.fleet.shape_solve import Plan
 from dlo_casadi.fleet.shape_table import shape_table
 from dlo_casadi.fleet.store import parquet_library
-from dlo_casadi.io.parameters import Parameters, load_parameters
+from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
@@ -114,7 +115,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _ends(
-    cable: Parameters,
+    cable: FittedCable,
     start: Sequence[float] | None,
     start_heading: float | None,
     end_heading: float | None,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.equilibrium import Equilibrium, tipping, tipping_lever
 from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import ways_of
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.model.assembly import Given, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -76,3 +77,10 @@ def tipping_of(
         slopes.append((value[:count] - value[count:]) / (2 * _SHARE))
     std = float(np.linalg.norm(slopes[1] - slopes[0]))
     return Tipping(tipping(model, eq, other), std / tipping_lever(model, eq, other))
+
+
+def sides_of(model: CableModel, pose: Pose, *pair: Equilibrium) -> list[Pose]:
+    """A pose that tells the side of each of two equilibria on either side."""
+    ways = ways_of(model, pose)
+    turned = [float(model.node.turning(eq.x)) for eq in pair]
+    return ways if turned[0] > turned[1] else ways[::-1]

@@ -304,13 +304,6 @@ def _told(
     return out
 
 
-def sides_of(model: CableModel, pose: Pose, *pair: Equilibrium) -> list[Pose]:
-    """A pose that tells the side of each of two equilibria on either side."""
-    ways = ways_of(model, pose)
-    turned = [float(model.node.turning(eq.x)) for eq in pair]
-    return ways if turned[0] > turned[1] else ways[::-1]
-
-
 def _continues(
     model: CableModel,
     p: FloatArray,

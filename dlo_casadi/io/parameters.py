@@ -12,9 +12,9 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,7 @@ from dlo_casadi.config import (
 )
 from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
 from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.equilibrium.fitted_cable import FittedCable, Metadata
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import ConfigError, DloError, counted
 from dlo_casadi.model.cable_model import CableModel
@@ -50,57 +51,6 @@ _ROUNDING = 1e-9
 _LISTED = 5
 
 
-@dataclass(frozen=True)
-class Metadata:
-    """What a parameters.yaml tells beside the model.
-
-    Parameters
-    ----------
-    path : Path
-    names : tuple of str
-        Fitted parameters, in the order of `covariance`.
-    covariance : (N, N)
-        In the products of the parameters' units.
-    uncertainty : Uncertainty
-        The same with what differs from pose to pose.
-    std : dict
-        Standard deviation of each parameter by name [SI]; 0 where it was not fitted.
-    coefficients : (n_coefficients,) [1/m]
-        Of the rest curvature before the first pose; in space about the axis y, then about z.
-    fixtures : dict
-        What all poses of the session share of `start` [m] and `start_heading`, `end_heading` [rad],
-        in space `start_orientation`, `end_orientation`.
-    identifiable : bool or None
-        Whether the shapes determine the bending stiffness.
-    interval_95 : (float or None, float or None) or None [N m^2]
-        Of the bending stiffness; None in it = unbounded.
-    model_hash : str
-        As written; see `parameters_hash`.
-    edited : bool
-        Whether the model is no longer the one that was written.
-    config : str
-        Name of the configuration.
-    versions : dict
-    document : dict
-        The whole file.
-    """
-
-    path: Path
-    names: tuple[str, ...]
-    covariance: FloatArray
-    uncertainty: Uncertainty
-    std: dict[str, float]
-    coefficients: FloatArray
-    fixtures: dict[str, Any]
-    identifiable: bool | None
-    interval_95: tuple[float | None, float | None] | None
-    model_hash: str
-    edited: bool
-    config: str
-    versions: dict[str, str]
-    document: dict[str, Any]
-
-
 class _DamagedError(DloError):
     """What is wrong in a file, and where."""
 
@@ -109,37 +59,7 @@ class _DamagedError(DloError):
         self.place = place
 
 
-class Parameters(NamedTuple):
-    """A fitted cable as parameters.yaml holds it: `model, p, rest, metadata = ...`.
-
-    Parameters
-    ----------
-    model : CableModel
-    p : (n_parameters,)
-        In the order of `model.names` (SI).
-    rest : (n_rests,) [1/m]
-        Rest curvature that the next pose finds; in space the rest strains twist, k_y, k_z of all
-        cells in turn.
-    metadata : Metadata
-    """
-
-    model: CableModel
-    p: FloatArray
-    rest: FloatArray
-    metadata: Metadata
-
-    @property
-    def std(self) -> dict[str, float]:
-        """Standard deviations by name (SI)."""
-        return self.metadata.std
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """The whole file."""
-        return self.metadata.document
-
-
-def load_parameters(path: str | Path) -> Parameters:
+def load_parameters(path: str | Path) -> FittedCable:
     """Read parameters.yaml and rebuild the model exactly.
 
     Parameters
@@ -150,7 +70,7 @@ def load_parameters(path: str | Path) -> Parameters:
     Returns
     -------
     (model, p, rest, metadata)
-        See `Parameters`.
+        See `FittedCable`.
 
     Raises
     ------
@@ -204,7 +124,7 @@ def _results_near(path: Path) -> str:
     return f"\n  Try: {listed}" if listed else "\n  Try: the results folder of a fit (dlo fit)."
 
 
-def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
+def _rebuild(document: dict[str, Any], source: Path) -> FittedCable:
     declared, rows = document["cable"], document["parameters"]
     cable = Cable(
         length=_positive(declared, "cable", "length"),
@@ -252,7 +172,7 @@ def _rebuild(document: dict[str, Any], source: Path) -> Parameters:
         if name not in (*model.names, *coefficients):
             raise _DamagedError(("covariance", "names"), f": nothing is called {show(name)}")
     rest = _stacked(document["state"]["rest_curvature"], Frame.strains, "state")
-    return Parameters(
+    return FittedCable(
         model,
         _numbers(values, len(values), "parameters"),
         _numbers(rest, model.chain.n_rests, "state", "rest_curvature"),

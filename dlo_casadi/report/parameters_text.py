@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config, dump_yaml
 from dlo_casadi.effects import Effect, known_effect
+from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.io.parameters import SCHEMA, Parameters, metadata_of, parameters_hash
+from dlo_casadi.io.parameters import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.report.json_report import finite
 from dlo_casadi.session.outcome import Outcome
@@ -34,10 +35,10 @@ def parameters_text(outcome: Outcome) -> str:
     return head + dump_yaml(parameters_dict(outcome))
 
 
-def parameters_of(outcome: Outcome) -> Parameters:
+def parameters_of(outcome: Outcome) -> FittedCable:
     """The fitted cable of a run, as `load_parameters` would read it from the run's file."""
     fit, metadata = outcome.fit, metadata_of(parameters_dict(outcome), outcome.config.path)
-    return Parameters(fit.model, fit.p, final_rest(fit), metadata)
+    return FittedCable(fit.model, fit.p, final_rest(fit), metadata)
 
 
 def parameters_dict(outcome: Outcome) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
-from dlo_casadi.equilibrium.tipping import tipping_of
+from dlo_casadi.equilibrium.tipping import sides_of, tipping_of
 from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
@@ -21,7 +21,6 @@ from dlo_casadi.estimation.prediction import (
     predict_other_side,
     predict_poses,
     rms_distance,
-    sides_of,
 )
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tiny_sessions import write_session
 
+from dlo_casadi.api import predict
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import Cable
@@ -24,7 +25,6 @@ from dlo_casadi.fleet.shape_poses import Grid, PoseList
 from dlo_casadi.fleet.shape_solve import Plan
 from dlo_casadi.fleet.shape_table import shape_table
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_text import parameters_text
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import open_executor

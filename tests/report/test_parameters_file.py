@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small_sessions import BENCH, CONFIGS, small
 
+from dlo_casadi.api import predict
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.effects import BendingSoftening, ImageDistortion, RestCurvatureDrift
 from dlo_casadi.errors import ConfigError
@@ -17,7 +18,6 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.parameters import load_parameters, parameters_hash
 from dlo_casadi.model.assembly import Given, assembly_of
-from dlo_casadi.prediction import predict
 from dlo_casadi.report.parameters_text import final_rest, fit_dict, parameters_text
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import minimum_by_ipopt
