@@ -489,6 +489,20 @@ def test_headings_follow_the_boundary(tmp_path):
     assert unused.warnings == ("start_heading is not used, the start is pinned: b",)
 
 
+def test_a_ball_joint_and_a_free_end_hold_no_shape_in_space(tmp_path):
+    """In a plane they do: there a cable cannot be turned about gravity."""
+    free = [
+        ("end: pinned", "end: free"),
+        ("end: [0.5, 0.1], ", ""),
+        ("end: [0.4, 0.1], ", ""),
+        ("end: [0.3, 0.1], ", ""),
+    ]
+    assert load(tmp_path, *free).experiment.boundary.end == "free"
+    space = [("[0, -9.81]", "[0, 0, -9.81]"), ("start: [0, 0]", "start: [0, 0, 0]")]
+    with pytest.raises(ConfigError, match=r"may be turned about gravity.* Try: start: clamped"):
+        load(tmp_path, *free, *space)
+
+
 def test_a_pose_out_of_reach_is_left_out(tmp_path):
     config = load(tmp_path, ("[0.5, 0.1]", "[0.5, 0.9]"))
     assert [pose.name for pose in config.experiment.poses] == ["b", "c"]

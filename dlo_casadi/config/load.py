@@ -128,6 +128,13 @@ def _contradictions(experiment: Experiment) -> list[Problem]:
     if experiment.in_space and measurement.kind == "images" and measurement.board is None:
         text = "photographs of a cable in space need a board of markers; a reference is of a plane"
         problems.append(Problem(("experiment", "measurement"), text))
+    if experiment.in_space and held.start == "pinned" and held.end == "free":
+        text = (
+            "on a ball joint and with a free end a cable in space may be turned about gravity, "
+            "which holds it in no shape of all these. Try: start: clamped, with start_orientation; "
+            "or two numbers of gravity, in the plane in which it hangs"
+        )
+        problems.append(Problem(("experiment", "boundary"), text))
     names: dict[str, int] = {}
     for i, pose in enumerate(experiment.poses):
 

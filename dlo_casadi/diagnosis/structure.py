@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from math import dist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,13 +132,13 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
             for c, v in zip(coefficients, own, strict=True)
         ]
     )
-    poses = [problem.measured[j].pose for j in problem.used]
-    spans = np.array([0.0 if x.end is None else dist(x.start, x.end) for x in poses])
     series = [
         one
         for j, e in zip(problem.used, lin.residuals, strict=True)
         for one in problem.measured[j].along(e)
     ]
+    names = [problem.measured[j].pose.name for j in problem.used]
+    spans = np.array([problem.measured[j].pose.span for j in problem.used])
     return Structure(
         statistic,
         dof,
@@ -149,7 +148,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         _rank_score(energies, np.arange(len(energies), dtype=float)),
         _rank_score(energies, spans),
         _position_score(fit, noise_dof),
-        dict(zip((pose.name for pose in poses), energies.tolist(), strict=True)),
+        dict(zip(names, energies.tolist(), strict=True)),
         _systematic(fit),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -60,6 +61,11 @@ class Pose:
         """Start, end [m], start frame, end frame: see `EndConditions.vector`."""
         end = self.end if self.end is not None else (0.0,) * len(self.start)
         return np.concatenate([self.start, end, *self.frames])
+
+    @property
+    def span(self) -> float:
+        """Distance [m] of the end from the start; 0 of a free end."""
+        return 0.0 if self.end is None else math.dist(self.start, self.end)
 
     @property
     def frames(self) -> tuple[FloatArray, FloatArray]:

@@ -7,25 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
-from scipy.optimize import least_squares
+from scipy.interpolate import make_lsq_spline
 
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
-from dlo_casadi.model.rest_curvature import RestCurvature
 
 FloatArray = NDArray[np.floating]
 
 LEAST_POINTS = 10
-# Coefficients of the measured curvature, points of the integrals, and places of the result.
-COEFFICIENTS = 8
+# Degree and largest number of parts of the measured curve: its curvature is a cubic spline of eight
+# coefficients, of fewer where there are fewer than two points for each coefficient of the curve.
+DEGREE, MOST_PARTS = 5, 5
+# Points of the integrals, and places of the result.
 FINE = 1000
 PLACES = 100
 
 
 @dataclass(frozen=True)
 class MomentCurve:
-    """Bending moment [N m] and curvature [1/m] at arc lengths s [m], all (K,)."""
+    """Bending moment [N m] and curvature >= 0 [1/m] at arc lengths s [m], all (K,)."""
 
     s: FloatArray
     curvature: FloatArray
@@ -33,22 +34,33 @@ class MomentCurve:
 
 
 def measured_moment_curve(
-    points: FloatArray, length: float, weight: float, gravity: tuple[float, ...]
+    points: FloatArray,
+    length: float,
+    weight: float,
+    gravity: tuple[float, ...],
+    s: FloatArray | None = None,
 ) -> MomentCurve:
     """Moment against curvature of a cable with a free end, without any law of its section.
 
-        M(s) = w int_s^L ((r(t) - r(s)) x g / |g|) dt,   kappa(s) = d heading / ds
+        kappa(s) = |dt/ds|,   n = (dt/ds) / kappa,   a(s) = int_s^L (r(q) - r(s)) dq
+        M(s) = (a . t) (f . n) - (a . n) (f . t),   f = w g / |g|
 
-    from a curve whose curvature is a cubic spline, fitted to the points by least squares.
+    M is the moment of what hangs beyond s, in the plane of the tangent t and the normal n in which
+    the cable bends there: positive where the weight bends the cable the way it is bent. The curve
+    r is a quintic spline between the first point and the last, fitted to the points by least
+    squares; what lies beyond the last point is taken as straight.
 
     Parameters
     ----------
-    points : (K, 2) [m]
-        Centre-line from the clamp to the free end, at least 10 points.
+    points : (K, d) [m]
+        From the clamp towards the free end, at least 10 points; d = 2 or 3.
     length : float [m]
     weight : float [N/m]
-    gravity : (float, float) [m/s^2]
+    gravity : (d,) [m/s^2]
         Its direction counts.
+    s : (K,) [m], optional
+        Arc lengths of the points where they are known; by default chords between all of them, the
+        whole cable together.
 
     Raises
     ------
@@ -63,37 +75,30 @@ def measured_moment_curve(
         raise EstimationError(
             f"a moment curve needs at least {LEAST_POINTS} points, got {len(points)}"
         )
-    steps = np.hypot(*np.diff(points, axis=0).T)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    along *= length / along[-1]  # chords of noisy points add up to more than the cable
-    fine = np.linspace(0.0, length, FINE)
-    basis = RestCurvature(length, COEFFICIENTS)
-    turn = cumulative_trapezoid(basis.basis(fine), fine, axis=0, initial=0)
-
-    def shape(unknowns: FloatArray) -> FloatArray:
-        """Curve (FINE, 2) from the start (2), its heading, and the curvature's coefficients."""
-        heading = unknowns[2] + turn @ unknowns[3:]
-        tangent = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-        return unknowns[:2] + cumulative_trapezoid(tangent, fine, axis=0, initial=0)
-
-    def gap(unknowns: FloatArray) -> FloatArray:
-        curve = shape(unknowns)
-        seen = [np.interp(along, fine, column) for column in curve.T]
-        return np.concatenate([seen[0] - points[:, 0], seen[1] - points[:, 1]])
-
-    toward = points[len(points) // 10] - points[0]
-    guess = np.concatenate([points[0], [np.arctan2(toward[1], toward[0])], np.zeros(COEFFICIENTS)])
-    unknowns = least_squares(gap, guess, x_scale="jac").x
-    curve = shape(unknowns)
+    if s is None:
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        s = np.concatenate([[0.0], np.cumsum(steps)])
+        s *= length / s[-1]  # chords of noisy points add up to more than the cable
+    parts = min(MOST_PARTS, len(points) // 2 - DEGREE)
+    knots = np.pad(np.linspace(s[0], s[-1], max(parts, 1) + 1), DEGREE, mode="edge")
+    spline = make_lsq_spline(s, points, knots, DEGREE)
+    fine = np.linspace(s[0], s[-1], FINE)
+    curve, velocity, acceleration = (spline(fine, k) for k in range(3))
+    speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+    tangent = velocity / speed
+    bend = acceleration - (acceleration * tangent).sum(axis=1, keepdims=True) * tangent
+    bend /= speed**2
+    curvature = np.linalg.norm(bend, axis=1)
+    normal = bend / np.maximum(curvature, 1e-300)[:, None]
     force = weight * np.array(gravity) / np.linalg.norm(gravity)
-    # Moment about s of what hangs beyond: int_s^L r dt x force - (L - s) r(s) x force.
-    beyond = curve[:, 0] * force[1] - curve[:, 1] * force[0]
-    whole = cumulative_trapezoid(beyond[::-1], fine, initial=0)[::-1]
-    moment = whole - (length - fine) * beyond
-    s = fine[:: FINE // PLACES]
-    curvature = basis.basis(s) @ unknowns[3:]
-    moment = moment[:: FINE // PLACES]
-    return MomentCurve(s, curvature, moment)
+    tip = length - s[-1]
+    whole = cumulative_trapezoid(curve[::-1], fine, axis=0, initial=0)[::-1]
+    whole += tip * (curve[-1] + tip / 2 * tangent[-1])
+    beyond = whole - (length - fine)[:, None] * curve
+    moment = (beyond * tangent).sum(axis=1) * (normal @ force)
+    moment -= (beyond * normal).sum(axis=1) * (tangent @ force)
+    kept = slice(None, None, FINE // PLACES)
+    return MomentCurve(fine[kept], curvature[kept], moment[kept])
 
 
 def law_of(model: CableModel, p: FloatArray, bend: FloatArray) -> FloatArray:

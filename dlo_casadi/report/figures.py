@@ -198,11 +198,10 @@ def draw_moment(path: Path, outcome: Outcome) -> None:
         axes = drawing.subplots()
         most = 0.0
         for pose in shown:
-            found = measured_moment_curve(pose.points, cable.length, weight, gravity)
-            bend, moment = np.abs(found.curvature), 1e3 * np.abs(found.moment)
+            found = measured_moment_curve(pose.points, cable.length, weight, gravity, pose.s)
             label = "from the centre-line alone" if pose is shown[0] else None
-            axes.plot(bend, moment, ".", color=BLUE, label=label)
-            most = max(most, float(bend.max()))
+            axes.plot(found.curvature, 1e3 * found.moment, ".", color=BLUE, label=label)
+            most = max(most, float(found.curvature.max()))
         grid = np.linspace(0.0, most, 200)
         law = law_of(outcome.fit.model, outcome.fit.p, grid)
         axes.plot(grid, 1e3 * law, color=VERMILLION, label="fitted law of the section")

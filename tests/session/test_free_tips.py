@@ -187,3 +187,16 @@ def test_in_space_a_cable_is_followed_too():
     assert moved.points[-1] == pytest.approx(
         [planar.points[-1, 0], 0, planar.points[-1, 1]], abs=5e-3
     )
+
+
+def test_in_space_a_cable_gives_way_to_one_side_of_two():
+    """Bent upwards at rest, on a gripper that points down: both sides are as low."""
+    cable = replace(MODEL.cable, torsional_stiffness=0.02)
+    model = CableModel(cable, 12, start="clamped", end="free", gravity=(0.0, 0.0, -9.81))
+    rest = np.zeros(model.chain.n_rests)
+    rest[model.chain.n_cells : 2 * model.chain.n_cells] = 6.0
+    half = -(UP + 1.0) / 2
+    held = Pose((0.0,) * 3, start_orientation=(0.0, np.sin(half), 0.0, np.cos(half)))
+    found = solve_equilibrium(model, model.nominal, rest, held)
+    assert found.stable
+    assert abs(found.points[-1, 1]) > 0.2
