@@ -102,6 +102,6 @@ def summary(found: vision.Calibration) -> str:
     matrix, std = found.camera.matrix, found.matrix_std
     return (
         f"focal lengths {matrix[0, 0]:.1f} +- {std[0]:.1f} and {matrix[1, 1]:.1f} +- "
-        f"{std[1]:.1f} px from {counted(len(found.errors), 'photograph')} of the session, "
-        f"{found.reprojection_error:.2f} px RMS"
+        f"{std[1]:.1f} px from {counted(len(found.errors), 'photograph')} of the session whose "
+        f"directions lie within {found.spread:.0f} degrees, {found.reprojection_error:.2f} px RMS"
     )

@@ -11,9 +11,9 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.session.coarse import coarse_fit, some, tells_weight
-from dlo_casadi.session.hanging import pulled_elsewhere
-from dlo_casadi.session.hanging_in_plane import hangs_elsewhere
+from dlo_casadi.session.coarse import coarse_fit, some, spread, tells_weight
+from dlo_casadi.session.exchanged_ends import ends_exchanged
+from dlo_casadi.session.hanging import hangs_elsewhere
 from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import line_without_end
 from dlo_casadi.session.outcome import PoseInput
@@ -38,9 +38,7 @@ NEVERTHELESS = (
     "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless."
 )
 
-# Poses of a fit that shows what forces shapes need.
-_POSES = 8
-# Points of a line between which its length is measured.
+# Points of a line between which its length is measured: noise makes a dense line longer.
 _SPARSE = 60
 
 
@@ -109,11 +107,7 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
         doubtful = {item.pose for item in found}
         sound = [item for item in read if item.name not in doubtful]
         found += _misread(config, sound)
-        if in_space:
-            lines_in_space = [(item.points, item.s) for item in sound]
-            found += pulled_elsewhere(lines_in_space, config.experiment.gravity)
-        else:
-            found += hangs_elsewhere(config, sound)
+        found += ends_exchanged(config, sound) or hangs_elsewhere(config, sound)
     return found
 
 
@@ -122,8 +116,8 @@ def _misread(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]
     declared = {pose.name: pose for pose in config.experiment.poses}
     fitted = [item for item in read if item.role == "fit" and not item.views]
     fitted = [item for item in fitted if declared[item.name].readings]
-    shown = some(fitted, _POSES)
-    fit = coarse_fit(config, shown, config.experiment.gravity) if shown else None
+    shown = some(fitted)
+    fit = coarse_fit(config, shown) if shown else None
     if fit is None:
         return ()
     model, measured = fit.model, fit.problem.measured
@@ -216,7 +210,12 @@ def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, Float
     unknown, whole = (np.nan,) * d, np.array([0.0, length])
     spans = np.array([known.get(pose.name, whole)[[0, -1]] for pose in poses]).reshape(-1, 2)
     measured = np.array(
-        [np.linalg.norm(np.diff(_sparse(points[p.name]), axis=0), axis=1).sum() for p in poses]
+        [
+            np.linalg.norm(
+                np.diff(points[p.name][spread(len(points[p.name]), _SPARSE)], axis=0), axis=1
+            ).sum()
+            for p in poses
+        ]
     ).reshape(-1)
     unseen = [0.0 if pose.name in known else _unseen(points[pose.name], length) for pose in poses]
     # A single marker has no length.
@@ -240,9 +239,3 @@ def _unseen(points: FloatArray, length: float) -> float:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     apart = float(np.median(steps)) if len(steps) else length
     return max(length - float(steps.sum()), 0.0) if apart > FITS * length else 0.0
-
-
-def _sparse(points: FloatArray) -> FloatArray:
-    """Every so manieth point, both ends among them: noise makes a dense line longer."""
-    kept = np.linspace(0, len(points) - 1, min(len(points), _SPARSE)).round().astype(int)
-    return points[kept]

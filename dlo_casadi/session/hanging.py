@@ -1,85 +1,177 @@
-"""Which way a cable in space is pulled, from its measured lines alone, without any shape solved.
-
-Kirchhoff's rod under a dead load w per length, in units of its bending stiffness:
-
-    M(s) = M_0 + F_0 x (r - r_0) - w x (s r - int r ds),    M across the tangent = t x t'
-
-is linear in M_0 and F_0, which each pose has of its own, and w, which all share. Second differences
-of the points give t x t'; rest curvature and noise are the residual, and the scatter of the poses
-tells the covariance of w.
-"""
+"""Whether a cable hangs along gravity: what its lines show at a glance, and what fits confirm."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.session.plausibility import Suspicion
-from dlo_casadi.thresholds import HEADING_NEAR, HEADING_OFF, PULLED
+from dlo_casadi.config import Config, Pose
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS
+from dlo_casadi.session.coarse import Hypothesis, compare, tells_weight
+from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.plausibility import Suspicion, clamp_axis, exchanges, read_as
+from dlo_casadi.thresholds import FITS, HEADING_OFF
 
 FloatArray = NDArray[np.floating]
 
 # Pieces of a dense line, whose points are averaged: second differences of closer ones are noise.
 _PIECES = 16
-# A covariance from the scatter of fewer poses tells nothing.
-_LEAST_POSES = 6
 
 
-def pulled_elsewhere(
-    lines: Sequence[tuple[FloatArray, FloatArray | None]], gravity: Sequence[float]
-) -> tuple[Suspicion, ...]:
-    """Whether the lines hang along another direction than gravity.
+def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Whether the shapes fit only with gravity turned, or the points mirrored.
 
-    Parameters
-    ----------
-    lines : sequence of (K, 3) [m] and (K,) [m] or None
-        Points, and arc lengths where they are known.
-    gravity : (3,) [m/s^2]
-        As declared.
+    Where the lines seem to be pulled along gravity nothing is fitted.
     """
-    found = load_over_stiffness(lines)
-    if found is None or not np.all(np.isfinite(found[0])):
+    gravity = np.array(config.experiment.gravity)
+    if not (len(read) and gravity.any()):
         return ()
-    load, covariance = found
-    score = float(np.sqrt(max(float(load @ np.linalg.pinv(covariance) @ load), 0.0)))
-    way = load / max(float(np.linalg.norm(load)), 1e-300)
-    size = float(np.linalg.norm(gravity))
-    cosine = float(way @ np.array(gravity)) / size if size else -1.0
-    off = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    if score < PULLED or off < HEADING_OFF:
+    pull = shown_pull(config, read)
+    if pull is not None and _angle(pull, gravity) < HEADING_OFF:
         return ()
-    axis = int(np.abs(way).argmax())
-    along = ("-" if way[axis] < 0 else "+") + "xyz"[axis]
-    near = float(np.arccos(min(abs(float(way[axis])), 1.0)))
-    told = ", ".join(f"{value:.2f}" for value in way)
-    declared = ", ".join(f"{value:g}" for value in gravity)
+    found = compare(config, read, list(_otherwise(config, read, pull)))
+    if found is None or not (found.better or found.shows_weight):
+        return ()
+    own, other = found.misfits
+    told = f"its shapes are {own:.3g} m RMS from those of any stiffness, but {other:.3g} m with"
+    if found.own is not None and not tells_weight(found.own):
+        stiff = found.own.value(BENDING_STIFFNESS)
+        told = (
+            f"its shapes show no weight, as if bending_stiffness were {stiff:.2g} N m^2 or more, "
+            f"and are {own:.3g} m RMS from such a cable's, but {other:.3g} m with"
+        )
+    up = "[0.0, -9.81] with y up" if len(gravity) == 2 else "[0.0, 0.0, -9.81] with z up"
     return (
         Suspicion(
-            f"the lines hang along ({told}), {np.degrees(near):.0f} degrees from {along} and "
-            f"{score:.0f} standard deviations from weightless, but gravity is ({declared}) m/s^2. "
-            "Try: gravity in the frame of points and grippers, with its sign, such as "
-            "[0.0, 0.0, -9.81] with z up and [0.0, -9.81, 0.0] with y up.",
-            near < HEADING_NEAR and size > 0,
+            f"the cable does not hang along gravity {_vector(gravity)} m/s^2: {told} {found.what}. "
+            f"Try: points, start, end and gravity in one frame, such as gravity: {up}."
+            + ("" if found.certain else " A strap that lifts the cable would look the same."),
+            found.certain,
         ),
     )
 
 
-def load_over_stiffness(
-    lines: Sequence[tuple[FloatArray, FloatArray | None]],
-) -> tuple[FloatArray, FloatArray] | None:
-    """Load per length over bending stiffness (3,) [1/m^3] and its covariance; None of a few lines.
+def _otherwise(
+    config: Config, read: Sequence[PoseInput], pull: FloatArray | None
+) -> Iterator[Hypothesis]:
+    """Gravity along other axes, and points with exchanged or mirrored axes that keep their ends.
 
-    Least squares without weights; the covariance is that of independent poses (White 1980).
+    Those alone along whose gravity the lines seem to be pulled; all if they show no pull.
     """
-    parts = [part for points, s in lines for part in _equations(points, s)]
-    if len(parts) < _LEAST_POSES:
-        return None
-    inverse = np.linalg.pinv(np.sum([a.T @ a for a, _ in parts], axis=0))
-    load = inverse @ np.sum([a.T @ y for a, y in parts], axis=0)
-    scores = np.array([a.T @ (y - a @ load) for a, y in parts])
-    return load, inverse @ scores.T @ scores @ inverse
+    gravity = np.array(config.experiment.gravity)
+    tried = [gravity]
+    frames = [
+        axes for axes in exchanges(len(gravity)) if _angle(pull, gravity @ axes) < HEADING_OFF
+    ]
+    for way in (gravity @ axes for axes in frames):
+        if not any(np.allclose(way, other) for other in tried):
+            tried.append(way)
+            experiment = config.experiment.model_copy(update={"gravity": tuple(way.tolist())})
+            what = f"gravity {_vector(way)} m/s^2"
+            yield Hypothesis(what, replace(config, experiment=experiment), read)
+    boundary, length = config.experiment.boundary, config.cable.length
+    if boundary.start == boundary.end == "pinned":
+        return  # between pins it is the same to turn the points, and gravity
+    poses = {pose.name: pose for pose in config.experiment.poses}
+    kept = [_held(poses[item.name], length) for item in read]
+    for axes in frames:
+        if np.allclose(axes, np.eye(len(gravity))):
+            continue
+        if all(np.abs(held @ axes.T - held).max() < FITS for held in kept):
+            starts = [np.array(poses[item.name].start) for item in read]
+            inputs = [
+                replace(item, points=(item.points - start) @ axes.T + start)
+                for item, start in zip(read, starts, strict=True)
+            ]
+            yield Hypothesis(_told(axes, gravity), config, inputs)
+
+
+def _held(pose: Pose, length: float) -> FloatArray:
+    """What turned points of a pose must keep (n, d): the end from the start, in lengths, clamps."""
+    kept: list[FloatArray] = [np.zeros(len(pose.start))]
+    if pose.end is not None:
+        kept.append((np.array(pose.end) - pose.start) / length)
+    axes = [clamp_axis(pose, side) for side in ("start", "end")]
+    kept += [axis for axis in axes if axis is not None]
+    return np.array(kept)
+
+
+def _told(axes: FloatArray, gravity: FloatArray) -> str:
+    """Exchanged axes of the points in words."""
+    up = int(np.abs(gravity).argmax())
+    mirrored = np.eye(len(gravity))
+    mirrored[up, up] = -1.0
+    if np.allclose(axes, mirrored):
+        return f"{'xyz'[up]} pointing up in the points, which now points down"
+    return f"the points read as {read_as(axes)}"
+
+
+def _vector(values: FloatArray) -> str:
+    return f"({', '.join(f'{value + 0.0:g}' for value in values)})"
+
+
+def _angle(pull: FloatArray | None, way: FloatArray) -> float:
+    """Angle [rad] of a direction from the pull that lines show; zero where they show none."""
+    if pull is None:
+        return 0.0
+    cosine = float(pull @ way) / float(np.linalg.norm(pull) * np.linalg.norm(way))
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+# ---- at a glance --------------------------------------------------------------------------------
+
+
+def shown_pull(config: Config, read: Sequence[PoseInput]) -> FloatArray | None:
+    """Direction (d,) in which the lines seem to be pulled, without any shape solved.
+
+    Between pins a cable hangs from its chord; elsewhere its moments tell, `load_over_stiffness`.
+    None where they do not: of a few points.
+    """
+    boundary = config.experiment.boundary
+    if boundary.start == boundary.end == "pinned":
+        poses = {pose.name: pose for pose in config.experiment.poses}
+        ends = [np.array([poses[item.name].start, poses[item.name].end]) for item in read]
+        pull = _off_the_chord([item.points for item in read], ends)
+    else:
+        pull = load_over_stiffness([(item.points, item.s) for item in read])
+    return pull if np.all(np.isfinite(pull)) and pull.any() else None
+
+
+def _off_the_chord(lines: Sequence[FloatArray], chords: Sequence[FloatArray]) -> FloatArray:
+    """Mean of the points (K, d) of all lines from their chords (2, d): what pulls across them."""
+    across, away = np.zeros((2, 1, 1))
+    for points, (start, end) in zip(lines, chords, strict=True):
+        along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-300)
+        own = np.eye(len(start)) - np.outer(along, along)
+        across, away = across + own, away + own @ (points - start).mean(axis=0)[:, None]
+    return np.asarray(np.linalg.pinv(across, rcond=FITS) @ away)[:, 0]
+
+
+def load_over_stiffness(lines: Sequence[tuple[FloatArray, FloatArray | None]]) -> FloatArray:
+    """Load per length over bending stiffness (d,) [1/m^3]; zero of a few points.
+
+    Kirchhoff's rod under a dead load w per length, in units of its bending stiffness:
+
+        M(s) = M_0 + F_0 x (r - r_0) - w x (s r - int r ds),    M across the tangent = t x t'
+
+    is linear in M_0 and F_0, which each pose has of its own, and w, which all share. Second
+    differences of the points give t x t'; rest curvature and noise are the residual.
+
+    Parameters
+    ----------
+    lines : sequence of (K, d) [m] and (K,) [m] or None
+        Points, and arc lengths where they are known.
+    """
+    d = lines[0][0].shape[1]
+    parts = [
+        part for points, s in lines for part in _equations(np.pad(points, ((0, 0), (0, 3 - d))), s)
+    ]
+    sizes = np.sum([np.zeros((3, 3)), *(a.T @ a for a, _ in parts)], axis=0)
+    right = np.sum([np.zeros(3), *(a.T @ y for a, y in parts)], axis=0)
+    return np.asarray(np.linalg.pinv(sizes) @ right)[:d]
 
 
 def _equations(points: FloatArray, s: FloatArray | None) -> list[tuple[FloatArray, FloatArray]]:

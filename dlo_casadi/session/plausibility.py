@@ -8,6 +8,7 @@ a list out of step as ends that fit another pose.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -15,7 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 
+from dlo_casadi.config import Pose
 from dlo_casadi.thresholds import (
     CONTRADICTS,
     FITS,
@@ -39,6 +42,30 @@ FRAMES: dict[str, FloatArray] = {
     "the picture turned by 90 degrees counter-clockwise": np.array([[0.0, 1.0], [-1.0, 0.0]]),
     "the picture turned by 90 degrees clockwise": np.array([[0.0, -1.0], [1.0, 0.0]]),
 }
+
+
+def exchanges(d: int) -> list[FloatArray]:
+    """All ways to exchange and turn round the axes of d dimensions, none first."""
+    return [
+        np.diag(signs) @ np.eye(d)[list(order)]
+        for order in itertools.permutations(range(d))
+        for signs in itertools.product((1.0, -1.0), repeat=d)
+    ]
+
+
+def read_as(axes: FloatArray) -> str:
+    """Exchanged axes in words."""
+    names = "xyz"[: len(axes)]
+    read = [("-" if row.min() < 0 else "") + names[int(np.abs(row).argmax())] for row in axes]
+    return f"{', '.join(names)} = {', '.join(read)}"
+
+
+def clamp_axis(pose: Pose, side: str) -> FloatArray | None:
+    """Direction (d,) of the cable in a clamp, from start to end; None where there is none."""
+    heading, q = getattr(pose, f"{side}_heading"), getattr(pose, f"{side}_orientation")
+    if heading is not None:
+        return np.array([np.cos(heading), np.sin(heading)])
+    return None if q is None else np.asarray(Rotation.from_quat(q).as_matrix()[:, 0])
 
 
 class Suspicion(NamedTuple):

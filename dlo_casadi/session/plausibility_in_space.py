@@ -5,7 +5,6 @@ As `plausibility`, of which the units, the order of files and single poses serve
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -18,8 +17,10 @@ from dlo_casadi.session.plausibility import (
     Lines,
     Suspicion,
     counted_from_the_end,
+    exchanges,
     out_of_step,
     overall,
+    read_as,
     single_poses,
     wrong_units,
 )
@@ -59,7 +60,7 @@ def other_frame(lines: Lines) -> Suspicion | None:
     own = overall(lines.misfit(lines.measured, lines.declared))
     if own < FITS or not np.all(np.isfinite(lines.declared)):
         return None
-    found = [_fitted(lines, np.array(matrix)) for matrix in _exchanges()]
+    found = [_fitted(lines, axes) for axes in exchanges(3)]
     misfit, turn, shift = min(found, key=lambda item: item[0])
     if misfit > min(FITS, MUCH_BETTER * own):
         return None
@@ -70,15 +71,6 @@ def other_frame(lines: Lines) -> Suspicion | None:
         "by its calibration against the robot.",
         own > CONTRADICTS,
     )
-
-
-def _exchanges() -> list[FloatArray]:
-    """The 48 ways to exchange and turn round axes, none first."""
-    return [
-        np.diag(signs) @ np.eye(3)[list(order)]
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1.0, -1.0), repeat=3)
-    ]
 
 
 def _fitted(lines: Lines, turn: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -113,14 +105,13 @@ def _told(turn: FloatArray, shift: FloatArray) -> str:
     exchanged = np.all(np.abs(named).sum(axis=0) == 1) and np.all(np.abs(named).sum(axis=1) == 1)
     close = exchanged and np.linalg.norm(turn - named) < _NAMED * np.sqrt(2)
     if close and not np.allclose(named, np.eye(3)):
-        axes = [("-" if row.min() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in named]
         hand = ", mirrored (a left-handed frame)" if np.linalg.det(turn) < 0 else ""
         up = (
             " (y up in one, z up in the other?)"
             if abs(named[1, 2]) == abs(named[2, 1]) == 1
             else ""
         )
-        return f"read as x, y, z = {', '.join(axes)}{hand}{up} and {moved}"
+        return f"read as {read_as(named)}{hand}{up} and {moved}"
     hand = "mirrored, " if np.linalg.det(turn) < 0 else ""
     vector = Rotation.from_matrix(turn * np.sign(np.linalg.det(turn))).as_rotvec()
     angle = float(np.linalg.norm(vector))
@@ -205,7 +196,8 @@ def wrong_orientations(
         off = np.degrees(np.median([_angle(pair, _READINGS[""]) for pair in pairs]))
         keys = " and ".join(f"{side}_orientation" for side in common)
         text = f"the x axis of {keys} is {off:.0f} degrees (median) off the lines{_meant(pairs)}"
-        found.insert(0, Suspicion(text, True))
+        # Certain only where another reading explains what the declared one does not.
+        found.insert(0, Suspicion(text, _best_reading(pairs)[1] < HEADING_NEAR))
     return tuple(found)
 
 

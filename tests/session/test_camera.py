@@ -38,6 +38,7 @@ def test_a_missing_camera_is_found_in_the_photographs(session, capsys):
     camera = found.experiment.measurement.camera
     assert camera.matrix[0][0] == pytest.approx(FOCAL, rel=5e-3)
     assert "no camera is declared: focal lengths" in found.warnings[0]
+    assert "directions lie within" in found.warnings[0]
     assert main(["calibrate", str(session), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["matrix"][0] == pytest.approx(camera.matrix[0])
@@ -54,7 +55,10 @@ def test_photographs_from_one_direction_are_no_calibration():
     measurement = config.experiment.measurement.model_copy(update={"camera": None})
     poses = config.experiment.poses[:4]
     bare = config.experiment.model_copy(update={"measurement": measurement, "poses": poses})
-    with pytest.raises(MeasurementError, match=r"camera is missing.* focal length .*30 to 45"):
+    said = (
+        r"camera is missing.* focal length is known to .* % only, .* within \d+ degrees.* Try: .*"
+    )
+    with pytest.raises(MeasurementError, match=said + "30 to 90 degrees apart, or .*camera"):
         calibrated(replace(config, experiment=bare), lambda *_: None)
 
 

@@ -151,15 +151,15 @@ def test_gravity_is_held_against_the_load_that_the_shapes_show(session, gravity)
     config, inputs = session
     experiment = config.experiment.model_copy(update={"gravity": gravity})
     (found,) = find_suspicions(replace(config, experiment=experiment), inputs)
-    assert "degrees from -z" in found.message
-    assert "with its sign" in found.message
+    assert "does not hang along gravity" in found.message
+    assert "with gravity (0, 0, -9.81) m/s^2" in found.message
 
 
 def test_the_load_over_the_stiffness_is_that_of_the_cable(session):
-    """The truth is 0.03 kg on 0.6 m and 0.015 N m^2 along -z; rest curvature is in the scatter."""
-    load, covariance = load_over_stiffness([(item.points, item.s) for item in session[1]])
-    gap = load - [0.0, 0.0, -0.03 * 9.81 / 0.6 / 0.015]
-    assert np.all(np.abs(gap) < 4 * np.sqrt(np.diag(covariance)))
+    """The truth is 0.03 kg on 0.6 m and 0.015 N m^2 along -z; rest curvature adds a quarter."""
+    load = load_over_stiffness([(item.points, item.s) for item in session[1]])
+    truth = 0.03 * 9.81 / 0.6 / 0.015
+    assert np.linalg.norm(load - [0.0, 0.0, -truth]) < truth / 2
 
 
 def markers():

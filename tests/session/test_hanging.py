@@ -1,0 +1,102 @@
+"""Gravity held against the lines of cables between ball joints in space, drawn from the model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dlo_casadi.config import dump_yaml, load_config
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.io.points import write_points
+from dlo_casadi.session import checks, coarse
+from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.hanging import load_over_stiffness, shown_pull
+from dlo_casadi.session.measure import conditions, read_inputs
+
+LENGTH, STIFFNESS, NOISE = 0.8, 0.02, 3e-4  # m, N m^2, m
+# Ends: chords of nine tenths of the cable, in nearly one vertical plane.
+ENDS = LENGTH * np.array(
+    [[0.92, 0.003, 0.1], [0.85, -0.002, -0.32], [0.9, 0.0, 0.26], [0.94, 0.002, -0.1]]
+)
+
+
+@pytest.fixture(scope="module")
+def curved(tmp_path_factory):
+    """Configuration and lines of a cable that is an arc of 2 m^-1 at rest."""
+    folder = tmp_path_factory.mktemp("curved")
+    names = [f"pose_{k}.csv" for k in range(len(ENDS))]
+    for name in names:
+        (folder / name).touch()
+    data = {
+        "cable": {"length": LENGTH, "mass": 0.06, "diameter": 0.005, "bending_stiffness": 0.03},
+        "experiment": {
+            "gravity": [0.0, 0.0, -9.81],
+            "boundary": {"start": "pinned", "end": "pinned"},
+            "measurement": {"kind": "centerlines"},
+            "poses": [
+                {"file": name, "start": [0.0, 0.0, 0.0], "end": end.tolist(), "role": "fit"}
+                for name, end in zip(names, ENDS, strict=True)
+            ],
+        },
+    }
+    path = folder / "curved.yaml"
+    path.write_text(dump_yaml(data))
+    config = load_config(path)
+    model = declared_model(config).model.with_mesh(20)
+    p = model.nominal.copy()
+    p[0] = STIFFNESS
+    rest = np.zeros(model.chain.n_rests)
+    rest[len(rest) // 3 : 2 * len(rest) // 3] = 2.0
+    rng = np.random.default_rng(0)
+    poses = [conditions(pose) for pose in config.experiment.poses]
+    for name, shape in zip(names, predict_poses(model, p, rest, poses), strict=True):
+        points = shape.curve.at(np.linspace(0.01, 0.99, 40) * LENGTH)
+        write_points(folder / name, points + NOISE * rng.standard_normal(points.shape))
+    return config, read_inputs(config, lambda *_: None)
+
+
+def under(config, gravity):
+    return replace(
+        config, experiment=config.experiment.model_copy(update={"gravity": tuple(gravity)})
+    )
+
+
+def test_a_curved_cable_between_ball_joints_is_no_mistake(curved, monkeypatch):
+    """Its moments seem to show another load, which they are far from; nothing needs a fit."""
+    load = load_over_stiffness([(item.points, item.s) for item in curved[1]])
+    assert load[2] > 0.5 * np.linalg.norm(load), "upwards: rest curvature is taken for weight"
+    assert shown_pull(*curved)[2] < 0
+    monkeypatch.setattr(coarse, "fit_model", None)
+    assert checks.find_suspicions(*curved) == ()
+
+
+@pytest.mark.parametrize(("gravity", "count"), [((0.0, 0.0, 9.81), 2), ((9.81, 0.0, 0.0), 4)])
+def test_gravity_along_another_axis_is_named_of_few_poses(curved, gravity, count):
+    config, inputs = curved
+    (found,) = checks.find_suspicions(under(config, gravity), inputs[:count])
+    declared = "(0, 0, 9.81)" if gravity[2] else "(9.81, 0, 0)"
+    assert f"does not hang along gravity {declared} m/s^2" in found.message
+    assert "m with gravity (0, 0, -9.81) m/s^2" in found.message
+
+
+def test_what_is_seen_at_a_glance_refuses_nothing_that_a_fit_explains(curved, monkeypatch):
+    """Were the pull that lines show upwards, the fit under the declared gravity would tell."""
+    monkeypatch.setattr("dlo_casadi.session.hanging.shown_pull", lambda *_: np.array([0, 0, 1.0]))
+    assert checks.find_suspicions(*curved) == ()
+
+
+def test_a_strap_or_a_stiff_cable_is_doubted_but_not_refused():
+    """Only a misfit that no missing effect leaves refuses a session."""
+
+    class Left:
+        """A fit that leaves so much [m]."""
+
+        def __init__(self, rms):
+            self.residual_rms = rms
+
+    found = [
+        coarse.Comparison("", Left(own), Left(other), 1.0)
+        for own, other in ((0.008, 0.001), (0.02, 0.001), (0.02, 0.015), (0.0015, 0.0003))
+    ]
+    assert [item.better for item in found] == [True, True, False, False]
+    assert [item.certain for item in found] == [False, True, False, False]
