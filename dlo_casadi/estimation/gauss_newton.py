@@ -99,7 +99,7 @@ class BatchProblem:
         self.roughness_std = roughness_std
         self.sweep = sweep or Sweep(unknowns.model, [item.pose for item in self.measured])
         self.precision = unknowns.prior_precision(roughness_std)
-        self.mean = unknowns.prior_mean()
+        self.mean = unknowns.prior_mean(self.precision)
         self.scatter = tolerances.deviation(unknowns.model.node) if scatter is None else scatter
         self.rest_scatter = rest_scatter
         self.deviation_std = self.scatter[self.sweep.used_deviations]

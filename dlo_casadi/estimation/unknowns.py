@@ -33,12 +33,15 @@ class Unknowns:
         Parameter values of what is not estimated (SI).
     rest_free : bool
         Whether the rest curvature is estimated.
+    told : tuple of (row (size,), value)
+        What else is known of theta: row @ theta is `value`, with a standard deviation of one.
     """
 
     model: CableModel
     free: BoolArray
     fixed: FloatArray
     rest_free: bool = True
+    told: tuple[tuple[FloatArray, float], ...] = ()
 
     @property
     def _used(self) -> NDArray[np.intp]:
@@ -161,14 +164,15 @@ class Unknowns:
         lower, upper = self.bounds
         return np.maximum(lower, theta - far), np.minimum(upper, theta + far)
 
-    def prior_mean(self) -> FloatArray:
-        """Mean of the Gaussian prior of theta."""
+    def prior_mean(self, precision: FloatArray) -> FloatArray:
+        """Mean of the Gaussian prior of theta, whose precision matrix is given."""
         nominal = self.model.nominal
         mean = self.pack(nominal, np.zeros(self.model.n_coefficients))
         bending, torsion = self._stiffnesses
         if torsion is not None and bending is None:
             mean[torsion] += np.log(self.fixed[0] / nominal[0])
-        return mean
+        pulled = sum((row * (value - row @ mean) for row, value in self.told), np.zeros_like(mean))
+        return mean + np.linalg.pinv(precision, hermitian=True) @ pulled if self.told else mean
 
     @property
     def _stiffnesses(self) -> tuple[int | None, int | None]:
@@ -222,4 +226,5 @@ class Unknowns:
             rough = self.model.roughness
             precision[rest, rest] = rough.T @ rough / roughness_std**2
             precision[rest, rest] += np.eye(self.n_rest) / REST_TURNS_STD**2
-        return precision
+        rows = np.reshape([row for row, _ in self.told], (-1, self.size))
+        return np.asarray(precision + rows.T @ rows)

@@ -80,11 +80,14 @@ class BranchShape:
         What the pose has to name for it to be predicted; None if no name does.
     turns : 0.5, -0.5 or None
         Or tell, see `Pose`.
+    undecided : bool
+        Whether the parameters are so uncertain that either equilibrium may be the lower one.
     """
 
     rmse: float
     branch: PoseBranch | None
     turns: float | None = None
+    undecided: bool = False
 
     @property
     def chosen_by(self) -> str | None:
@@ -171,6 +174,11 @@ class PoseShape:
     spread: FloatArray | None = None
     expected: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+
+    @property
+    def open(self) -> bool:
+        """Whether it was measured in another equilibrium that may as well be the lowest one."""
+        return self.measured_branch is not None and self.measured_branch.undecided
 
     def inside_band(self, length: float, noise: float) -> NDArray[np.bool_]:
         """Whether each measured point (K,) lies in its 90 % band, noise included."""

@@ -15,7 +15,7 @@ from dlo_casadi.errors import counted
 from dlo_casadi.estimation.mesh import allowed_mesh_error
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
+from dlo_casadi.session.outcome import SIMPLER, BranchShape, PoseInput, PoseShape, Stage
 from dlo_casadi.thresholds import FIXTURES, UNSEEN
 
 FloatArray = NDArray[np.floating]
@@ -89,6 +89,7 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
                 f"stage {stage.name}: {', '.join(found)}: the equilibrium of lowest energy, which "
                 f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
                 f"off, on the measured branch {1e3 * measured:.3g} mm; {_cure(chosen_by)}"
+                + _open(found)
             )
         sides = stage.measured_side
         for chosen_by in dict.fromkeys(side.chosen_by for side in sides.values()):
@@ -105,6 +106,12 @@ def _cure(chosen_by: str | None) -> str:
     if chosen_by is None:
         return "no `branch` of these poses would choose it: take them again, or leave them out"
     return f"`{chosen_by}` in these poses chooses it"
+
+
+def _open(found: Mapping[str, BranchShape]) -> str:
+    """That the parameters do not tell which equilibrium is lower, where so."""
+    names = ", ".join(name for name, shape in found.items() if shape.undecided)
+    return f". The fit is too uncertain to tell which of both is lower in {names}" if names else ""
 
 
 def weight_warning(weight: Mapping[str, Any], expected: float) -> str:
@@ -161,7 +168,8 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
     times what noise, fixtures, parameters and the cable's scatter let expect. A held-out pose that
     hangs on the other side (see `EitherSide`), and one whose equilibrium has no name but the way
     that led there, tells of the model what it tells there; but where all poses were measured in
-    another equilibrium, and a simpler model comes nearer, nothing is predicted.
+    another equilibrium, and a simpler model comes nearer, nothing is predicted. A pose does not
+    count whose lowest equilibrium the uncertain parameters leave open.
     """
     lines, stage = [], stages[-1]
     if fit.failed:
@@ -174,7 +182,7 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
         errors = {
             pose.name: _errors(stage.shapes[pose.name])
             for pose in poses
-            if pose.role == role and pose.name in stage.shapes and len(pose.points)
+            if pose.role == role and pose.name in _judged(stage) and len(pose.points)
         }
         if not errors:
             continue
@@ -205,7 +213,7 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
     shown = {name for name, shape in stage.shapes.items() if shape.rmse is not None}
     simpler = [x for x in stages if x.name in SIMPLER and x.rmse_fit is not None]
     nearest = min(simpler, key=lambda x: x.rmse_fit or 0.0, default=None)
-    if len(shown) < 2 or not shown <= set(stage.other_branch) or nearest is None:
+    if len(shown) < 2 or not shown <= _judged(stage) & set(stage.other_branch) or nearest is None:
         return []
     off, other = stage.rmse_fit or 0.0, nearest.rmse_fit or 0.0
     if off <= other:
@@ -218,10 +226,15 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
     ]
 
 
+def _judged(stage: Stage) -> set[str]:
+    """Poses whose errors tell of the model: an equilibrium that is open tells nothing."""
+    known = (name for name, shape in stage.shapes.items() if shape.expected is not None)
+    return {name for name in known if not stage.shapes[name].open}
+
+
 def _errors(shape: PoseShape) -> FloatArray:
     """Squares (2, K) [m^2] of a pose's distances from its prediction: measured, expected."""
-    if shape.expected is None:
-        return np.zeros((2, 0))
+    assert shape.expected is not None
     expected, there = shape.expected**2, shape.measured_branch
     if there is not None and (there.branch not in SIGNS or shape.either_side is not None):
         return np.stack([np.full_like(expected, there.rmse**2), expected])

@@ -13,6 +13,7 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.errors import DloError
+from dlo_casadi.estimation.branches import as_measured
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SETTLED_MODES
 from dlo_casadi.estimation.mesh import SEARCH_MESH, fine_enough, mesh_error
@@ -135,6 +136,8 @@ def fit_session(
     if best.point is not fit.point:
         own = _declared_stage(config, best, measured, reported)
     fit = not_worse(best, [*stages, own])
+    if not config.diagnosis.enabled:
+        fit = as_measured(fit)
     if fit is not best:
         own = _declared_stage(config, fit, measured, reported)
     progress.step("compare with simpler fits", 1, 1)
@@ -217,7 +220,7 @@ def close_the_loop(
         own = fit_stage("closed", fit, measured, profile_intervals(fit), names)
         found = confirming()
         clock.add("batch", found.seconds)
-        best = confirmed(fit, found)
+        best = as_measured(confirmed(fit, found))
         if best.point is not fit.point:
             own = fit_stage("closed", best, measured, profile_intervals(best), names)
         fit = best
@@ -228,6 +231,7 @@ def close_the_loop(
     else:
         next_pose = None
         # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
+        fit = as_measured(fit)
         stages[-1] = fit_stage("batch", fit, measured, profile_intervals(fit), reported)
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)

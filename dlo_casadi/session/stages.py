@@ -14,6 +14,7 @@ from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
 from dlo_casadi.equilibrium.tipping import sides_of, tipping_of
 from dlo_casadi.estimation.band import uncertainty_of
+from dlo_casadi.estimation.branches import EnergyGap
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
     Prediction,
@@ -40,7 +41,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     StageName,
 )
-from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95
+from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, UNSEEN
 
 FloatArray = NDArray[np.floating]
 
@@ -49,7 +50,9 @@ _REST_POINTS = 41
 
 
 def pose_shape(
-    prediction: Prediction, item: MeasuredPose, other: MeasuredBranch | None
+    prediction: Prediction,
+    item: MeasuredPose,
+    other: MeasuredBranch | None,
 ) -> PoseShape:
     """One predicted pose beside its measured points."""
     curve = prediction.curve
@@ -185,7 +188,12 @@ def _stage(
                 shape = shapes[item.pose.name]
                 shape = _expected(model, p, item, known, shape, uncertainty, noise)
                 either = _either_side(model, p, item, known, other, uncertainty)
-                shapes[item.pose.name] = replace(shape, either_side=either)
+                branch = shape.measured_branch
+                if branch is not None and other is not None:
+                    undecided = _undecided(model, p, item, known, other, uncertainty)
+                    branch = replace(branch, undecided=undecided)
+                shape = replace(shape, either_side=either, measured_branch=branch)
+                shapes[item.pose.name] = shape
     lost = [item for item in measured if item.pose.name not in shapes]
     if lost:
         names = ", ".join(item.pose.name for item in lost)
@@ -233,6 +241,28 @@ def _expected(
         hanging = np.bincount(line.point_of, (rows**2).sum(axis=1))
         expected = np.sqrt(hanging + (noise * line.noise_distances) ** 2)
     return replace(shape, spread=spread if model.in_space else spread[:, 0], expected=expected)
+
+
+def _undecided(
+    model: CableModel,
+    p: FloatArray,
+    item: MeasuredPose,
+    known: Prediction,
+    other: MeasuredBranch,
+    uncertainty: Uncertainty,
+) -> bool:
+    """Whether the uncertain parameters leave open in which equilibrium a pose is."""
+    std = np.sqrt(np.maximum(np.diag(uncertainty.covariance), 1e-300))
+    by_p, by_rest = uncertainty.unknowns_in(model)
+    gap = EnergyGap.between(
+        model,
+        item.pose,
+        (other.prediction.equilibrium, known.equilibrium),
+        (p, known.rest),
+        (by_p * std, by_rest * std),
+        uncertainty.covariance / np.outer(std, std),
+    )
+    return gap.value < UNSEEN * gap.std
 
 
 def _no_rest(model: CableModel) -> RestCurvatureEstimate:

@@ -1,0 +1,48 @@
+"""From one mesh to the next: a fit that gets stuck on the finer one starts again."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.estimation import fit as fitting
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+
+MODEL = CableModel(Cable(0.5, 0.1, 0.006, 0.02), 10, n_rest=0)
+NOISE = 3e-4
+
+
+def test_a_fit_that_gets_stuck_on_a_finer_mesh_starts_again(monkeypatch):
+    """Where a pose loses its stability on the way no step leads on, however much is left.
+
+    Stuck here: at twice the stiffness, with nothing that descends from there.
+    """
+    poses = [Pose((0.0, 0.0), end, name=f"{k}") for k, end in enumerate([(0.4, 0.0), (0.3, -0.1)])]
+    shapes = predict_poses(MODEL, MODEL.nominal, np.zeros(MODEL.chain.n_rests), poses)
+    rng, s = np.random.default_rng(0), np.linspace(0.01, 0.49, 40)
+    measured = [
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2)))
+        for pose, shape in zip(poses, shapes, strict=True)
+    ]
+    fit = fitting.fit_model(MODEL, measured, Tolerances(), NOISE)
+
+    def stuck(unknowns, history, start, _=0):
+        p = start.p * np.where(np.array(start.model.names) == "bending_stiffness", 2.0, 1.0)
+        problem = start.problem.of(replace(unknowns, fixed=p), history)
+        problem.share_metric(start.problem)
+        rest = unknowns.model.rest_basis @ start.coefficients
+        moved, _ = problem.sweep.solve(fitting.carried_shapes(problem, start), p, rest)
+        theta = unknowns.pack(p, start.coefficients)
+        return fitting.Fit(problem, problem.evaluate(theta, moved, start.point.feet), False)
+
+    monkeypatch.setattr(fitting, "_continue", stuck)
+    monkeypatch.setattr(fitting, "refine", lambda problem, near, **_: (problem, near, False))
+    finer = fitting.refine_mesh(fit, 20)
+
+    assert finer.model.n == 20
+    # The two meshes differ by less than the noise: so do the fits.
+    assert finer.chi2_per_dof < 1.2 * fit.chi2_per_dof
