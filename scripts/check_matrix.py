@@ -55,7 +55,6 @@ import dlo_casadi as dlo
 from dlo_casadi.api import Result
 from dlo_casadi.cli import main as command
 from dlo_casadi.codegen import CompiledSolver
-from dlo_casadi.codegen.compiled import CompiledSpaceSolver
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.profile import student_95, threshold
 from dlo_casadi.io.files import write_file
@@ -253,17 +252,7 @@ def solved_in_c(predicted: PredictedShape) -> np.ndarray:
     """Nodes (n + 1, d) [m] of the same pose by the generated C, compiled."""
     (model, p, rest, _), pose = predicted.cable, predicted.pose
     flags = ("-O0",)  # compiles quickly
-    if model.in_space:
-        return CompiledSpaceSolver(model, p, rest, flags=flags).solve(pose).points
-    return (
-        CompiledSolver(model, p, rest, flags=flags)
-        .solve(
-            pose.end or (0.0, 0.0),
-            start=pose.start,
-            headings=(pose.start_heading or 0.0, pose.end_heading or 0.0),
-        )
-        .points
-    )
+    return CompiledSolver(model, p, rest, flags=flags).solve(pose).points
 
 
 def matching(cells: Sequence[Cell], levels: str) -> list[Cell]:

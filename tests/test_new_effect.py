@@ -140,8 +140,9 @@ def test_the_generated_solver_knows_it(result):
     model, p, rest, _ = parameters_of(result)
     solver = CompiledSolver(model, p, rest, flags=("-O0",))  # compiles quickly
     for end in ENDS:
-        expected = solve_equilibrium(model, p, rest, Pose((0.0, 0.0), end))
-        assert solver.solve(end).points == pytest.approx(expected.points, abs=1e-8)
+        pose = Pose((0.0, 0.0), end)
+        expected = solve_equilibrium(model, p, rest, pose)
+        assert solver.solve(pose).points == pytest.approx(expected.points, abs=1e-8)
 
 
 def test_it_stands_behind_what_acts_like_it(known, tmp_path):

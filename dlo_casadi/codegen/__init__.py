@@ -1,29 +1,19 @@
 """The C solver that planners embed."""
 
-from dlo_casadi.codegen.compiled import CompiledSolver, CompiledSpaceSolver
+from dlo_casadi.codegen.compiled import CompiledSolver
 from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.obstacles import Capsule, Gap, HalfSpace
-from dlo_casadi.codegen.shapes import (
-    STATUSES,
-    Shape,
-    ShapePath,
-    Slope,
-    SpaceShape,
-    SpaceSlope,
-)
+from dlo_casadi.codegen.shapes import STATUSES, Shape, ShapePath, Slope
 
 __all__ = [
     "STATUSES",
     "Capsule",
     "CompiledSolver",
-    "CompiledSpaceSolver",
     "Gap",
     "HalfSpace",
     "Shape",
     "ShapePath",
     "Slope",
     "Solver",
-    "SpaceShape",
-    "SpaceSlope",
     "generate",
 ]

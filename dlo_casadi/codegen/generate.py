@@ -8,18 +8,21 @@ import re
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import __version__
 from dlo_casadi.codegen import plane, space
-from dlo_casadi.codegen.kernels import c_number
+from dlo_casadi.codegen.kernels import Kernels, c_number, size_of_code, table_to_c, text_of
 from dlo_casadi.codegen.prefix import check_prefix
+from dlo_casadi.codegen.records import n_columns
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.lagrangian import lagrangian_of
 
 FloatArray = NDArray[np.floating]
 
@@ -116,13 +119,43 @@ def _values(model: CableModel, prefix: str, digest: str) -> dict[str, str]:
         + (comment(", ".join(names)) or "none"),
         "HASH": digest,
         "DIMENSION": str(model.node.dimension),
+        "COORDINATES": str(model.node.coordinates),
+        "AXES": str(model.node.increment),
+        "COLUMNS": str(n_columns(model)),
         "N": str(model.n),
+        "NODES": str(model.chain.n_nodes),
+        "NODES_ARE": model.chain.kind.nodes_are,
         "START_CLAMPED": str(clamped["start"]),
         "END_CLAMPED": str(clamped["end"]),
         "END_FREE": str(int(model.end == "free")),
         "RADIUS": c_number(model.cable.diameter / 2),
         "ELASTIC": str(int(model.yields)),
+        "STRETCHES": str(int(model.extensible)),
+        "SMOOTH": str(int(model.chain.kind.smooth)),
     }
+
+
+def _own(model: CableModel) -> ModuleType:
+    """What differs between plane and space."""
+    return space if model.in_space else plane
+
+
+def table_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
+    """The table of another cable of the kind of a solver generated with `inline=False`."""
+    own = _own(model)
+    return _table(own, model, p, rest, own.meshes_of(model, p, rest, inline=False))
+
+
+def _table(
+    own: ModuleType,
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    meshes: dict[str, Kernels],
+) -> list[float]:
+    """Numbers of the kernels of all meshes, then the others."""
+    rows = [number for kernels in meshes.values() for number in kernels.table]
+    return [*rows, *own.numbers_of(model, p, rest)]
 
 
 def comment(text: str) -> str:
@@ -192,13 +225,28 @@ def generate(
             "  Try: dlo predict, or dlo_casadi.predict, which know it."
         )
     digest = solver_hash(model, p, rest)
-    own, kind = (space, "space") if model.in_space else (plane, "plane")
-    values = _values(model, prefix, digest) | own.values(model, p, rest, inline)
+    own, kind = _own(model), "space" if model.in_space else "plane"
+    meshes = own.meshes_of(model, p, rest, inline)
+    numbers = _table(own, model, p, rest, meshes)
+    kernels, loops, kernel_numbers = text_of(meshes)
+    values = {
+        **_values(model, prefix, digest),
+        **own.values(model, p, meshes),
+        "LENGTH": c_number(float(lagrangian_of(model).held(p, 0, 0)[1])),
+        "TABLE": table_to_c(numbers),
+        "EXTRA": str(kernel_numbers),
+        "CODE": str(size_of_code(meshes.values(), numbers)),
+        "KERNELS": kernels,
+        "LOOPS": loops,
+    }
+    values["TRY_STEPS"] = str(own.TRY_STEPS)
     values["PATH_STEPS"] = str(int(values["STEPS"]) + own.TRY_STEPS * (2 * FINEST + 13))
-    texts = {**own.TEXTS, "TYPES": _template(f"{kind}_types.h.in").rstrip()}
-    own_parts = [f"{kind}{part}.c.in" for part in ("", "_guesses", "_shape")]
-    parts = [*own_parts, "clearance.c.in", "interface.c.in"]
-    source = "".join(_template(name) for name in parts)
+    texts = {**own.TEXTS, "POSE_TYPE": _template(f"{kind}_pose.h.in").rstrip()}
+    parts = (
+        *("common", kind, "newton", f"{kind}_descent", f"{kind}_guesses", f"{kind}_shape"),
+        *("shape", "clearance", "interface"),
+    )
+    source = "".join(_template(f"{name}.c.in") for name in parts)
     names = {
         f"{prefix}_solver.h": "solver.h.in",
         f"{prefix}_solver.hpp": "solver.hpp.in",

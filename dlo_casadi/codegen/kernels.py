@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
@@ -112,29 +112,47 @@ class Kernels:
         """Bytes of their machine code, about."""
         return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.slots))
 
-    def loops(self, call: str, table_at: int = 0) -> list[str]:
-        """Statements that call all kernels, `table_at` after the start of the solver's table.
-
-        `call` has the places {k}, the kernel's number, and {row}, its numbers.
-        """
+    def loops(self, name: str, table_at: int = 0) -> str:
+        """Statements that call all kernels, `table_at` after the start of the solver's table."""
         found, offset = [], table_at + len(self.shared)
         for k, kernel in enumerate(self.slots):
             (first, last), width = kernel.members, kernel.rows.shape[1]
             row = f"table + {offset} + (j - {first}) * {width}" if width else "table"
-            found.append(
-                f"    for (j = {first}; j < {last}; ++j)\n        {call.format(k=k, row=row)};"
-            )
+            state = kernel.function.numel_in(0) // 2
+            found += [
+                f"    for (j = {first}; j < {last}; ++j)",
+                f"        {name}_{k}(x + {state} * j, lam, {row}, table,",
+                f"        {' ' * len(f'{name}_{k}')} slot + SLOT * j);",
+            ]
             offset += kernel.rows.size
-        return found
+        return "\n".join(found)
 
-    def to_c(self, elastic: bool) -> tuple[str, str]:
-        """Kernel functions of a planar cable, and the statements that call them for all slots."""
-        functions = [_kernel_text(k, kernel, elastic) for k, kernel in enumerate(self.slots)]
-        loops = self.loops("total += kernel_{k}(q, j, {row}, table)")
-        if self.ends is not None:
-            functions.append(_ends_text(self.ends))
-            loops.append("    total += at_ends(q, table);")
-        return with_helpers(functions), "\n".join(loops)
+    def to_c(self, name: str) -> list[str]:
+        """Kernel functions, called `name`_0, `name`_1, ..."""
+        return [_kernel_text(f"{name}_{k}", kernel) for k, kernel in enumerate(self.slots)]
+
+
+def text_of(meshes: dict[str, Kernels]) -> tuple[str, str, int]:
+    """Functions in C of all meshes, the statements that call them, and the length of their table.
+
+    Of two meshes the second one is called if `w->coarse` is set.
+    """
+    functions: list[str] = []
+    loops: list[str] = []
+    at = 0
+    for name, kernels in meshes.items():
+        functions += kernels.to_c(name)
+        loops.append(kernels.loops(name, at))
+        at += len(kernels.table)
+        if kernels.ends is not None:
+            functions.append(_ends_text(kernels.ends))
+    fine, *coarse = loops
+    for statements in coarse:
+        inside = re.sub("^", "    ", statements, flags=re.MULTILINE)
+        fine = f"    if (w->coarse) {{\n{inside}\n        return;\n    }}\n{fine}"
+    text = "\n".join(functions)
+    helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
+    return "\n".join([*helpers, text]), fine, at
 
 
 def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
@@ -143,13 +161,6 @@ def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
     Of 13 solvers in the plane and in space, with gcc 12 -O2 on x86-64, it is within 8 %.
     """
     return 25_000 + sum(kernels.code_size for kernels in meshes) + 8 * len(numbers)
-
-
-def with_helpers(functions: Sequence[str]) -> str:
-    """Text of functions, and ahead of it what they call."""
-    text = "\n".join(functions)
-    helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
-    return "\n".join([*helpers, text])
 
 
 def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True) -> Kernels:
@@ -209,13 +220,25 @@ def _kernel(
         ca.SX.zeros(len(model.deviation_names)),
         lagrangian_of(model).shares(p, ca.DM(first) if inline else place),
     )
-    derivatives = _in_space if model.in_space else _in_plane
-    return Kernel(members, own[:, varies], partial(derivatives, model, numbers, row))
+    return Kernel(members, own[:, varies], partial(_told, model, numbers, row))
 
 
-def _in_plane(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:
-    """(x (2,), lam (2,), row, p) -> value, gradient (4,), upper triangle of the Hessian."""
-    x, lam = ca.SX.sym("x", 2), ca.SX.sym("lam", 2)
+def _told(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:
+    """(x, lam, row, p) -> a slot's Lagrangian and its derivatives in one vector.
+
+    Of x, the states of both nodes, and lam [N], the force on the end's holder; also where that is
+    free, for its derivative is the advance. In order: value; by lam: advance [m]; in space the
+    rotation vector from node to node [rad]; slopes by the first, last node; Hessian by first-first,
+    first-last, last-last, first-lam, last-lam, lam-lam: rows one after another, of symmetric blocks
+    the upper triangle column by column.
+    """
+    x, lam = ca.SX.sym("x", 2 * model.node.coordinates), ca.SX.sym("lam", model.node.dimension)
+    found = (_in_space if model.in_space else _in_plane)(model, x, lam, numbers)
+    arguments = [x, lam, row, _symbols(numbers.p)]
+    return ca.Function("kernel", arguments, ca.cse([ca.densify(ca.vertcat(*found))]))
+
+
+def _in_plane(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SlotNumbers) -> list[ca.SX]:
     position = ca.SX.zeros(0) if model.end == "free" else lam
     multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
     arguments = [x, multipliers, numbers.p, numbers.rest, numbers.place, numbers.deviation]
@@ -226,34 +249,13 @@ def _in_plane(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Functio
     if model.end == "free":
         # lam is zero there; its derivative is the way from slot to slot all the same.
         value += ca.dot(lam, advance)
-    return _derivatives(value, [x, lam, row, _symbols(numbers.p)], ca.vertcat(x, lam))
+    hessian, gradient = ca.hessian(value, ca.vertcat(x, lam))
+    bends, borders = _triangle(hessian[:2, :2]), _rows(hessian[:2, 2:])
+    return [value, gradient[2:], gradient[:2], bends, borders, _triangle(hessian[2:, 2:])]
 
 
-def _in_space(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:
-    """(x (8,), lam (3,), row, p) -> what `_told_in_space` tells, in one vector."""
-    x, lam = ca.SX.sym("x", 8), ca.SX.sym("lam", 3)
-    outputs = ca.vertcat(*_told_in_space(model, x, lam, numbers))
-    arguments = [x, lam, row, _symbols(numbers.p)]
-    return ca.Function("kernel", arguments, ca.cse([ca.densify(outputs)]))
-
-
-def _told_in_space(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SlotNumbers) -> list[ca.SX]:
-    """A slot's Lagrangian and its derivatives by increments about the world's axes.
-
-    Parameters
-    ----------
-    x : (8,)
-        Frames of both nodes.
-    lam : (3,) [N]
-        Force on the end's holder; also where that is free, for its derivative is the advance.
-
-    Returns
-    -------
-    list
-        Value; by lam: advance (3,) [m]; phi (3,) [rad]; slopes (3,) by the first, last node;
-        Hessian by first-first, first-last, last-last, first-lam, last-lam, lam-lam: rows one after
-        another (9,), of symmetric blocks the upper triangle column by column (6,).
-    """
+def _in_space(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SlotNumbers) -> list[ca.SX]:
+    """Derivatives are by increments about the world's axes."""
     found = lagrangian_of(model).in_frame(x, lam, numbers).derivatives()
     found = found.about(found.turn, found.turn)
     (first, between, last), (first_lam, last_lam) = found.bends, found.mixed
@@ -276,7 +278,7 @@ def _rows(a: ca.SX) -> ca.SX:
 
 
 def _triangle(a: ca.SX) -> ca.SX:
-    return ca.vertcat(*(a[: k + 1, k] for k in range(3)))
+    return ca.vertcat(*(a[: k + 1, k] for k in range(a.shape[1])))
 
 
 def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
@@ -290,141 +292,72 @@ def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
     )
     if not ca.depends_on(value, x):
         return None
-    return _derivatives(value, [x, _symbols(p)], x)
+    hessian, gradient = ca.hessian(value, x)
+    told = ca.densify(ca.vertcat(value, gradient, ca.diag(hessian)))
+    return ca.Function("at_ends", [x, _symbols(p)], ca.cse([told]))
 
 
 def _symbols(p: ca.SX) -> ca.SX:
     return p if p.is_valid_input() else ca.SX.zeros(0)
 
 
-def _derivatives(value: ca.SX, arguments: list[ca.SX], by: ca.SX) -> ca.Function:
-    hessian, gradient = ca.hessian(value, by)
-    outputs = ca.cse([value, ca.sparsify(gradient), ca.triu(hessian)])
-    return ca.Function("kernel", arguments, outputs)
-
-
 # ---- text --------------------------------------------------------------------------------------
-
-Targets = dict[tuple[int, int], str]
 
 _BODY = re.compile(r"^static int casadi_f0\(.*?\{\n(.*?)^\}", re.MULTILINE | re.DOTALL)
 _INPUT = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
-_OUTPUT = re.compile(r"if \(res\[(\d+)\]!=0\) res\[\1\]\[(\d+)\]=(.*?);")
+_OUTPUT = re.compile(r"if \(res\[0\]!=0\) res\[0\]\[(\d+)\]=(.*?);")
 
 
-def statements(function: ca.Function, inputs: Sequence[str], targets: Targets) -> str:
+def _statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[str]) -> str:
     """What CasADi prints for a function, reading and writing our names.
 
     Parameters
     ----------
     inputs : sequence of str
         C array of each input.
-    targets : dict
-        (output, nonzero) -> the assignment's left side and operator.
+    targets : sequence of str
+        Of each number of the output: the assignment's left side and operator.
     """
     generator = ca.CodeGenerator("kernel")
     generator.add(function)
     found = _BODY.search(generator.dump())
     if found is None:  # pragma: no cover: another version of CasADi prints in another way
         raise DloError("CasADi printed no function; try another version of CasADi")
-
-    def output(match: re.Match[str]) -> str:
-        target = targets.get((int(match[1]), int(match[2])))
-        return f"{target} {match[3]};" if target else ""
-
     text = _INPUT.sub(lambda match: f"{inputs[int(match[1])]}[{match[2]}]", found[1])
-    text = _OUTPUT.sub(output, text).replace("  return 0;\n", "")
+    text = _OUTPUT.sub(lambda match: f"{targets[int(match[1])]} {match[2]};", text)
+    text = text.replace("  return 0;\n", "")
     text = re.sub(
         r"casadi_\w+", lambda match: _CALLS.get(match[0], match[0][len("casadi_") :]), text
     )
     return "\n".join("  " + line for line in text.splitlines() if line.strip())
 
 
-def _by_place(function: ca.Function, targets: dict[tuple, str]) -> Targets:
-    """Of ("value",), ("g", row), ("h", row, column) -> text, those of nonzero outputs."""
-    return {at: targets[place] for at, place in _places(function) if place in targets}
-
-
-def _places(function: ca.Function) -> Iterator[tuple[tuple[int, int], tuple]]:
-    """Where each nonzero of the outputs belongs."""
-    yield (0, 0), ("value",)
-    for i, row in enumerate(function.sparsity_out(1).row()):
-        yield (1, i), ("g", row)
-    hessian = function.sparsity_out(2)
-    for i, place in enumerate(zip(hessian.row(), hessian.get_col(), strict=True)):
-        yield (2, i), ("h", *place)
-
-
-# Of the unknowns (x_j, x_(j+1), lam_x, lam_y): where a slot's derivatives are added or set.
-_TARGETS: dict[tuple, tuple[str, ...]] = {
-    ("g", 0): ("q->gradient[j] +=",),
-    ("g", 1): ("q->gradient[j + 1] =",),
-    ("h", 0, 0): ("q->diagonal[j] +=",),
-    ("h", 1, 1): ("q->diagonal[j + 1] =",),
-    ("h", 0, 1): ("q->off[j] =",),
-    ("h", 0, 2): ("q->jx[j] +=",),
-    ("h", 0, 3): ("q->jy[j] +=",),
-    ("h", 1, 2): ("q->jx[j + 1] = q->bx[j] =",),
-    ("h", 1, 3): ("q->jy[j + 1] = q->by[j] =",),
-    ("g", 2): ("q->ax[j] =",),
-    ("g", 3): ("q->ay[j] =",),
-}
-_ELASTIC: dict[tuple, tuple[str, ...]] = {
-    ("h", 2, 2): ("q->kx[j] =",),
-    ("h", 2, 3): ("q->kxy[j] =",),
-    ("h", 3, 3): ("q->ky[j] =",),
-}
-
-
-def _kernel_text(k: int, kernel: Kernel, elastic: bool) -> str:
-    targets = {place: text for place, (text,) in (_TARGETS | (_ELASTIC if elastic else {})).items()}
-    there = {place for _, place in _places(kernel.function)}
-    zeros = [
-        f"    {text} 0.0;"
-        for place, text in targets.items()
-        if place not in there and not text.endswith("+=")
-    ]
-    targets["value",] = "value ="
-    inputs = ("x", "q->lam", "row", "table")
-    body = statements(kernel.function, inputs, _by_place(kernel.function, targets))
-    first, last = kernel.members
-    return "\n".join(
-        [
-            f"/* Slots {first} to {last - 1}. */",
-            f"static double kernel_{k}(point_t *q, int j, const double *row, const double *table)",
-            "{",
-            "    const double *const x = q->x + j;",
-            "    double value = 0.0;",
-            body,
-            *zeros,
-            "    (void)x, (void)row, (void)table;",
-            "    return value;",
-            "}",
-            "",
-        ]
-    )
+def _kernel_text(name: str, kernel: Kernel) -> str:
+    function, (first, last) = kernel.function, kernel.members
+    targets = [f"out[{i}] =" for i in range(function.nnz_out(0))]
+    head = f"static void {name}("
+    return f"""\
+/* Slots {first} to {last - 1}. */
+{head}const double *x, const double *lam, const double *row,
+{" " * len(head)}const double *table, double *restrict out)
+{{
+{_statements(function, ("x", "lam", "row", "table"), targets)}
+    (void)x, (void)lam, (void)row, (void)table;
+}}
+"""
 
 
 def _ends_text(function: ca.Function) -> str:
-    targets: dict[tuple, str] = {
-        ("value",): "value =",
-        ("g", 0): "q->gradient[0] +=",
-        ("g", 1): "q->gradient[SLOTS - 1] +=",
-        ("h", 0, 0): "q->diagonal[0] +=",
-        ("h", 1, 1): "q->diagonal[SLOTS - 1] +=",
-    }
-    body = statements(function, ("x", "table"), _by_place(function, targets))
-    return "\n".join(
-        [
-            "/* What holds the first and the last node beside their conditions. */",
-            "static double at_ends(point_t *q, const double *table)",
-            "{",
-            "    const double x[2] = {q->x[0], q->x[SLOTS - 1]};",
-            "    double value = 0.0;",
-            body,
-            "    (void)x, (void)table;",
-            "    return value;",
-            "}",
-            "",
-        ]
-    )
+    """What holds the first and the last node of a planar cable beside their conditions."""
+    targets = ["q->lagrangian +="]
+    targets += ["first[SLOPE_0] +=", "last[SLOPE_1] +=", "first[BEND_00] +=", "last[BEND_11] +="]
+    return f"""\
+/* Adds what holds the first and the last node beside their conditions. */
+static void add_ends(point_t *q, const double *table)
+{{
+    const double x[2] = {{q->x[0], q->x[NODE(1)]}};
+    double *const first = q->slot, *const last = q->slot + SLOT * (NODE(1) - 1);
+{_statements(function, ("x", "table"), targets)}
+    (void)x, (void)table;
+}}
+"""

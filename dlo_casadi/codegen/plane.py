@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.codegen.kernels import (
-    Kernels,
-    c_number,
-    kernels_of,
-    size_of_code,
-    table_to_c,
-)
+from dlo_casadi.codegen.kernels import Kernels, kernels_of
 from dlo_casadi.equilibrium.guesses import resting_headings
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
@@ -19,17 +13,23 @@ from dlo_casadi.model.lagrangian import lagrangian_of
 
 FloatArray = NDArray[np.floating]
 
-# Doubles of a workspace per slot; as in the template.
-_ARRAYS = 38
-# Newton steps for a part of a path; the template checks the number.
+# Doubles of a workspace per node, as in the template: arrays, the border, slots of two points.
+_NUMBERS = 12 + 2 + 2 * 15
+# Newton steps for a part of a path.
 TRY_STEPS = 13
 # Parts of the templates.
 TEXTS = {
+    "METHOD": """\
+ * Steps are accepted by the exact penalty function V + nu |end error|, with a second-order
+ * correction. A joint that reaches +-pi/2 is held there by an augmented Lagrangian.""",
     "WHERE": "in a plane",
     "ANGLES": """Angles are headings against the x axis of the board frame,
  * counter-clockwise positive, continuous along the cable (a full clockwise turn ends at -2 pi).""",
-    "COLUMNS": "4",
-    "NODES": "\n#define DLO_N_HEADINGS @N_HEADINGS@ /* @HEADINGS_ARE@ */",
+    "STATES_ARE": "headings of the nodes [rad]",
+    "COLUMNS_ARE": """\
+end x, end y [m], start heading,
+ * end heading [rad]. Moving the start fixture by d has the effect of moving everything by d and
+ * then the end by -d.""",
     "START_FRAME": "start_heading",
     "END_FRAME": "end_heading",
     "BRANCH": """\
@@ -43,17 +43,21 @@ TEXTS = {
 }
 
 
-def _extra(model: CableModel, p: FloatArray) -> list[float]:
+def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
     offsets, length = lagrangian_of(model).held(p, 0, 0)
-    compliance = clamp_compliances(model, p)
-    hold = [1 / c if c > 0 else 0.0 for c in compliance]
-    dead_load, turns = (
-        np.array(functions_of(model).dead_load(p)).ravel(),
-        np.array(offsets).ravel()[2:],
-    )
-    return [float(length), down, *dead_load, *turns, *hold]
+    stretch = float(length) / model.cable.length
+    return [
+        float(length),
+        down,
+        *np.array(functions_of(model).dead_load(p)).ravel(),
+        *np.array(offsets).ravel()[2:],
+        *(1 / c if c > 0 else 0.0 for c in clamp_compliances(model, p)),
+        *(model.chain.places / model.cable.length),
+        *resting_headings(model.chain, rest),
+        *(1 / (np.diff(model.chain.cells, axis=1).ravel() * stretch)),
+    ]
 
 
 def clamp_compliances(model: CableModel, p: FloatArray) -> list[float]:
@@ -67,16 +71,11 @@ def clamp_compliances(model: CableModel, p: FloatArray) -> list[float]:
     return [named.get(f"{side}_heading", 0.0) for side in ("start", "end")]
 
 
-def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray, kernels: Kernels) -> list[float]:
-    """The solver's table: numbers of the kernels, nodes, widths of the cells, rest, the others."""
-    stretch = float(lagrangian_of(model).held(p, 0, 0)[1]) / model.cable.length
-    return [
-        *kernels.table,
-        *(model.chain.places / model.cable.length),
-        *(1 / (np.diff(model.chain.cells, axis=1).ravel() * stretch)),
-        *resting_headings(model.chain, rest),
-        *_extra(model, p),
-    ]
+def meshes_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool
+) -> dict[str, Kernels]:
+    """Kernels of the mesh, by their name in C."""
+    return {"kernel": kernels_of(model, p, rest, inline)}
 
 
 def _most_steps(model: CableModel) -> int:
@@ -89,35 +88,20 @@ def _most_steps(model: CableModel) -> int:
     return (1 + 16 * guesses) * (100 + 6)
 
 
-def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> dict[str, str]:
+def values(model: CableModel, p: FloatArray, meshes: dict[str, Kernels]) -> dict[str, str]:
     """What the marks of the templates stand for."""
-    kernels = kernels_of(model, p, rest, inline)
-    functions, loops = kernels.to_c(model.yields)
-    chain, rows = model.chain, len(kernels.table)
+    kernels, chain = meshes["kernel"], model.chain
     count, gives = chain.n_nodes, [c > 0 for c in clamp_compliances(model, p)]
-    numbers = numbers_of(model, p, rest, kernels)
     return {
-        "N_HEADINGS": str(count),
-        "HEADINGS_ARE": chain.kind.nodes_are,
-        "LENGTH": c_number(float(lagrangian_of(model).held(p, 0, 0)[1])),
-        "WORKSPACE": str(_ARRAYS * (count + 1)),
+        "WORKSPACE": str(_NUMBERS * (count + 1)),
         "ELEMENTS": str(chain.n_slots),
         "FIRST": str(chain.layout.advancing[0]),
         "LOW": str(int(model.start == "clamped" and not gives[0])),
         "HIGH": str(count - int(model.end == "clamped" and not gives[1])),
         "GIVES_START": str(int(gives[0])),
         "GIVES_END": str(int(gives[1])),
-        "SMOOTH": str(int(chain.kind.smooth)),
-        "STRETCHES": str(int(model.extensible)),
-        "TABLE": table_to_c(numbers),
-        "PLACES": str(rows),
-        "WIDTHS": str(rows + count),
-        "RESTING": str(rows + 2 * count - 1),
-        "EXTRA": str(rows + 3 * count - 1),
         # Elimination and solution: about 30 operations a node; the trial point is evaluated, too.
         "OPERATIONS": str(2 * kernels.operations + 30 * count),
         "STEPS": str(_most_steps(model)),
-        "CODE": str(size_of_code([kernels], numbers)),
-        "KERNELS": functions,
-        "LOOPS": loops,
+        "HOLDERS": "" if kernels.ends is None else "    add_ends(q, w->table);",
     }

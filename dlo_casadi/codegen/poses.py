@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from dlo_casadi.codegen.records import pose_size
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.errors import DloError
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.ends import EndConditions
 
 FloatArray = NDArray[np.floating]
 
@@ -19,89 +21,75 @@ _BRANCHES = {None: 0, "ccw": 1, "cw": 2}
 _HINTS = {
     "unreachable": "is the end in metres?",
     "iteration_limit": "warm: the shape of a pose nearby.",
-    "not_finite": "finite numbers for end, start and headings.",
+    "not_finite": "finite numbers for start, end and directions.",
     "unstable": "another branch, or a pose nearby.",
+    "bad_argument": "in space a pose without a branch, and orientations that are not zero.",
     "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
     "turns_shed": "fewer turns, or the end farther from the start.",
 }
 
 
-def branch_number(branch: object) -> int:
-    """The C solver's number of a branch.
+def pose_table(
+    model: CableModel, poses: Sequence[Pose] | FloatArray, branch: object = None
+) -> tuple[FloatArray, int]:
+    """Poses (m, k) laid out as dlo_pose, and the C solver's number of their branch.
+
+    Parameters
+    ----------
+    poses : sequence of Pose, or (m, k)
+    branch : "ccw", "cw" or None
+        Of rows of numbers; a Pose has its own.
 
     Raises
     ------
     DloError
-        If it is neither "ccw", "cw" nor None.
+        If they are no poses of this cable, of several branches, or of an unknown one.
     """
+    if isinstance(poses, np.ndarray):
+        size = pose_size(model)
+        if poses.ndim != 2 or poses.shape[1] != size:
+            raise DloError(
+                f"poses: an array (m, {size}) as dlo_pose in the C header belongs here, found "
+                f"{poses.shape}"
+            )
+        return np.ascontiguousarray(poses, float), _branch_number(branch)
+    if branch is not None:
+        raise DloError(f"branch {branch!r} is for poses in an array; a Pose names its own")
+    table = np.array([_row(model, pose) for pose in poses]).reshape(-1, pose_size(model))
+    numbers = {_branch_number(pose.branch) for pose in poses} or {0}
+    if len(numbers) > 1:
+        found = ", ".join(sorted({str(pose.branch) for pose in poses}))
+        raise DloError(f"poses of one branch belong in one call, found {found}\n  Try: two calls.")
+    return table, numbers.pop()
+
+
+def _branch_number(branch: object) -> int:
     if branch is not None and not (isinstance(branch, str) and branch in _BRANCHES):
         raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
     return _BRANCHES[branch]
 
 
-def pose_table(ends: ArrayLike, start: ArrayLike, headings: ArrayLike) -> FloatArray:
-    """Poses (m, 6) of many ends (m, 2): start, end, headings.
-
-    Parameters
-    ----------
-    ends : (m, 2) or (2,) [m]
-    start : (2,) or (m, 2) [m]
-    headings : (2,) or (m, 2) [rad]
-
-    Raises
-    ------
-    DloError
-        If they are no numbers, or do not belong together.
-    """
-    held = np.atleast_2d(_numbers("ends", ends))
-    if held.ndim != 2 or held.shape[1] != 2:
-        raise DloError(f"ends must have the shape (m, 2), found {np.shape(ends)}")
-    poses = np.zeros((len(held), 6))
-    poses[:, 2:4] = held
-    for name, given, at in (("start", start, slice(0, 2)), ("headings", headings, slice(4, 6))):
-        values = _numbers(name, given)
-        if values.shape not in ((2,), held.shape):
-            raise DloError(
-                f"{name} must have the shape (2,) or, as the ends, {held.shape}; "
-                f"found {values.shape}"
-            )
-        poses[:, at] = values
-    return poses
+def _row(model: CableModel, pose: object) -> FloatArray:
+    if not isinstance(pose, Pose):
+        raise DloError(f"a Pose belongs here, found {pose!r}\n  Try: dlo_casadi.Pose(start, end)")
+    d = model.node.dimension
+    for name, place in (("start", pose.start), ("end", pose.end)):
+        if place is not None and np.shape(place) != (d,):
+            raise DloError(f"{pose.name}: {name} must have {d} numbers, found {place!r}")
+    try:
+        numbers = np.asarray([*pose.ends, pose.turns], float)
+    except (TypeError, ValueError):
+        raise DloError(f"numbers belong in a pose, found {pose!r}") from None
+    if len(numbers) != EndConditions.size(model.node) + 1:
+        raise DloError(f"{pose.name}: an orientation must have 4 numbers, found {pose!r}")
+    return numbers[: pose_size(model)]
 
 
-def one_pose(end: ArrayLike, start: ArrayLike, headings: ArrayLike) -> FloatArray:
-    """Pose (1, 6): start, end, headings, each of shape (2,).
-
-    Raises
-    ------
-    DloError
-        If one of them is not two numbers.
-    """
-    for name, given in (("end", end), ("start", start), ("headings", headings)):
-        shape = _numbers(name, given).shape
-        if shape != (2,):
-            many = " Try: solve_many for many ends." if name == "end" and len(shape) == 2 else ""
-            raise DloError(f"{name}: two numbers belong here, found the shape {shape}.{many}")
-    return pose_table(end, start, headings)
-
-
-def frame_poses(poses: Sequence[Pose]) -> FloatArray:
-    """Poses (m, 15) in space: start, end, orientations, turns."""
-    return np.array([[*pose.ends, pose.turns] for pose in poses], dtype=float).reshape(-1, 15)
-
-
-def no_equilibrium(status: str, start: FloatArray, end: FloatArray, length: float) -> str:
+def no_equilibrium(status: str, pose: Pose, length: float) -> str:
     """Message on a pose that ends in a status other than ok."""
-    here, there = (", ".join(f"{x:.4f}" for x in place) for place in (start, end))
+    start, end = (", ".join(f"{x:.4f}" for x in place or ()) for place in (pose.start, pose.end))
     hint = _HINTS.get(status)
     return (
-        f"no equilibrium: {status} with the end at ({there}) m, the start at ({here}) m; the cable "
-        f"is {length:.4f} m long." + (f"\n  Try: {hint}" if hint else "")
+        f"no equilibrium: {status} with the end {f'at ({end}) m' if end else 'free'}, the start at "
+        f"({start}) m; the cable is {length:.4f} m long." + (f"\n  Try: {hint}" if hint else "")
     )
-
-
-def _numbers(name: str, values: Any) -> FloatArray:
-    try:
-        return np.asarray(values, float)
-    except (TypeError, ValueError):
-        raise DloError(f"{name}: numbers belong here, found {values!r}") from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,29 +29,34 @@ class Shape:
 
     Parameters
     ----------
-    points : (n + 1, 2) [m]
-    headings : (n_nodes,) [rad]
-    lam_start, lam : (2,) [N]
-        Force of the cable on whatever holds its start and its end.
-    moments : (2,) [N m]
+    points : (n + 1, dimension) [m]
+    x : (n_nodes, coordinates)
+        States of the nodes: in a plane headings [rad], in space unit quaternions (x, y, z, w).
+    start_force, end_force : (dimension,) [N]
+        Of the cable on whatever holds its start and its end.
+    moments : (2, increment) [N m]
+        Of the cable on its clamps (start, end), in space about the world's axes.
     energy : float [J]
     min_bend_radius : float [m]
+    max_twist : float [1/m]
+        Largest twist of an element, with its sign; 0 in a plane.
     end_error : float [m]
     imbalance : float [N m]
     iterations : int
     turn : int
-        +1 counter-clockwise from start to end, -1 clockwise.
+        +1 counter-clockwise from start to end, -1 clockwise; 0 in space.
     status : str
         One of STATUSES; all numbers are zero unless it is "ok".
     """
 
     points: FloatArray
-    headings: FloatArray
-    lam_start: FloatArray
-    lam: FloatArray
+    x: FloatArray
+    start_force: FloatArray
+    end_force: FloatArray
     moments: FloatArray
     energy: float
     min_bend_radius: float
+    max_twist: float
     end_error: float
     imbalance: float
     iterations: int
@@ -61,84 +65,37 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class SpaceShape:
-    """Shape of a cable in space in one pose, as in the C header.
-
-    Parameters
-    ----------
-    points : (n + 1, 3) [m]
-    frames : (n + 1, 4)
-        Material frames of the nodes: unit quaternions (x, y, z, w).
-    lam_start, lam : (3,) [N]
-        Force of the cable on whatever holds its start and its end.
-    moments : (2, 3) [N m]
-        Of the cable on its clamps, about the world's axes.
-    energy : float [J]
-    min_bend_radius : float [m]
-    max_twist : float [1/m]
-        Largest twist of an element, with its sign.
-    end_error : float [m]
-    imbalance : float [N m]
-    iterations : int
-    status : str
-        One of STATUSES; all numbers are zero unless it is "ok".
-    """
-
-    points: FloatArray
-    frames: FloatArray
-    lam_start: FloatArray
-    lam: FloatArray
-    moments: FloatArray
-    energy: float
-    min_bend_radius: float
-    max_twist: float
-    end_error: float
-    imbalance: float
-    iterations: int
-    status: str
-
-
-S_co = TypeVar("S_co", bound=Shape | SpaceShape, covariant=True)
-
-
-@dataclass(frozen=True)
-class ShapePath(Generic[S_co]):
+class ShapePath:
     """Shapes along a path of poses.
 
     `shapes` has one shape per pose; `first_jump` is the first pose that cannot be reached on
     the held branch, None if there is none.
     """
 
-    shapes: tuple[S_co, ...]
+    shapes: tuple[Shape, ...]
     first_jump: int | None
 
 
 @dataclass(frozen=True)
 class Slope:
-    """Derivatives by (end x, end y, start heading, end heading), last index.
+    """Derivatives of a shape by k numbers of its pose, last index.
 
-    `points` (n + 1, 2, 4), `headings` (n_nodes, 4), `lam` (2, 4), `moments` (2, 4),
-    `min_bend_radius` (4,).
+    In a plane by end x, y [m], start heading, end heading [rad], k = 4. In space by start x, y, z
+    [m], the rotation of the start about the world's axes x, y, z [rad], and the same of the end,
+    k = 12.
+
+    Parameters
+    ----------
+    points : (n + 1, dimension, k)
+    rotations : (n_nodes, increment, k)
+        Of the nodes, in space about the world's axes.
+    end_force : (dimension, k)
+    moments : (2, increment, k)
+    min_bend_radius : (k,)
     """
 
     points: FloatArray
-    headings: FloatArray
-    lam: FloatArray
-    moments: FloatArray
-    min_bend_radius: FloatArray
-
-
-@dataclass(frozen=True)
-class SpaceSlope:
-    """Derivatives of a shape in space by the pose, last index (12,).
-
-    By start x, y, z [m], turn of the start about the world's axes x, y, z [rad], and the same of
-    the end. `points` (n + 1, 3, 12), `turns` (n + 1, 3, 12) of the frames about the world's axes,
-    `lam` (3, 12), `moments` (2, 3, 12), `min_bend_radius` (12,).
-    """
-
-    points: FloatArray
-    turns: FloatArray
-    lam: FloatArray
+    rotations: FloatArray
+    end_force: FloatArray
     moments: FloatArray
     min_bend_radius: FloatArray

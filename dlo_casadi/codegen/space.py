@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.codegen.kernels import (
-    Kernels,
-    c_number,
-    kernels_of,
-    size_of_code,
-    statements,
-    table_to_c,
-    with_helpers,
-)
+from dlo_casadi.codegen.kernels import Kernels, kernels_of
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
@@ -31,14 +20,18 @@ _NUMBERS, _COARSE_SHAPES = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 8
 # clamped problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than if all first
 # guesses are followed on the fine mesh.
 LEAST_COARSE, COARSENING = 6, 2.0
-# Newton steps for a part of a path; the template checks the number.
+# Newton steps for a part of a path.
 TRY_STEPS = 12
 # Parts of the templates.
 TEXTS = {
+    "METHOD": """\
+ * First guesses are followed on a coarse mesh; the shapes that they lead to are carried over.""",
     "WHERE": "in space",
     "ANGLES": """Vectors are in world axes, orientations are unit quaternions (x, y, z, w).""",
-    "COLUMNS": "12",
-    "NODES": "",
+    "STATES_ARE": "material frames of the nodes, unit quaternions (x, y, z, w)",
+    "COLUMNS_ARE": """\
+start x, y, z [m], rotation of the start
+ * about the world's axes x, y, z [rad], then the same six of the end.""",
     "START_FRAME": "start_orientation",
     "END_FRAME": "end_orientation",
     "BRANCH": """\
@@ -92,7 +85,7 @@ def _clamps(model: CableModel, p: FloatArray) -> FloatArray:
     return found[3:]
 
 
-def _extra(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
+def numbers_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
     """Numbers of the cable that no kernel holds, in the order of the template's macros."""
     length = float(lagrangian_of(model).held(p, 0, 0)[1])
     widths = np.diff(model.chain.cells, axis=1).ravel()
@@ -108,24 +101,28 @@ def _extra(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
 
 
 def meshes_of(
-    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool
 ) -> dict[str, Kernels]:
-    """Kernels of the fine mesh and, where there is one, of the coarse mesh, by their names in C."""
+    """Kernels of the fine mesh and, where there is one, of the coarse mesh, by their names in C.
+
+    Raises
+    ------
+    DloError
+        If springs hold the ends, or clamps give way.
+    """
     found = {"kernel": kernels_of(model, p, rest, inline)}
+    if found["kernel"].ends is not None or lagrangian_of(model).compliant:
+        raise DloError(
+            "no solver can be generated for a cable in space whose ends are held by springs, or by "
+            "clamps that give way\n"
+            "  Try: dlo predict, or dlo_casadi.predict, which know them."
+        )
     count = coarse_elements(model)
     if count:
         coarse = model.with_mesh(count, "arc")
         means = coarse_rest(model, coarse, rest)
         found["coarse_kernel"] = kernels_of(coarse, p, means, inline)
     return found
-
-
-def numbers_of(
-    model: CableModel, p: FloatArray, rest: FloatArray, meshes: dict[str, Kernels]
-) -> list[float]:
-    """The solver's table: numbers of the kernels of both meshes, then the others."""
-    rows = [number for kernels in meshes.values() for number in kernels.table]
-    return [*rows, *_extra(model, p, rest)]
 
 
 def _most_steps(model: CableModel) -> int:
@@ -138,57 +135,16 @@ def _most_steps(model: CableModel) -> int:
     return (1 + 3 * guesses) * 80
 
 
-def values(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> dict[str, str]:
+def values(model: CableModel, p: FloatArray, meshes: dict[str, Kernels]) -> dict[str, str]:
     """What the marks of the templates stand for."""
-    meshes, count = meshes_of(model, p, rest, inline), coarse_elements(model)
-    if meshes["kernel"].ends is not None or lagrangian_of(model).compliant:
-        raise DloError(
-            "no solver can be generated for a cable in space whose ends are held by springs, or by "
-            "clamps that give way\n"
-            "  Try: dlo predict, or dlo_casadi.predict, which know them."
-        )
-    functions: list[str] = []
-    loops: dict[str, str] = {}
-    at = 0
-    for name, kernels in meshes.items():
-        functions += [
-            _kernel_text(f"{name}_{k}", kernel.members, kernel.function)
-            for k, kernel in enumerate(kernels.slots)
-        ]
-        call = f"{name}_{{k}}(w->x + 4 * j, w->lam, {{row}}, table, w->slot + SLOT * j)"
-        loops[name] = "\n".join(kernels.loops(call, at))
-        at += len(kernels.table)
-    numbers = numbers_of(model, p, rest, meshes)
+    count = coarse_elements(model)
     return {
-        "LENGTH": c_number(float(lagrangian_of(model).held(p, 0, 0)[1])),
-        "WORKSPACE": str(_NUMBERS * (model.n + 1) + 4 * _COARSE_SHAPES * (count + 1)),
+        "WORKSPACE": str(_NUMBERS * (model.n + 2) + 4 * _COARSE_SHAPES * (count + 1)),
         "COARSE": str(count),
-        "REACHES": str(int(not model.extensible)),
-        "TABLE": table_to_c(numbers),
-        "EXTRA": str(at),
+        "FIRST": "0",
+        "GIVES_START": "0",
+        "GIVES_END": "0",
         # Elimination and solution: about 500 operations a node.
         "OPERATIONS": str(meshes["kernel"].operations + 500 * (model.n + 1)),
         "STEPS": str(_most_steps(model)),
-        "CODE": str(size_of_code(meshes.values(), numbers)),
-        "KERNELS": with_helpers(functions),
-        "LOOPS": loops["kernel"],
-        "COARSE_LOOPS": re.sub("^", "    ", loops.get("coarse_kernel", ""), flags=re.MULTILINE),
     }
-
-
-def _kernel_text(name: str, members: tuple[int, int], function: ca.Function) -> str:
-    first, last = members
-    targets = {(0, i): f"out[{i}] =" for i in range(function.nnz_out(0))}
-    body = statements(function, ("x", "lam", "row", "table"), targets)
-    return "\n".join(
-        [
-            f"/* Slots {first} to {last - 1}. */",
-            f"static void {name}(const double *x, const double *lam, const double *row,",
-            f"{' ' * len(f'static void {name}(')}const double *table, double *restrict out)",
-            "{",
-            body,
-            "    (void)x, (void)lam, (void)row, (void)table;",
-            "}",
-            "",
-        ]
-    )

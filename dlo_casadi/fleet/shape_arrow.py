@@ -29,9 +29,9 @@ def _pose_columns(model: CableModel) -> list[str]:
 def _result_columns(model: CableModel) -> dict[str, tuple[str, int | None]]:
     """Column -> field of a part and its component."""
     columns: dict[str, tuple[str, int | None]] = {"energy": ("energy", None)}
-    for side, name in (("start", "lam_start"), ("end", "lam")):
+    for side in ("start", "end"):
         for k, axis in enumerate("xy"):
-            columns[f"force_on_{side}_{axis}"] = (name, k)
+            columns[f"force_on_{side}_{axis}"] = (f"{side}_force", k)
     for k, side in enumerate(("start", "end")):
         if getattr(model, side) == "clamped":
             columns[f"moment_on_{side}"] = ("moments", k)

@@ -81,8 +81,8 @@ def part_type(n: int) -> np.dtype[Any]:
             ("pose", "<f8", 6),
             ("status", "i1"),
             ("energy", "<f8"),
-            ("lam_start", "<f8", 2),
-            ("lam", "<f8", 2),
+            ("start_force", "<f8", 2),
+            ("end_force", "<f8", 2),
             ("moments", "<f8", 2),
             ("min_bend_radius", "<f8"),
             ("points", "<f4", (n + 1, 2)),
@@ -94,13 +94,11 @@ def solve_chunk(plan: Plan, chunk: Chunk) -> int:
     """Solve a chunk, keep it durably and return how many poses have a shape."""
     solver = _solver(plan)
     poses = chunk.poses
-    records, statuses = solver.solve_many(
-        poses[:, 2:4], start=poses[:, :2], headings=poses[:, 4:], branch=plan.branch
-    )
+    records, statuses = solver.solve_many(poses, branch=plan.branch)
     part = np.zeros(len(poses), part_type(plan.model.n))
     part["pose"], part["status"] = poses, statuses
-    for name in ("energy", "lam_start", "lam", "moments", "min_bend_radius", "points"):
-        part[name] = records[name]
+    for name in ("energy", "start_force", "end_force", "moments", "min_bend_radius", "points"):
+        part[name] = records[name].reshape(part[name].shape)
     write_file(plan.part(chunk.index), lambda stream: np.save(stream, part))
     return int((statuses == 0).sum())
 

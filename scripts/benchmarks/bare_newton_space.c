@@ -6,16 +6,15 @@ static int bare_newton(solver_t *w)
     double c[3], size;
     int count, i, k;
     for (count = 1; count < 30; ++count) {
-        evaluate(w);
-        (void)factor(w, 0.0);
-        for (i = low_node(); i <= high_node(w); ++i) {
-            slope_of(w, i, w->step + 3 * i);
+        evaluate(w, &w->at);
+        (void)factor(w, &w->at, 0.0);
+        for (i = LOW; i < HIGH; ++i) {
             for (k = 0; k < 3; ++k)
-                w->step[3 * i + k] = -w->step[3 * i + k];
+                w->step[3 * i + k] = -slope_at(&w->at, i, k);
         }
         for (k = 0; k < 3; ++k)
-            c[k] = -w->c[k];
-        solve_with(w, c);
+            c[k] = -w->at.c[k];
+        solve_with(w, w->step, c, w->step, w->dlam);
         size = largest_step(w);
         move(w, 1.0);
         if (size < 1e-6)

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.space_ipopt import Ipopt
-from dlo_casadi.codegen import plane, space
-from dlo_casadi.codegen.generate import generate
-from dlo_casadi.codegen.kernels import kernels_of
+from dlo_casadi.codegen.generate import generate, table_of
 from dlo_casadi.codegen.library import compile_library
-from dlo_casadi.codegen.poses import frame_poses
+from dlo_casadi.codegen.poses import pose_table
 from dlo_casadi.codegen.records import shape_record
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
@@ -99,7 +97,7 @@ class SpaceProblem:
     @property
     def table(self) -> FloatArray:
         """All poses as the C solver takes them."""
-        return frame_poses(self.poses)
+        return pose_table(self.model, self.poses)[0]
 
 
 @lru_cache
@@ -168,13 +166,13 @@ def _is_minimum(
 
 def check_in_space(problem: SpaceProblem, shape: NDArray[np.void], i: int) -> tuple[bool, float]:
     """Whether a shape is a stable equilibrium by the Python model, and its worst end error."""
-    x = shape["frames"]
+    x = shape["x"]
     # The solver's moments are about the world's axes, multipliers about the nodes' own.
     moments = [
         Rotation.from_quat(frame).inv().apply(moment)
         for frame, moment in zip((x[0], x[-1]), shape["moments"], strict=True)
     ]
-    return _is_minimum(problem, i, x, np.concatenate([shape["lam"], *moments]))
+    return _is_minimum(problem, i, x, np.concatenate([shape["end_force"], *moments]))
 
 
 def compare_in_space(problem: SpaceProblem, shape: NDArray[np.void], i: int, ipopt: Ipopt) -> str:
@@ -277,10 +275,7 @@ class AnyCable:
 
     def table(self, problem: Problem | SpaceProblem) -> FloatArray:
         """Numbers of a cable, laid out as the compiled code expects."""
-        given = problem.model, problem.p, problem.rest
-        if problem.model.in_space:
-            return np.array(space.numbers_of(*given, space.meshes_of(*given, inline=False)))
-        return np.array(plane.numbers_of(*given, kernels_of(*given, inline=False)))
+        return np.array(table_of(problem.model, problem.p, problem.rest))
 
     def solve(
         self,
@@ -292,7 +287,7 @@ class AnyCable:
         table, poses = self.table(problem), problem.table
         warm = np.zeros(len(poses), self.record)
         if starts is not None:
-            warm["headings"] = starts
+            warm["x"][..., 0] = starts
         shapes = np.zeros(len(poses), self.record)
         statuses = np.zeros(len(poses), np.intc)
         begin = perf_counter()
@@ -309,10 +304,10 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
 
     Joints at their bound count as conditions.
     """
-    model, phi = problem.model, shape["headings"]
+    model, phi = problem.model, shape["x"][:, 0]
     pose = Pose((0.0, 0.0), (float(end[0]), float(end[1])))
     given = Given.of(model.nominal, problem.rest, pose.vector[None])
-    shapes = Shapes.declared(phi[None, :, None], shape["lam"][None])
+    shapes = Shapes.declared(phi[None, :, None], shape["end_force"][None])
     _, slope, matrix = assembly_of(model).balance(shapes, given)
     force = slope.x[0, :, 0, 0]
     active = np.flatnonzero(np.abs(np.diff(phi)) > JOINT_BOUND - 1e-7)

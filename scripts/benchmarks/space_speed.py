@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.random_cables import SpaceProblem
 from benchmarks.speed import FLAGS, HERE, summary
-from dlo_casadi.codegen import CompiledSpaceSolver, generate
+from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.codegen.library import compile_library
-from dlo_casadi.codegen.poses import frame_poses
+from dlo_casadi.codegen.poses import pose_table
 from dlo_casadi.codegen.records import shape_record
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
@@ -70,7 +70,7 @@ def problem(n: int, element: str, bent: float = 1.0) -> SpaceProblem:
 def reference(bent: float = 1.0) -> tuple[FloatArray, ...]:
     """Points of all poses on the fine mesh."""
     fine = problem(FINE, "quadratic", bent)
-    solver = CompiledSpaceSolver(fine.model, fine.model.nominal, fine.rest)
+    solver = CompiledSolver(fine.model, fine.model.nominal, fine.rest)
     return tuple(solver.solve(pose).points for pose in fine.poses)
 
 
@@ -118,7 +118,7 @@ class Timed:
     def bare(self, pose: Pose, which: int, warm: NDArray[np.void] | None) -> NDArray[np.void]:
         """Shape to which the bare method leads; zeros if it leads nowhere."""
         out = np.zeros(1, shape_record(self.own.model))
-        at = frame_poses([pose])
+        at, _ = pose_table(self.own.model, [pose])
         self._c.dlo_bare(
             *(at.ctypes.data, which, None if warm is None else warm.ctypes.data),
             *(out.ctypes.data, self._work.ctypes.data),
@@ -140,7 +140,7 @@ class Timed:
         repeats: int,
     ) -> tuple[FloatArray, NDArray[np.void]]:
         taken, out = np.zeros(repeats), np.zeros(1, shape_record(self.own.model))
-        at = frame_poses([pose])
+        at, _ = pose_table(self.own.model, [pose])
         for _ in range(2):  # the first round fills the caches
             clock(
                 *(at.ctypes.data, which, None if warm is None else warm.ctypes.data, repeats),

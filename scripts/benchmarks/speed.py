@@ -168,7 +168,7 @@ def by_casadi(n: int, kind: str, repeats: int) -> dict[str, Any]:
         p = np.concatenate(
             [model.nominal, np.zeros(n - 1), Pose((0.0, 0.0), end).vector, np.zeros(6)]
         )
-        good = reference.solve(end, branch="ccw").headings
+        good = reference.solve(Pose((0.0, 0.0), tuple(end), branch="ccw")).x[:, 0]
         # Sixteen at a time, so that no conversion of arguments is timed.
         tiled = {
             name: np.tile(value, (16, 1)).T
@@ -197,7 +197,7 @@ def by_cobyla(n: int) -> dict[str, Any]:
     reference = CompiledSolver(model, model.nominal, np.zeros(n - 1))
     seconds, reached = [], 0
     for end in poses()[:4]:
-        good = reference.solve(end, branch="ccw").headings
+        good = reference.solve(Pose((0.0, 0.0), tuple(end), branch="ccw")).x[:, 0]
         start = arc_headings(model.chain.places, CABLE.length, np.zeros(2), end, 1)
 
         def energy(theta: FloatArray) -> float:
@@ -234,10 +234,11 @@ def throughput(n: int = 20, threads: int = 2, count: int = 120_000) -> dict[str,
     rng = np.random.default_rng(0)
     radius = 0.995 * CABLE.length * np.sqrt(rng.uniform(size=count))
     angle = rng.uniform(-np.pi, np.pi, size=count)
-    ends = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    table = np.zeros((count, 6))  # as dlo_pose: start, end, headings
+    table[:, 2:4] = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     out: dict[str, float] = {}
     for branch in ("ccw", None):
-        parts = np.array_split(ends, threads)
+        parts = np.array_split(table, threads)
         failed: list[int] = []
 
         def work(part: FloatArray, branch: Any = branch, failed: list[int] = failed) -> None:

@@ -55,11 +55,11 @@ def simulated(poses: int) -> list[MeasuredPose]:
         radius = published.LENGTH * np.sqrt(rng.uniform(0.2, 0.9))
         angle = rng.uniform(-0.45 * np.pi, 0.1 * np.pi)
         end = (float(radius * np.cos(angle)), float(radius * np.sin(angle)))
-        shape = solver.solve(end, branch="ccw", throw=False)
+        pose = Pose((0.0, 0.0), end, branch="ccw", name=f"{len(out)}")
+        shape = solver.solve(pose, throw=False)
         if shape.status != "ok":
             continue
-        pose = Pose((0.0, 0.0), end, branch="ccw", name=f"{len(out)}")
-        shapes = Shapes.declared(shape.headings[None, :, None], shape.lam[None])
+        shapes = Shapes.declared(shape.x[None], shape.end_force[None])
         given = Given.of(model.nominal, rest, pose.vector[None])
         z = assembly_of(model).curve(shapes, given)[0]
         s = np.linspace(0.01, 0.99, POINTS) * published.LENGTH

@@ -95,7 +95,7 @@ def by_c(element: Method, n: int, truth: list[FloatArray]) -> tuple[float, float
     """Mean time [s] of the generated solver over the poses, and its largest RMS error [m]."""
     model, rest = _model(element, n)
     solver = CompiledSolver(model, model.nominal, rest)
-    ends = np.array([pose.end for pose in published.poses()])
+    ends = np.array([pose.ends for pose in published.poses()])
     many = np.tile(ends, (SOLVES // len(ends), 1))
     seconds = []
     for _ in range(3):
@@ -106,17 +106,16 @@ def by_c(element: Method, n: int, truth: list[FloatArray]) -> tuple[float, float
         raise RuntimeError(f"the C solver failed in {int((statuses != 0).sum())} solves")
     curves = []
     for pose, record in zip(published.poses(), found, strict=False):
-        shape = solver.solve(pose.end, branch="ccw")
-        curves.append(_seen(model, rest, pose, record["headings"], shape.lam))
+        curves.append(_seen(model, rest, pose, record["x"], record["end_force"]))
     return min(seconds), _largest(curves, truth)
 
 
 def _seen(
-    model: CableModel, rest: FloatArray, pose: Pose, phi: FloatArray, lam: FloatArray
+    model: CableModel, rest: FloatArray, pose: Pose, x: FloatArray, lam: FloatArray
 ) -> NodeCurve:
     """Curve of given headings."""
     given = Given.of(model.nominal, rest, pose.vector[None])
-    shapes = Shapes.declared(phi[None, :, None], lam[None])
+    shapes = Shapes.declared(x[None], lam[None])
     return NodeCurve.of(published.LENGTH, assembly_of(model).curve(shapes, given)[0])
 
 

@@ -137,7 +137,6 @@ static dlo_pose pose_of(const Scene &scene, const ob::State *state)
 }
 
 static dlo_branch branch_of(const std::string &) { return DLO_LOWEST; }
-static double twist_of(const dlo_shape &shape) { return std::fabs(shape.max_twist); }
 #else
 using Space = ob::RealVectorStateSpace;
 static std::shared_ptr<Space> make_space() { return std::make_shared<Space>(D); }
@@ -155,7 +154,6 @@ static dlo_pose pose_of(const Scene &, const ob::State *state)
 }
 
 static dlo_branch branch_of(const std::string &word) { return word == "cw" ? DLO_CW : DLO_CCW; }
-static double twist_of(const dlo_shape &) { return 0.0; }
 #endif
 
 // The cable in the scene: one workspace, so one object for each thread.
@@ -214,7 +212,7 @@ public:
     static double force(const dlo_shape &shape)
     {
         double square = 0.0;
-        for (double part : shape.lam_end)
+        for (double part : shape.end_force)
             square += part * part;
         return std::sqrt(square);
     }
@@ -237,7 +235,7 @@ private:
             return "bend radius";
         if (force(shape) > scene_.force)
             return "force";
-        if (twist_of(shape) > scene_.twist)
+        if (std::fabs(shape.max_twist) > scene_.twist)
             return "twist";
         return distance(shape) < scene_.clearance ? "clearance" : nullptr;
     }
@@ -351,7 +349,7 @@ int main(int argc, char **argv)
                 for (double number : point)
                     std::printf("%.6f ", number);
             std::printf("%.6f %.6f %.6f %.6f\n", shape.min_bend_radius, Cable::force(shape),
-                        twist_of(shape), cable.distance(shape));
+                        std::fabs(shape.max_twist), cable.distance(shape));
         }
     }
     return 0;

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from plan import Scene, draw, example, obstacles_of, read_scene, scene_of
 
-from dlo_casadi.codegen import CompiledSolver, CompiledSpaceSolver
+from dlo_casadi.codegen import CompiledSolver, Shape
 from dlo_casadi.equilibrium.pose import Pose
 
 try:
@@ -37,24 +37,16 @@ class InPlane:
         """Set a state."""
         state[0], state[1] = numbers
 
-    def at(self, state: Any) -> list[float]:
+    def at(self, state: Any) -> Pose:
         """What the solver is asked for."""
-        return list(state[0:2])
-
-    def solve(self, at: list[float]) -> Any:
-        """Shape of the cable, whatever its status."""
-        return self.solver.solve(at, branch="ccw", throw=False)
-
-    def path(self, way: list[list[float]]) -> Any:
-        """Shapes along a way."""
-        return self.solver.path(way, branch="ccw")
+        return Pose((0.0, 0.0), (state[0], state[1]), branch="ccw")
 
 
 class InSpace:
     """The gripper's place and orientation, in SE(3); the cable is clamped."""
 
     def __init__(self, held: list[float]) -> None:
-        self.space, self.solver = ob.SE3StateSpace(), CompiledSpaceSolver(*example(in_space=True))
+        self.space, self.solver = ob.SE3StateSpace(), CompiledSolver(*example(in_space=True))
         self.held = tuple(held)
 
     def put(self, state: Any, numbers: list[float]) -> None:
@@ -69,14 +61,6 @@ class InSpace:
         last = (turn.x, turn.y, turn.z, turn.w)
         return Pose((0.0, 0.0, 0.0), place, start_orientation=self.held, end_orientation=last)
 
-    def solve(self, at: Pose) -> Any:
-        """Shape of the cable, whatever its status."""
-        return self.solver.solve(at, throw=False)
-
-    def path(self, way: list[Pose]) -> Any:
-        """Shapes along a way."""
-        return self.solver.path(way)
-
 
 class Leader:
     """The cable in the scene: which states and motions of the gripper are allowed."""
@@ -86,23 +70,23 @@ class Leader:
         self.obstacles = obstacles_of(scene, gripper.solver.model.node.dimension)
         self.scene = {name: numbers[0][0] for name, numbers in scene.items()}
 
-    def limit(self, shape: Any) -> str | None:
+    def limit(self, shape: Shape) -> str | None:
         """The limit that a shape does not keep."""
         scene = self.scene
         if shape.status != "ok":
             return "no equilibrium"
         if shape.min_bend_radius < scene.get("bend_radius", 0.0):
             return "bend radius"
-        if np.linalg.norm(shape.lam) > scene.get("force", np.inf):
+        if np.linalg.norm(shape.end_force) > scene.get("force", np.inf):
             return "force"
-        if abs(getattr(shape, "max_twist", 0.0)) > scene.get("twist", np.inf):
+        if abs(shape.max_twist) > scene.get("twist", np.inf):
             return "twist"
         gap = self.gripper.solver.clearance(shape, self.obstacles)
         return "clearance" if gap.distance < scene.get("clearance", 0.0) else None
 
     def place(self, state: Any) -> bool:
         """Whether the gripper may be in a state."""
-        return self._judge(self.limit(self.gripper.solve(self.gripper.at(state))), "state")
+        return self._judge(self.limit(self._shape(self.gripper.at(state))), "state")
 
     def lead(self, start: Any, end: Any) -> tuple[Any, ...]:
         """Shapes along a motion; none if it is not possible."""
@@ -111,15 +95,19 @@ class Leader:
         for u in np.linspace(0.0, 1.0, count):
             space.interpolate(start, end, u, state)
             way.append(gripper.at(state))
-        path = gripper.path(way)
+        path = gripper.solver.path(way)
         why = "snap" if path.first_jump is not None else None
         why = why or next(filter(None, map(self.limit, path.shapes)), None)
         if not why:
             # The shape that the motion leads to must be the one that the state stands for.
-            own = gripper.solve(way[-1])
+            own = self._shape(way[-1])
             far = np.abs(own.points - path.shapes[-1].points).max() > 1e-6
             why = "another shape" if far else None
         return path.shapes if self._judge(why, "motion") else ()
+
+    def _shape(self, pose: Pose) -> Shape:
+        """Shape of the cable, whatever its status."""
+        return self.gripper.solver.solve(pose, throw=False)
 
     def _judge(self, why: str | None, what: str) -> bool:
         if why:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.codegen import Capsule, CompiledSolver, CompiledSpaceSolver, HalfSpace
+from dlo_casadi.codegen import Capsule, CompiledSolver, HalfSpace
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.errors import DloError
@@ -30,7 +30,7 @@ FLOOR = HalfSpace((0.0, 0.0, -0.3), (0.0, 0.0, 2.0))
 def space():
     cable = Cable(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
     model = CableModel(cable, 12, "quadratic", "clamped", "clamped", gravity=(0.0, 0.0, -9.81))
-    return CompiledSpaceSolver(model, model.nominal, np.zeros(model.chain.n_rests), flags=("-O0",))
+    return CompiledSolver(model, model.nominal, np.zeros(model.chain.n_rests), flags=("-O0",))
 
 
 def fine(shape):
@@ -38,7 +38,7 @@ def fine(shape):
     from scipy.interpolate import CubicHermiteSpline
 
     s = np.linspace(0.0, 0.6, len(shape.points))
-    tangents = Rotation.from_quat(shape.frames).apply([1.0, 0.0, 0.0])
+    tangents = Rotation.from_quat(shape.x).apply([1.0, 0.0, 0.0])
     return CubicHermiteSpline(s, shape.points, tangents)(np.linspace(0.0, 0.6, 20001))
 
 
@@ -93,11 +93,14 @@ def test_in_a_plane(element):
     solver = CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells), flags=("-O0",))
     pose = np.array([0.5, 0.1, 0.4])
 
+    def posed(at):
+        return Pose((0.0, 0.0), tuple(at[:2]), start_heading=at[2])
+
     def solved(at, warm=None):
-        return solver.solve(at[:2], headings=(at[2], 0.0), warm=warm)
+        return solver.solve(posed(at), warm=warm)
 
     shape = solved(pose)
-    slope = solver.sensitivity(shape, pose[:2], headings=(pose[2], 0.0))
+    slope = solver.sensitivity(shape, posed(pose))
     ball, floor = Capsule((0.3, 0.4), (0.3, 0.4), 0.05), HalfSpace((0.0, -0.5), (0.0, 1.0))
     for obstacle in (ball, floor):
         gap = solver.clearance(shape, [obstacle], slope)

@@ -28,7 +28,7 @@ int dlo_guess(const dlo_pose *pose, int which, double *headings, double *work)
     if (which >= GUESSES || take(&w, pose) != DLO_OK)
         return 0;
     there = first_guess(&w, which);
-    for (i = 0; i < DLO_N_HEADINGS; ++i)
+    for (i = 0; i < DLO_NODES; ++i)
         headings[i] = w.at.x[i];
     return there;
 }

@@ -7,7 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from dlo_casadi.codegen import STATUSES, CompiledSolver, generate, library
+from dlo_casadi.codegen import STATUSES, CompiledSolver, generate, library, poses
 from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, EndOffset, ImageScale
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -47,6 +47,10 @@ def clamped():
     return CompiledSolver(*cable("arc", "clamped", "clamped", effects=(AxialStretch(),)))
 
 
+def at(end, *, start=(0.0, 0.0), headings=(None, None), branch=None):
+    return Pose(start, end, *headings, branch=branch)
+
+
 def all_zero(shape):
     values = [v for name, v in vars(shape).items() if name != "status"]
     return not any(np.any(value) for value in values)
@@ -62,57 +66,77 @@ def all_zero(shape):
     ],
 )
 def test_wrong_ends_give_a_status_and_zeros(links, end, status):
-    shape = links.solve(end, throw=False)
+    shape = links.solve(at(end), throw=False)
     assert shape.status == status
     assert all_zero(shape)
     with pytest.raises(EquilibriumError, match=status) as caught:
-        links.solve(end)
-    hint = {"not_finite": "finite numbers for end", "unreachable": "is the end in metres?"}
+        links.solve(at(end))
+    hint = {"not_finite": "finite numbers for start, end", "unreachable": "is the end in metres?"}
     assert hint[status] in caught.value.message
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"end": "ab"}, "end: numbers belong here, found 'ab'"),
-        ({"end": [(0.3, -0.1), (0.4, 0.1)]}, r"found the shape \(2, 2\). Try: solve_many"),
-        ({"start": (1, 2, 3)}, r"start: two numbers belong here, found the shape \(3,\)"),
+        ({"end": "ab"}, "pose: end must have 2 numbers, found 'ab'"),
+        ({"end": ("a", "b")}, r"numbers belong in a pose, found .*\('a', 'b'\)"),
+        ({"end": [(0.3, -0.1), (0.4, 0.1)]}, "end must have 2 numbers"),
+        ({"start": (1, 2, 3)}, r"start must have 2 numbers, found \(1, 2, 3\)"),
         ({"branch": "left"}, "branch must be 'ccw', 'cw' or None, found 'left'"),
         ({"branch": ["cw"]}, "branch must be"),
-        ({"warm": 3}, "warm: a shape of this solver, with 10 headings"),
     ],
 )
 def test_what_is_no_pose_is_refused(links, arguments, message):
     with pytest.raises(DloError, match=message):
-        links.solve(**({"end": (0.3, -0.1)} | arguments))
+        links.solve(at(**({"end": (0.3, -0.1)} | arguments)))
 
 
-def test_headings_must_be_as_many_as_ends(links):
-    with pytest.raises(DloError, match=r"shape \(2,\) or, as the ends, \(3, 2\); found \(2, 2\)"):
-        links.solve_many([(0.1, 0.2)] * 3, headings=[(0, 0)] * 2)
+def test_a_place_is_no_pose_and_three_is_no_shape(links):
+    with pytest.raises(DloError, match=r"a Pose belongs here, found \(0.3, -0.1\)\n  Try: dlo"):
+        links.solve((0.3, -0.1))
+    with pytest.raises(DloError, match=r"shape of this solver, with x of the shape \(10, 1\)"):
+        links.solve(at((0.3, -0.1)), warm=3)
+
+
+def test_many_poses_are_of_one_branch_or_rows_of_numbers(links):
+    ends = [(0.3, -0.1), (0.4, 0.1)]
+    way = [at(end, branch="cw") for end in ends]
+    rows = np.array([pose.ends for pose in way])
+    shapes, _ = links.solve_many(way)
+    assert shapes.tobytes() == links.solve_many(rows, branch="cw")[0].tobytes()
+    assert set(shapes["turn"]) == {-1}
+    with pytest.raises(DloError, match="one branch belong in one call, found ccw, cw"):
+        links.solve_many([*way, at((0.3, 0.1), branch="ccw")])
+    with pytest.raises(DloError, match="'cw' is for poses in an array"):
+        links.solve_many(way, branch="cw")
+    with pytest.raises(DloError, match=r"an array \(m, 6\) as dlo_pose .* found \(2, 2\)"):
+        links.solve_many(np.array(ends))
 
 
 def test_not_finite_clamps_and_warm_starts(clamped):
-    assert clamped.solve((0.5, 0.1), headings=(np.nan, 0.0), throw=False).status == "not_finite"
-    good = clamped.solve((0.5, 0.1), headings=(0.7, -0.6))
-    good.headings[3] = np.nan
-    again = clamped.solve((0.5, 0.1), headings=(0.7, -0.6), warm=good, throw=False)
+    assert clamped.solve(at((0.5, 0.1), headings=(np.nan, 0.0)), throw=False).status == "not_finite"
+    pose = at((0.5, 0.1), headings=(0.7, -0.6))
+    good = clamped.solve(pose)
+    good.x[3] = np.nan
+    again = clamped.solve(pose, warm=good, throw=False)
     assert again.status == "not_finite"
     assert all_zero(again)
 
 
 def test_small_workspace_and_wrong_branch(links, monkeypatch):
     monkeypatch.setattr(links, "workspace", links.workspace - 1)
-    shape = links.solve((0.5, 0.1), throw=False)
+    shape = links.solve(at((0.5, 0.1)), throw=False)
     assert shape.status == "workspace_too_small"
     assert all_zero(shape)
     monkeypatch.undo()
-    monkeypatch.setattr("dlo_casadi.codegen.compiled.branch_number", lambda branch: 7)
-    assert links.solve((0.5, 0.1), throw=False).status == "bad_argument"
+    monkeypatch.setitem(poses._BRANCHES, "ccw", 7)
+    assert links.solve(at((0.5, 0.1), branch="ccw"), throw=False).status == "bad_argument"
 
 
 def test_a_failure_leaves_no_stale_number_in_a_batch(links):
-    shapes, statuses = links.solve_many([(0.5, 0.1), (np.nan, 0.0), (2.0, 0.0), (0.5, 0.1)])
+    shapes, statuses = links.solve_many(
+        list(map(at, [(0.5, 0.1), (np.nan, 0.0), (2.0, 0.0), (0.5, 0.1)]))
+    )
     assert [STATUSES[k] for k in statuses] == ["ok", "not_finite", "unreachable", "ok"]
     assert not any(np.any(shapes[i][name]) for i in (1, 2) for name in shapes.dtype.names)
     assert shapes[0].tobytes() == shapes[3].tobytes()
@@ -120,55 +144,55 @@ def test_a_failure_leaves_no_stale_number_in_a_batch(links):
 
 def test_both_ends_at_one_place_is_a_loop(links):
     for branch in ("ccw", "cw"):
-        loop = links.solve((0.0, 0.0), branch=branch)
+        loop = links.solve(at((0.0, 0.0), branch=branch))
         assert np.abs(loop.points[-1]).max() < 1e-9
     weightless = CableModel(CABLE, n=16, gravity=(0.0, 0.0))
-    shape = CompiledSolver(weightless, weightless.nominal, np.zeros(16)).solve((0.0, 0.0))
+    shape = CompiledSolver(weightless, weightless.nominal, np.zeros(16)).solve(at((0.0, 0.0)))
     assert np.abs(shape.points[-1]).max() < 1e-9
 
 
 def test_almost_taut(links):
     for ratio in (0.99, 0.999, 0.99999):
-        shape = links.solve((ratio * CABLE.length, 0.0))
+        shape = links.solve(at((ratio * CABLE.length, 0.0)))
         assert shape.end_error < 1e-9
 
 
 def test_branches_bow_either_way():
     solver = CompiledSolver(*cable("arc", straight=True))
-    left = solver.solve((0.5, 0.0), branch="ccw")
-    right = solver.solve((0.5, 0.0), branch="cw")
+    left = solver.solve(at((0.5, 0.0), branch="ccw"))
+    right = solver.solve(at((0.5, 0.0), branch="cw"))
     assert (left.turn, right.turn) == (1, -1)
-    assert solver.solve((0.5, 0.0)).energy == min(left.energy, right.energy)
+    assert solver.solve(at((0.5, 0.0))).energy == min(left.energy, right.energy)
 
 
 def test_a_branch_without_an_equilibrium_is_a_status():
     """A limp cable hangs, and does not stand up: nothing is returned in place of what was named."""
     model = CableModel(Cable(0.8, 0.2, 0.01, 0.005), n=12)
     solver = CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells))
-    hung = solver.solve((0.5, 0.0))
+    hung = solver.solve(at((0.5, 0.0)))
     assert hung.turn == 1
     for warm in (None, hung):
-        shape = solver.solve((0.5, 0.0), branch="cw", warm=warm, throw=False)
+        shape = solver.solve(at((0.5, 0.0), branch="cw"), warm=warm, throw=False)
         assert shape.status == "other_branch"
         assert all_zero(shape)
-        assert solver.solve((0.5, 0.0), branch="ccw", warm=warm).turn == 1
+        assert solver.solve(at((0.5, 0.0), branch="ccw"), warm=warm).turn == 1
     with pytest.raises(EquilibriumError, match=r"other_branch with the end.*\n  Try: the other"):
-        solver.solve((0.5, 0.0), branch="cw")
-    path = solver.path([(0.5, 0.0), (0.5, 0.1)], branch="cw")
+        solver.solve(at((0.5, 0.0), branch="cw"))
+    path = solver.path([at(end, branch="cw") for end in ((0.5, 0.0), (0.5, 0.1))])
     assert [shape.status for shape in path.shapes] == ["other_branch"] * 2
 
 
 def test_a_warm_start_of_the_other_branch_is_not_followed():
     solver = CompiledSolver(*cable("arc", straight=True))
-    left = solver.solve((0.5, 0.0), branch="ccw")
-    right = solver.solve((0.5, 0.0), branch="cw", warm=left)
+    left = solver.solve(at((0.5, 0.0), branch="ccw"))
+    right = solver.solve(at((0.5, 0.0), branch="cw"), warm=left)
     assert right.turn == -1
 
 
 def test_a_clamped_loop_turns_once_clockwise():
     model, p, rest = cable("arc", "clamped", "clamped", n=40, straight=True)
-    shape = CompiledSolver(model, p, rest).solve((0.2, 0.0), headings=(0.0, -2 * np.pi))
-    assert shape.headings[-1] == pytest.approx(-2 * np.pi, abs=1e-9)
+    shape = CompiledSolver(model, p, rest).solve(at((0.2, 0.0), headings=(0.0, -2 * np.pi)))
+    assert shape.x[-1] == pytest.approx(-2 * np.pi, abs=1e-9)
     assert shape.end_error < 1e-9
 
 
@@ -177,52 +201,57 @@ def test_a_clamped_loop_turns_once_clockwise():
 def test_sensitivities_are_central_differences(element, start, end, effects):
     solver = CompiledSolver(*cable(element, start, end, effects=effects))
     pose = np.array([0.5, 0.12, 0.7, -0.6])
-    shape = solver.solve(pose[:2], headings=pose[2:])
-    slope = solver.sensitivity(shape, pose[:2], headings=pose[2:])
+
+    def posed(numbers):
+        return at(tuple(numbers[:2]), headings=numbers[2:])
+
+    shape = solver.solve(posed(pose))
+    slope = solver.sensitivity(shape, posed(pose))
     step = 1e-5
     for k in range(4):
         moved = []
         for sign in (1, -1):
             to = pose + sign * step * np.eye(4)[k]
-            moved.append(solver.solve(to[:2], headings=to[2:], warm=shape))
-        for name in ("points", "headings", "lam", "moments", "min_bend_radius"):
+            moved.append(solver.solve(posed(to), warm=shape))
+        names = {"points": "points", "x": "rotations", "end_force": "end_force"}
+        names |= {"moments": "moments", "min_bend_radius": "min_bend_radius"}
+        for name, derivative in names.items():
             expected = (getattr(moved[0], name) - getattr(moved[1], name)) / (2 * step)
-            size = max(np.abs(getattr(slope, name)).max(), 1e-12)
-            assert np.abs(getattr(slope, name)[..., k] - expected).max() < 1e-6 * size, (k, name)
+            found = getattr(slope, derivative)
+            size = max(np.abs(found).max(), 1e-12)
+            assert np.abs(found[..., k] - expected).max() < 1e-6 * size, (k, name)
         rise = (moved[0].energy - moved[1].energy) / (2 * step)
         if k >= 2:
-            assert rise == pytest.approx(-shape.moments[k - 2], abs=1e-6)
+            assert rise == pytest.approx(-shape.moments[k - 2, 0], abs=1e-6)
 
 
 @pytest.mark.parametrize("solver", ["links", "clamped"])
 def test_a_step_stays_on_its_branch_within_its_bound_on_the_work(solver, request):
     solver = request.getfixturevalue(solver)
-    held = {"headings": (0.7, -0.6)}
-    shape = solver.solve((0.5, 0.1), **held)
-    stepped = solver.step(shape, (0.503, 0.098), steps=5, **held)
+    near = at((0.503, 0.098), headings=(0.7, -0.6))
+    shape = solver.solve(at((0.5, 0.1), headings=(0.7, -0.6)))
+    stepped = solver.step(shape, near, steps=5)
     assert stepped.status == "ok"
-    expected = solver.solve((0.503, 0.098), warm=shape, **held)
+    expected = solver.solve(near, warm=shape)
     np.testing.assert_allclose(stepped.points, expected.points, atol=1e-8)
     for steps, status in ((1, "iteration_limit"), (0, "bad_argument")):
-        short = solver.step(shape, (0.503, 0.098), steps=steps, **held)
+        short = solver.step(shape, near, steps=steps)
         assert short.status == status
         assert all_zero(short)
 
 
 def test_sensitivity_of_a_shape_of_another_pose_is_refused(links):
-    shape = links.solve((0.5, 0.1))
+    shape = links.solve(at((0.5, 0.1)))
     with pytest.raises(EquilibriumError, match="bad_argument"):
-        links.sensitivity(shape, (0.5, 0.11))
+        links.sensitivity(shape, at((0.5, 0.11)))
 
 
-def test_minus_lam_is_the_slope_of_the_energy(links):
-    shape, step = links.solve((0.5, 0.1)), 1e-5
+def test_minus_the_end_force_is_the_slope_of_the_energy(links):
+    shape, step = links.solve(at((0.5, 0.1))), 1e-5
     for k in range(2):
-        e = [
-            links.solve(np.array([0.5, 0.1]) + s * step * np.eye(2)[k], warm=shape).energy
-            for s in (1, -1)
-        ]
-        assert (e[0] - e[1]) / (2 * step) == pytest.approx(-shape.lam[k], rel=1e-6)
+        ends = [np.array([0.5, 0.1]) + s * step * np.eye(2)[k] for s in (1, -1)]
+        e = [links.solve(at(tuple(end)), warm=shape).energy for end in ends]
+        assert (e[0] - e[1]) / (2 * step) == pytest.approx(-shape.end_force[k], rel=1e-6)
 
 
 def test_path_holds_its_branch_and_reports_the_snap():
@@ -230,9 +259,7 @@ def test_path_holds_its_branch_and_reports_the_snap():
     model, p, rest = cable("arc", "clamped", "clamped", n=24, straight=True)
     solver = CompiledSolver(model, p, rest)
     turns = np.linspace(0.6, -2.5, 32)
-    headings = np.stack([turns, -turns], axis=1)
-    ends = np.tile([0.7, 0.0], (len(turns), 1))
-    path = solver.path(ends, headings=headings)
+    path = solver.path([at((0.7, 0.0), headings=(turn, -turn)) for turn in turns])
     assert path.first_jump is not None
     assert all(shape.status == "ok" for shape in path.shapes)
     moves = [
@@ -246,15 +273,16 @@ def test_path_holds_its_branch_and_reports_the_snap():
 
 def test_path_without_a_snap_agrees_with_single_poses(links):
     ends = np.stack([np.linspace(0.6, 0.3, 20), np.linspace(0.0, 0.3, 20)], axis=1)
-    path = links.path(ends, branch="cw")
+    way = [at(tuple(end), branch="cw") for end in ends]
+    path = links.path(way)
     assert path.first_jump is None
-    for end, shape in zip(ends, path.shapes, strict=True):
-        single = links.solve(end, branch="cw")
+    for pose, shape in zip(way, path.shapes, strict=True):
+        single = links.solve(pose)
         assert np.abs(single.points - shape.points).max() < 1e-9
 
 
 def test_path_over_an_impossible_pose(links):
-    path = links.path([(0.5, 0.1), (2.0, 0.0), (0.5, 0.1)], branch="cw")
+    path = links.path([at(end, branch="cw") for end in ((0.5, 0.1), (2.0, 0.0), (0.5, 0.1))])
     assert [shape.status for shape in path.shapes] == ["ok", "unreachable", "ok"]
     assert path.first_jump == 1
     assert all_zero(path.shapes[1])
@@ -338,9 +366,9 @@ def test_no_compiler_is_an_error_that_says_so(monkeypatch):
 
 def test_a_start_anywhere_moves_everything_with_it(links):
     model, p, rest = cable()
-    start, end = np.array([0.3, -0.4]), (0.7, -0.1)
-    expected = solve_equilibrium(model, p, rest, Pose(tuple(start), end))
-    shape = links.solve(end, start=start)
+    pose = Pose((0.3, -0.4), (0.7, -0.1))
+    expected = solve_equilibrium(model, p, rest, pose)
+    shape = links.solve(pose)
     assert np.abs(shape.points - expected.points).max() < 1e-8
     assert shape.energy == pytest.approx(expected.energy, rel=1e-9)
-    assert shape.points[0] == pytest.approx(start)
+    assert shape.points[0] == pytest.approx(pose.start)

@@ -72,7 +72,7 @@ def test_a_named_branch_is_found_where_there_is_one_and_never_the_other(branch):
         there = statuses == 0
         assert set(statuses[~there]) <= {STATUSES.index("other_branch")}
         assert np.all(shapes["turn"][there] == sign)
-        assert not np.any(shapes["headings"][~there])
+        assert not np.any(shapes["x"][~there])
         assert np.all(there[lowest["turn"] == sign])
         refused += np.count_nonzero(~there)
     assert refused  # limp cables do not bow upwards

@@ -67,12 +67,7 @@ def test_session(name):
     solver = CompiledSolver(model, p, rest, flags=("-O0",))  # compiles quickly
     for pose in poses[: 3 if model.has_state else 8]:
         expected = solve_equilibrium(model, p, rest, pose)
-        shape = solver.solve(
-            pose.end or (0.0, 0.0),
-            start=pose.start,
-            headings=(pose.start_heading or 0.0, pose.end_heading or 0.0),
-            branch=pose.branch,
-        )
+        shape = solver.solve(pose)
         assert np.abs(shape.points - expected.points).max() < 1e-8
         assert shape.min_bend_radius == pytest.approx(expected.min_bend_radius, rel=1e-6)
         if model.has_state:  # a drift enters with its latest state: compile anew

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 
 from benchmarks import memory
 
-from dlo_casadi.codegen import STATUSES, CompiledSpaceSolver, generate
+from dlo_casadi.codegen import STATUSES, CompiledSolver, generate
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.codegen.space import coarse_elements
 from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, LumpedMass, PointForce
@@ -78,7 +78,7 @@ def all_zero(shape):
 
 @pytest.fixture(scope="module")
 def solver():
-    return CompiledSpaceSolver(*problem())
+    return CompiledSolver(*problem())
 
 
 @pytest.mark.parametrize("element", ["arc", "quadratic"])
@@ -87,14 +87,14 @@ def solver():
 )
 def test_shape_force_moment_energy_and_radius_are_those_of_python(element, effects):
     model, p, rest = problem(element, effects=effects, n=9)
-    compiled = CompiledSpaceSolver(model, p, rest, flags=("-O0",))
+    compiled = CompiledSolver(model, p, rest, flags=("-O0",))
     for pose in poses(4, np.random.default_rng(0)):
         expected = solve_equilibrium(model, p, rest, pose)
         shape = compiled.solve(pose)
         assert np.abs(shape.points - expected.points).max() < 1e-8
         assert shape.energy == pytest.approx(expected.energy, rel=1e-8)
-        assert shape.lam == pytest.approx(expected.lam, abs=1e-7)
-        assert shape.lam_start == pytest.approx(expected.lam_start, abs=1e-7)
+        assert shape.end_force == pytest.approx(expected.lam, abs=1e-7)
+        assert shape.start_force == pytest.approx(expected.lam_start, abs=1e-7)
         np.testing.assert_allclose(shape.moments, expected.moments, atol=1e-8)
         assert shape.min_bend_radius == pytest.approx(expected.min_bend_radius, rel=1e-6)
         assert abs(shape.max_twist) == pytest.approx(np.abs(expected.twist).max(), rel=1e-6)
@@ -112,7 +112,7 @@ def test_a_section_law_inside_bowed_elements():
     )
     p = model.nominal + np.eye(len(model.names))[-1] * 0.02
     rest = np.zeros(model.chain.n_rests)
-    compiled = CompiledSpaceSolver(model, p, rest, flags=("-O0",))
+    compiled = CompiledSolver(model, p, rest, flags=("-O0",))
     for pose in poses(2, np.random.default_rng(1)):
         expected = solve_equilibrium(model, p, rest, pose)
         assert np.abs(compiled.solve(pose).points - expected.points).max() < 1e-8
@@ -123,19 +123,19 @@ def test_a_section_law_inside_bowed_elements():
 )
 def test_other_ends(ends):
     model, p, rest = problem(n=8, start=ends[0], end=ends[1])
-    compiled = CompiledSpaceSolver(model, p, rest, flags=("-O0",))
+    compiled = CompiledSolver(model, p, rest, flags=("-O0",))
     for pose in poses(3, np.random.default_rng(2)):
         held = replace(pose, end=None) if ends[1] == "free" else pose
         expected = solve_equilibrium(model, p, rest, held)
         shape = compiled.solve(held)
         assert np.abs(shape.points - expected.points).max() < 1e-8
-        assert shape.lam_start == pytest.approx(expected.lam_start, abs=1e-7)
+        assert shape.start_force == pytest.approx(expected.lam_start, abs=1e-7)
         np.testing.assert_allclose(shape.moments, expected.moments, atol=1e-8)
 
 
 def test_turns_twist_the_cable():
     model, p, rest = problem(n=20, curved=0.0)
-    compiled = CompiledSpaceSolver(model, p, rest, flags=("-O0",))
+    compiled = CompiledSolver(model, p, rest, flags=("-O0",))
     straight = Pose(
         (0.0, 0.0, 0.0),
         (0.58, 0.0, 0.0),
@@ -177,7 +177,7 @@ def test_turns_that_a_cable_sheds_are_told(solver):
 def test_two_turns_are_not_lost_on_the_coarse_mesh():
     """Its six elements would be twisted by more than 2 rad each, the way round hard to tell."""
     model, p, rest = problem(n=12)
-    compiled = CompiledSpaceSolver(model, p, rest, flags=("-O0",))
+    compiled = CompiledSolver(model, p, rest, flags=("-O0",))
     for pose, turns in zip(poses(4, np.random.default_rng(10)), (-2.0, 2.0) * 2, strict=True):
         twisted = replace(pose, turns=turns)
         shape, expected = compiled.solve(twisted), solve_equilibrium(model, p, rest, twisted)
@@ -187,7 +187,7 @@ def test_two_turns_are_not_lost_on_the_coarse_mesh():
 @pytest.mark.parametrize(("n", "turns"), [(4, 0.0), (12, 0.0), (12, 2.0)])
 def test_frames_are_those_of_the_points_however_the_shape_was_found(n, turns):
     """Derivatives are those of a shape whose frames are in balance; without a coarse mesh, too."""
-    compiled = CompiledSpaceSolver(*problem(n=n), flags=("-O0",))
+    compiled = CompiledSolver(*problem(n=n), flags=("-O0",))
     for pose in poses(6, np.random.default_rng(11)):
         twisted = replace(pose, turns=turns)
         shape = compiled.solve(twisted)
@@ -206,7 +206,7 @@ int dlo_guess(const dlo_pose *pose, int which, double *frames, double *work)
         return 0;
     if (first_guess(&w, which) <= 0)
         return 0;
-    copy(frames, w.x, 4 * NODES);
+    copy(frames, w.at.x, 4 * DLO_NODES);
     return 1;
 }
 """
@@ -322,7 +322,7 @@ def moved(pose, column, step):
 )
 def test_sensitivities_are_central_differences(element, effects, ends):
     model, p, rest = problem(element, 8, *ends, effects=effects)
-    compiled = CompiledSpaceSolver(model, p, rest, flags=("-O0",))
+    compiled = CompiledSolver(model, p, rest, flags=("-O0",))
     for pose in poses(2, np.random.default_rng(5)):
         held = replace(pose, end=None) if ends[1] == "free" else pose
         shape = compiled.solve(held)
@@ -336,7 +336,7 @@ def test_sensitivities_are_central_differences(element, effects, ends):
             ahead = [
                 compiled.solve(moved(held, column, k * step), warm=shape) for k in (1, -1, 2, -2)
             ]
-            for name in ("points", "lam", "moments", "min_bend_radius"):
+            for name in ("points", "end_force", "moments", "min_bend_radius"):
                 a, b, c, d = (getattr(one, name) for one in ahead)
                 expected = (8 * (a - b) - (c - d)) / (12 * step)
                 found = getattr(slope, name)
@@ -347,7 +347,9 @@ def test_sensitivities_are_central_differences(element, effects, ends):
 def test_wrench_is_the_slope_of_the_energy(solver):
     (pose,) = poses(1, np.random.default_rng(6))
     shape, step = solver.solve(pose), 1e-5
-    expected = -np.concatenate([shape.lam_start, shape.moments[0], shape.lam, shape.moments[1]])
+    expected = -np.concatenate(
+        [shape.start_force, shape.moments[0], shape.end_force, shape.moments[1]]
+    )
     for column in range(12):
         e = [solver.solve(moved(pose, column, s * step), warm=shape).energy for s in (1, -1)]
         assert (e[0] - e[1]) / (2 * step) == pytest.approx(expected[column], abs=1e-6)
@@ -371,7 +373,7 @@ def test_a_path_without_a_jump_agrees_with_single_poses(solver):
 @pytest.mark.parametrize("n", [24, 32])
 def test_a_path_finds_the_twist_at_which_the_cable_loops(n):
     """A bow that is twisted on snaps into a loop: at the same twist on either mesh."""
-    compiled = CompiledSpaceSolver(*problem(n=n, curved=0.0))
+    compiled = CompiledSolver(*problem(n=n, curved=0.0))
     ahead = (0.0, 0.0, 0.0, 1.0)
     bow = Pose((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), start_orientation=ahead, end_orientation=ahead)
     turns = 0.02 * np.arange(170)
