@@ -15,39 +15,24 @@ from dlo_casadi.config.limits import (
     implausible_sizes,
 )
 from dlo_casadi.config.load import load_config
-from dlo_casadi.config.measuring import Board, Camera, Centerlines, Images, Reference, Tolerances
-from dlo_casadi.config.options import (
-    DeclaredEffect,
-    DiagnosisOptions,
-    EffectParameter,
-    EstimationOptions,
-    ModelOptions,
-)
+from dlo_casadi.config.measuring import Camera, Centerlines, Images
+from dlo_casadi.config.options import DeclaredEffect, EstimationOptions
 from dlo_casadi.config.problems import Place, show
-from dlo_casadi.config.sections import Boundary, Cable, Config, Experiment, Pose, SkippedPose
+from dlo_casadi.config.sections import Config, Pose, SkippedPose
 
 __all__ = [
     "MESH",
     "REST_COEFFICIENTS",
-    "Board",
-    "Boundary",
-    "Cable",
     "Camera",
     "Centerlines",
     "Config",
     "DeclaredEffect",
-    "DiagnosisOptions",
-    "EffectParameter",
     "EstimationOptions",
-    "Experiment",
     "Images",
-    "ModelOptions",
     "Place",
     "Pose",
     "Range",
-    "Reference",
     "SkippedPose",
-    "Tolerances",
     "declared_setup",
     "dump_yaml",
     "implausible_gravity",

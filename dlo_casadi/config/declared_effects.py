@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from dlo_casadi.config.limits import Range
-from dlo_casadi.config.problems import Problem, did_you_mean
+from dlo_casadi.config.problems import Place, Problem, did_you_mean
 from dlo_casadi.effects import EFFECTS, Cable, Setup
 from dlo_casadi.effects.parameter import Parameter
 
@@ -42,20 +42,25 @@ def declared_setup(config: Config | File) -> Setup:
 
 def wrong_effects(config: Config | File) -> list[Problem]:
     """Find effects, and parameters of theirs, that do not exist or cannot be as declared."""
-    setup = declared_setup(config)
+    setup, effects, excluded = (
+        declared_setup(config),
+        config.model.effects,
+        config.diagnosis.exclude,
+    )
     problems = [
-        problem for i, item in enumerate(config.model.effects) for problem in _wrong(item, i, setup)
+        problem
+        for i, item in enumerate(effects)
+        for problem in _wrong(item, ("model", "effects", i), setup)
     ]
-    for i, name in enumerate(config.diagnosis.exclude):
-        if name not in EFFECTS:
-            text = f"diagnosis.exclude: {_unknown(name)}"
-            problems.append(Problem(("diagnosis", "exclude", i), text))
-    return problems
+    return problems + [
+        Problem(("diagnosis", "exclude", i), f"diagnosis.exclude: {_unknown(name)}")
+        for i, name in enumerate(excluded)
+        if name not in EFFECTS
+    ]
 
 
-def _wrong(item: DeclaredEffect, i: int, setup: Setup) -> Iterator[Problem]:
+def _wrong(item: DeclaredEffect, at: Place, setup: Setup) -> Iterator[Problem]:
     """Find what is wrong with one declared effect."""
-    at = ("model", "effects", i)
     if item.name not in EFFECTS:
         yield Problem((*at, "name"), f"model.effects: {_unknown(item.name)}")
         return
@@ -66,28 +71,19 @@ def _wrong(item: DeclaredEffect, i: int, setup: Setup) -> Iterator[Problem]:
         yield Problem((*at, "name"), f"model.effects: {item.name}: {refusal}")
         return
     values = {name: declared.value for name, declared in item.parameters.items()}
-    wrong = [
-        problem
-        for name, value in values.items()
-        for problem in _wrong_value(item.name, known, name, value)
-    ]
-    for place, message in wrong:
-        yield Problem((*at, *place), f"model.effects: {message}")
+    wrong = {name: text for name in values if (text := _wrong_value(known, name, values[name]))}
+    for name, text in wrong.items():
+        yield Problem((*at, "parameters", name), f"model.effects: {item.name}{text}")
     if not wrong and (refusal := effect.refusal(setup, nominal | values)):
         yield Problem((*at, "name"), f"model.effects: {item.name}: {refusal}")
 
 
-def _wrong_value(
-    effect: str, known: Mapping[str, Parameter], name: str, value: float
-) -> list[Problem]:
-    """Find what is wrong with a value that is declared for a parameter of an effect."""
-    place = ("parameters", name)
+def _wrong_value(known: Mapping[str, Parameter], name: str, value: float) -> str:
+    """What is wrong with a value that is declared for a parameter; empty if nothing is."""
     if name not in known:
-        text = f"{effect} has no parameter {name!r}{did_you_mean(name, known)}"
-        return [Problem(place, text)]
-    possible = Range(*known[name].range, known[name].unit)
-    problems = possible.problems(place, value)
-    return [Problem(at, f"{effect}.{name}: {message}") for at, message in problems]
+        return f" has no parameter {name!r}{did_you_mean(name, known)}"
+    complaint = Range(*known[name].range, known[name].unit).complaint(value)
+    return complaint and f".{name}: {complaint}"
 
 
 def _unknown(name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -226,10 +226,9 @@ def _read_bytes(source: Path) -> bytes:
     except FileNotFoundError:
         near = did_you_mean(source.name, [p.name for p in source.parent.glob("*.y*ml")])
         raise ConfigError(f"no such file{near}", file=source) from None
-    except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror}", file=source) from None
-    except ValueError as error:  # a NUL in the name
-        raise ConfigError(f"cannot be read: {error}", file=source) from None
+    except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"cannot be read: {reason}", file=source) from None
     if len(text) > _LARGEST:
         raise ConfigError(
             f"larger than {_LARGEST} bytes, which no configuration or fitted cable is. Try: is it "
@@ -258,15 +257,21 @@ def _inspect(root: yaml.Node, source: Path) -> None:
         if id(node) in measured:
             return measured[id(node)]
         above.add(id(node))
+        parts: list[yaml.Node] = []
         if isinstance(node, yaml.ScalarNode):
             if found := _NO_TEXT.search(node.value):
                 raise refuse(f"{show(node.value)} holds {found[0]!r}, which is no text", node)
-            inner = []
         elif isinstance(node, yaml.MappingNode):
-            _refuse_repeated_keys(node, source)
-            inner = [inspect(part) for pair in node.value for part in pair]
+            first: dict[str, int] = {}
+            for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+                if key.value in first:
+                    text = f"occurs twice, first in line {first[key.value]}"
+                    raise refuse(f"key {show(key.value)} {text}", key)
+                first[key.value] = key.start_mark.line + 1
+            parts = [part for pair in node.value for part in pair]
         else:
-            inner = [inspect(part) for part in node.value]
+            parts = node.value
+        inner = [inspect(part) for part in parts]
         values = 1 + sum(size for size, _ in inner)
         levels = 1 + max((depth for _, depth in inner), default=0)
         if values > _MOST_VALUES:
@@ -282,18 +287,3 @@ def _inspect(root: yaml.Node, source: Path) -> None:
         return values, levels
 
     inspect(root)
-
-
-def _refuse_repeated_keys(node: yaml.MappingNode, source: Path) -> None:
-    first: dict[Hashable, int] = {}
-    for key, _ in node.value:
-        if not isinstance(key, yaml.ScalarNode):
-            continue
-        line = key.start_mark.line + 1
-        if key.value in first:
-            raise ConfigError(
-                f"key {show(key.value)} occurs twice, first in line {first[key.value]}",
-                file=source,
-                line=line,
-            )
-        first[key.value] = line

@@ -49,23 +49,21 @@ def _sections(annotation: Any) -> list[type[Section]]:
     return [section for part in get_args(annotation) for section in _sections(part)]
 
 
+def _kinds(section: type[Section]) -> tuple[str, ...]:
+    """The values of `kind` by which a file chooses the section, if it does so."""
+    return (
+        get_args(section.model_fields["kind"].annotation) if "kind" in section.model_fields else ()
+    )
+
+
 def _section_at(place: Place) -> type[Section]:
     """Find the section at a place; what is no key of it (index, kind) is passed over."""
     found: list[type[Section]] = [File]
     for part in place:
-        inner = [
-            section
-            for outer in found
-            if part in outer.model_fields
-            for section in _sections(outer.model_fields[str(part)].annotation)
-        ]
-        kinds = [s for s in found if part in get_args(_annotation(s, "kind"))]
-        found = inner or kinds or found
+        fields = [outer.model_fields[str(part)] for outer in found if part in outer.model_fields]
+        inner = [section for field in fields for section in _sections(field.annotation)]
+        found = inner or [section for section in found if part in _kinds(section)] or found
     return found[0]
-
-
-def _annotation(section: type[Section], key: str) -> Any:
-    return section.model_fields[key].annotation if key in section.model_fields else None
 
 
 def _homes(key: str, section: type[Section] = File, at: str = "") -> list[str]:
@@ -73,21 +71,15 @@ def _homes(key: str, section: type[Section] = File, at: str = "") -> list[str]:
     homes = [at or "the top"] if key in section.model_fields else []
     for name, field in section.model_fields.items():
         for inner in _sections(field.annotation):
-            kind = get_args(_annotation(inner, "kind"))
-            homes += _homes(
-                key, inner, f"{at}.{name}".lstrip(".") + "".join(f" (kind: {k})" for k in kind)
-            )
+            kind = "".join(f" (kind: {kind})" for kind in _kinds(inner))
+            homes += _homes(key, inner, f"{at}.{name}".lstrip(".") + kind)
     return homes
 
 
-def _help(section: type[Section], key: str) -> str:
-    text = section.model_fields[key].description if key in section.model_fields else None
-    return f": {text.rstrip('.')}" if text else ""
-
-
-def _what(section: type[Section], key: object) -> str:
+def _help(section: type[Section], key: object) -> str:
     """Help on a key, where the section knows it."""
-    return _help(section, str(key)) if key in section.model_fields else ""
+    field = section.model_fields.get(str(key))
+    return f": {field.description.rstrip('.')}" if field and field.description else ""
 
 
 def _about_number(value: object) -> str:
@@ -104,25 +96,23 @@ def _about_number(value: object) -> str:
 
 def _allowed(section: type[Section], key: object) -> str:
     """The range of a number, where it has two ends."""
-    found: dict[str, float] = {}
-    waiting = [section.model_json_schema()["properties"].get(str(key))]
-    while waiting:
-        schema = waiting.pop()
-        if isinstance(schema, dict):
-            found |= {name: schema[name] for name in ("minimum", "maximum") if name in schema}
-            waiting += schema.get("anyOf", [])
-    if len(found) < 2:
-        return ""
-    return f"; {found['minimum']:g} to {found['maximum']:g} is possible"
+    field = section.model_json_schema()["properties"].get(str(key), {})
+    ends: dict[str, float] = {}
+    for part in (field, *field.get("anyOf", ())):
+        ends |= {name: part[name] for name in ("minimum", "maximum") if name in part}
+    return "; {minimum:g} to {maximum:g} is possible".format(**ends) if len(ends) == 2 else ""
 
 
+_MAPPING = "a mapping of keys and values belongs here, found {kind}"
+_NUMBER_TYPE = "a number belongs here, found {input}{number}"
+_WHOLE = "a whole number belongs here, found {input}"
 _MESSAGES: dict[str, str] = {
-    "float_type": "a number belongs here, found {input}{number}",
-    "float_parsing": "a number belongs here, found {input}{number}",
+    "float_type": _NUMBER_TYPE,
+    "float_parsing": _NUMBER_TYPE,
     "finite_number": "a finite number belongs here, found {input}",
-    "int_type": "a whole number belongs here, found {input}",
-    "int_parsing": "a whole number belongs here, found {input}",
-    "int_from_float": "a whole number belongs here, found {input}",
+    "int_type": _WHOLE,
+    "int_parsing": _WHOLE,
+    "int_from_float": _WHOLE,
     "bool_type": "true or false belongs here, found {input}",
     "string_type": "text belongs here, found {input}",
     "greater_than": "must be larger than {gt:g}, found {input}",
@@ -130,9 +120,9 @@ _MESSAGES: dict[str, str] = {
     "less_than": "must be smaller than {lt:g}, found {input}",
     "less_than_equal": "must not be larger than {le:g}, found {input}{allowed}",
     "literal_error": "allowed are {expected}, found {input}",
-    "model_type": "a mapping of keys and values belongs here, found {kind}",
-    "model_attributes_type": "a mapping of keys and values belongs here, found {kind}",
-    "dict_type": "a mapping of keys and values belongs here, found {kind}",
+    "model_type": _MAPPING,
+    "model_attributes_type": _MAPPING,
+    "dict_type": _MAPPING,
     "tuple_type": "a list belongs here, found {kind}",
     "too_short": "at least {min_length} belongs here, found {actual_length}",
     "too_long": "at most {max_length} belong here, found {actual_length}",
@@ -155,7 +145,7 @@ def explain(errors: Sequence[ErrorDetails], data: Any) -> list[Problem]:
         section, label = _section_at(place[:-1]), _label(place, data)
         kind = error["type"]
         if error["input"] == PLACEHOLDER:
-            text = f"{label} is still to be filled in{_what(section, place[-1])}"
+            text = f"{label} is still to be filled in{_help(section, place[-1])}"
         elif kind == "missing":
             if place in suggested:
                 continue

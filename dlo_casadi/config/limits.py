@@ -7,7 +7,7 @@ range that is allowed. What can be computed but is hardly meant is a warning of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from dlo_casadi.config.problems import Place, Problem
@@ -28,12 +28,14 @@ class Range(NamedTuple):
     def __str__(self) -> str:
         return f"{self.least:g} to {self.most:g}{self.unit and ' '}{self.unit} is possible"
 
+    def complaint(self, value: float) -> str:
+        """What is wrong with a value that lies outside; empty if it does not."""
+        return "" if value in self else f"{value:g}{self.unit and ' '}{self.unit}: {self}"
+
     def problems(self, place: Place, value: float, hint: str = "") -> list[Problem]:
-        """What is wrong with a value, if it lies outside."""
-        if value in self:
-            return []
-        text = f"{value:g}{self.unit and ' '}{self.unit}: {self}{hint}"
-        return [Problem(place, text)]
+        """The same as a list of at most one problem of a place."""
+        text = self.complaint(value)
+        return [Problem(place, text + hint)] if text else []
 
 
 # Nothing shorter than a millimetre is held in two fixtures; 100 m hang between two masts.
@@ -66,7 +68,7 @@ FINEST_TOLERANCE = 1.0e-9
 # The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; taut it pulls more. A moment: a metre's arm.
 FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
 # A nanonewton is what atomic force microscopes resolve.
-FINEST_READING = 1.0e-9
+FORCE_STD, MOMENT_STD = FORCE._replace(least=1.0e-9), MOMENT._replace(least=1.0e-9)
 # A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
 PIXELS = Range(-1.0e6, 1.0e6, "px")
 FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
@@ -86,57 +88,57 @@ def implausible_sizes(
     length: float, mass: float, diameter: float, stiffness: float | None = None
 ) -> list[Problem]:
     """Find sizes [m], [kg], [N m^2] of a cable that no cable has, by their key."""
-    problems: list[Problem] = []
-    if length not in LENGTH:
-        meant = length / 1e3  # of millimetres
-        hint = f"did you mean {meant:g}? " if meant in LENGTH else ""
-        text = f"{length:g} m: units are SI, {hint}{LENGTH}"
-        problems.append(Problem(("length",), text))
-    elif diameter > length:
-        hint = _meant_diameter(length, mass, diameter)
-        text = f"{diameter:g} m is larger than the length {length:g} m: units are SI{hint}"
-        problems.append(Problem(("diameter",), text))
-    else:
-        problems += Range(_THINNEST, length, "m").problems(("diameter",), diameter)
-    heaviest = min(_HEAVIEST, _HEAVIEST_PER_METRE * length)
-    if mass > heaviest:
-        meant = mass / 1e3  # of grams
-        hint = f"did you mean {meant:g}? " if meant <= heaviest else ""
-        text = (
-            f"{mass:g} kg for {length:g} m: units are SI, {hint}at most {heaviest:g} kg is possible"
-        )
-        problems.append(Problem(("mass",), text))
-    elif mass < _LIGHTEST:
-        text = (
-            f"{mass:g} kg: no cable is lighter than {_LIGHTEST:g} kg; to leave its weight out, "
-            "write gravity: [0, 0]"
-        )
-        problems.append(Problem(("mass",), text))
-    if not problems:
-        problems += _implausible_density(length, mass, diameter)
+    sizes = list(_implausible(length, mass, diameter))
+    sizes = sizes or list(_implausible_density(length, mass, diameter))
+    problems = [Problem((key,), text) for key, text in sizes]
     if stiffness is not None:
         problems += STIFFNESS.problems(("bending_stiffness",), stiffness)
     return problems
 
 
-def _implausible_density(length: float, mass: float, diameter: float) -> list[Problem]:
+def _implausible(length: float, mass: float, diameter: float) -> Iterator[tuple[str, str]]:
+    """Find sizes that are impossible one by one: the key, and what is wrong."""
+    if length not in LENGTH:
+        hint = _meant(length / 1e3, length / 1e3 in LENGTH)  # of millimetres
+        yield "length", f"{length:g} m: units are SI, {hint}{LENGTH}"
+    elif diameter > length:
+        hint = _meant_diameter(length, mass, diameter)
+        text = f"{diameter:g} m is larger than the length {length:g} m: units are SI{hint}"
+        yield "diameter", text
+    elif wrong := Range(_THINNEST, length, "m").complaint(diameter):
+        yield "diameter", wrong
+    heaviest = min(_HEAVIEST, _HEAVIEST_PER_METRE * length)
+    if mass > heaviest:
+        hint = _meant(mass / 1e3, mass / 1e3 <= heaviest)  # of grams
+        possible = f"at most {heaviest:g} kg is possible"
+        yield "mass", f"{mass:g} kg for {length:g} m: units are SI, {hint}{possible}"
+    elif mass < _LIGHTEST:
+        text = f"no cable is lighter than {_LIGHTEST:g} kg; to leave its weight out, write "
+        yield "mass", f"{mass:g} kg: {text}gravity: [0, 0]"
+
+
+def _implausible_density(length: float, mass: float, diameter: float) -> Iterator[tuple[str, str]]:
     """Find a mass [kg] that nothing of such a volume has."""
     apparent = _density(length, mass, diameter)
     if apparent > _POSSIBLE_DENSITIES.most:
-        hint = f"did you mean {mass / 1e3:g}? " if apparent / 1e3 in _DENSITIES else ""
-        text = (
+        hint = _meant(mass / 1e3, apparent / 1e3 in _DENSITIES)
+        yield (
+            "mass",
             f"{mass:g} kg make it {apparent / 1e3:.3g} times as dense as water (osmium, the "
             f"densest metal: {_DENSITIES.most / 1e3:g}): units are SI, {hint}diameter and length "
-            "in m?"
+            "in m?",
         )
-        return [Problem(("mass",), text)]
     if apparent < _POSSIBLE_DENSITIES.least:
-        text = (
+        yield (
+            "diameter",
             f"{diameter:g} m make {mass:g} kg lighter than air, {apparent:.2g} kg/m^3: units are "
-            f"SI{_meant_diameter(length, mass, diameter)}, mass in kg?"
+            f"SI{_meant_diameter(length, mass, diameter)}, mass in kg?",
         )
-        return [Problem(("diameter",), text)]
-    return []
+
+
+def _meant(value: float, possible: bool) -> str:
+    """Question after a value of another unit, if it would be possible."""
+    return f"did you mean {value:g}? " if possible else ""
 
 
 def _density(length: float, mass: float, diameter: float) -> float:
@@ -163,18 +165,3 @@ def implausible_quaternion(values: Sequence[float]) -> str:
         return f"{belongs}, not {counted(len(values), 'number')}"
     size = math.hypot(*values)
     return "" if abs(size - 1) <= _UNIT else f"{belongs}, its length is {size:.4g}"
-
-
-def implausible_pixels(place: Place, values: Iterable[float]) -> list[Problem]:
-    """Find pixels [px] that no picture has."""
-    return [problem for value in values for problem in PIXELS.problems(place, value)]
-
-
-def implausible_camera(
-    matrix: Sequence[Sequence[float]], distortion: Sequence[float]
-) -> list[Problem]:
-    """Find numbers of a pinhole camera that no lens has, by their key."""
-    (fx, skew, cx), (_, fy, cy), _ = matrix
-    problems = [p for f in (fx, fy) for p in FOCAL_LENGTH.problems(("matrix",), f)]
-    problems += implausible_pixels(("matrix",), (skew, cx, cy))
-    return problems + [p for k in distortion for p in DISTORTION.problems(("distortion",), k)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -13,17 +13,7 @@ from pydantic import ValidationError
 from dlo_casadi.config.declared_effects import wrong_effects
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.explain import explain
-from dlo_casadi.config.limits import (
-    COORDINATE,
-    FINEST_READING,
-    FINEST_STD,
-    FINEST_TOLERANCE,
-    FORCE,
-    MOMENT,
-    Range,
-    implausible_gravity,
-    implausible_quaternion,
-)
+from dlo_casadi.config.limits import FINEST_STD, FINEST_TOLERANCE, Range
 from dlo_casadi.config.measuring import Tolerances
 from dlo_casadi.config.problems import Problem, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, File, Pose, SkippedPose
@@ -77,13 +67,17 @@ def load_config(path: str | Path) -> Config:
     poses = file.experiment.poses
     unreachable = _unreachable(poses, file.cable, file.experiment.tolerances)
     reachable = tuple(pose for pose in poses if pose.name not in unreachable)
-    problems_by_pose = unreachable | _missing(reachable)
-    skipped = {
-        pose.name: problems_by_pose[pose.name] for pose in poses if pose.name in problems_by_pose
-    }
-    n_fit = sum(pose.role == "fit" and pose.name not in skipped for pose in poses)
+    reasons = unreachable | _missing(reachable)
+    n_fit = sum(pose.role == "fit" and pose.name not in reasons for pose in poses)
     if n_fit == 0:
-        raise document.error(_no_fit_pose(poses, skipped), "no pose to fit is left")
+        lost = [
+            Problem(
+                ("experiment", "poses", i), f"pose {i + 1} ({pose.shown_by}): {reasons[pose.name]}"
+            )
+            for i, pose in enumerate(poses)
+            if pose.role == "fit"
+        ]
+        raise document.error(lost, "no pose to fit is left")
     warnings = _oddities(file)
     if n_fit == 1:
         warnings.append("only one pose to fit: what it tells cannot be checked on another one")
@@ -96,9 +90,9 @@ def load_config(path: str | Path) -> Config:
         diagnosis=file.diagnosis,
         warnings=tuple(warnings),
         skipped=tuple(
-            SkippedPose(pose.name, skipped[pose.name], pose.role)
+            SkippedPose(pose.name, reasons[pose.name], pose.role)
             for pose in poses
-            if pose.name in skipped
+            if pose.name in reasons
         ),
     )
 
@@ -121,65 +115,49 @@ _COBYLA_LINKS = 20
 _LARGEST_HEADINGS = {"start": 6.3, "end": 25.0}
 
 
-def _contradictions(experiment: Experiment) -> list[Problem]:
+def _contradictions(experiment: Experiment) -> Iterator[Problem]:
     """Find poses that do not fit the boundary, the kind of measurement, or each other."""
-    problems: list[Problem] = []
-    held, measurement = experiment.boundary, experiment.measurement
+    measurement, poses = experiment.measurement, experiment.poses
     if experiment.in_space and measurement.kind == "images" and measurement.board is None:
         text = "photographs of a cable in space need a board of markers; a reference is of a plane"
-        problems.append(Problem(("experiment", "measurement"), text))
+        yield Problem(("experiment", "measurement"), text)
+    held = experiment.boundary
     if experiment.in_space and held.start == "pinned" and held.end == "free":
         text = (
             "on a ball joint and with a free end a cable in space may be turned about gravity, "
             "which holds it in no shape of all these. Try: start: clamped, with start_orientation; "
             "or two numbers of gravity, in the plane in which it hangs"
         )
-        problems.append(Problem(("experiment", "boundary"), text))
-    names: dict[str, int] = {}
-    for i, pose in enumerate(experiment.poses):
-
-        def wrong(message: str, i: int = i, pose: Pose = pose, key: str | None = None) -> None:
-            at = ("experiment", "poses", i) if key is None else ("experiment", "poses", i, key)
-            problems.append(Problem(at, f"pose {i + 1} ({pose.shown_by}): {message}"))
-
-        if len(pose.name.encode()) > _LONGEST_NAME:
-            wrong(f"results are named after the file, at most {_LONGEST_NAME} bytes long")
-        if pose.name in names:
-            wrong(
-                f"pose {names[pose.name] + 1} is called {pose.name!r} too; results are named after "
-                "the file without its ending, give each its own"
-            )
-        names.setdefault(pose.name, i)
-        for message, key in _frame_problems(experiment, pose):
-            wrong(message, key=key)
-        for key, most in _LARGEST_HEADINGS.items():
-            heading = getattr(pose, f"{key}_heading")
-            if heading is not None and getattr(held, key) == "clamped" and abs(heading) > most:
-                wrong(
-                    f"{key}_heading: {heading:g} rad: in degrees? then {math.radians(heading):.4g}",
-                    key=f"{key}_heading",
-                )
-        if held.end != "free" and pose.end is None:
-            wrong(f"a {held.end} end needs its position: end: {_axes(experiment)}")
+        yield Problem(("experiment", "boundary"), text)
+    names = [pose.name for pose in poses]
+    for i, pose in enumerate(poses):
+        wrong = [*_file_problems(experiment, pose), *_end_problems(experiment, pose)]
+        if (first := names.index(pose.name)) < i:
+            text = "results are named after the file without its ending, give each its own"
+            wrong.append((f"pose {first + 1} is called {pose.name!r} too; {text}", None))
         if pose.branch == "previous" and i == 0:
-            wrong("the first pose continues none; branch: ccw or cw?", key="branch")
-        if held.end == "free":
-            for key in ("end", "end_heading", "end_orientation", "end_force", "end_moment"):
-                if getattr(pose, key) is not None:
-                    wrong(f"a free end has no {key}; boundary.end: pinned or clamped?")
-        endings = {path.suffix.lower() for path in pose.paths}
-        # In space photographs, lines and markers may stand in one session.
-        mixed = experiment.in_space and pose.file is not None
-        if experiment.measurement.kind == "images" and ".csv" in endings and not mixed:
-            wrong("a CSV is not a photograph; measurement kind: centerlines?")
-        if experiment.measurement.kind == "centerlines" and endings & _IMAGE_ENDINGS:
-            wrong("a photograph is not a CSV; measurement kind: images?")
-        if len(pose.files) > 1 and not experiment.in_space:
-            wrong("several photographs are of a cable in space; gravity: two numbers", key="files")
-    if not any(pose.role == "fit" for pose in experiment.poses):
-        at = ("experiment", "poses")
-        problems.append(Problem(at, "no pose has role: fit, there is nothing to fit to"))
-    return problems
+            wrong.append(("the first pose continues none; branch: ccw or cw?", "branch"))
+        for message, key in wrong:
+            at = ("experiment", "poses", i) if key is None else ("experiment", "poses", i, key)
+            yield Problem(at, f"pose {i + 1} ({pose.shown_by}): {message}")
+    if not any(pose.role == "fit" for pose in poses):
+        text = "no pose has role: fit, there is nothing to fit to"
+        yield Problem(("experiment", "poses"), text)
+
+
+def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
+    """What is wrong with the files of a pose, and the key."""
+    if len(pose.name.encode()) > _LONGEST_NAME:
+        yield f"results are named after the file, at most {_LONGEST_NAME} bytes long", None
+    endings = {path.suffix.lower() for path in pose.paths}
+    # In space photographs, lines and markers may stand in one session.
+    mixed = experiment.in_space and pose.file is not None
+    if experiment.measurement.kind == "images" and ".csv" in endings and not mixed:
+        yield "a CSV is not a photograph; measurement kind: centerlines?", None
+    if experiment.measurement.kind == "centerlines" and endings & _IMAGE_ENDINGS:
+        yield "a photograph is not a CSV; measurement kind: images?", None
+    if len(pose.files) > 1 and not experiment.in_space:
+        yield "several photographs are of a cable in space; gravity: two numbers", "files"
 
 
 def _weightless(file: File) -> Iterator[Problem]:
@@ -200,28 +178,25 @@ def _weightless(file: File) -> Iterator[Problem]:
         yield Problem(at, f"mass: null: {UNKNOWN_MASS.name} is of a declared mass; one of the two")
 
 
-def _axes(experiment: Experiment) -> str:
-    return "[x, y, z]" if experiment.in_space else "[x, y]"
-
-
-def _frame_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
-    """What is wrong with the ends of a pose, in the plane or in space, and its key."""
+def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
+    """What is wrong with the ends of a pose, in the plane or in space, and the key."""
     held, space = experiment.boundary, experiment.in_space
+    axes = "[x, y, z]" if space else "[x, y]"
     numbers = "three numbers of gravity: the cable is in space" if space else "two of gravity"
-    for key in ("start", "end"):
-        place = getattr(pose, key)
-        if place is not None and len(place) != len(experiment.gravity):
-            yield f"{key}: {_axes(experiment)} belongs here ({numbers})", key
+    for key, most in _LARGEST_HEADINGS.items():
+        place, how = getattr(pose, key), getattr(held, key)
         orientation, heading = getattr(pose, f"{key}_orientation"), getattr(pose, f"{key}_heading")
-        if orientation is not None:
-            if wrong := implausible_quaternion(orientation):
-                yield f"{key}_orientation: {wrong}", f"{key}_orientation"
-            if not space:
-                text = "is for a cable in space; gravity has two numbers. Try: "
-                yield f"{key}_orientation {text}{key}_heading", f"{key}_orientation"
+        if place is not None and len(place) != len(experiment.gravity):
+            yield f"{key}: {axes} belongs here ({numbers})", key
+        if orientation is not None and not space:
+            text = "is for a cable in space; gravity has two numbers. Try: "
+            yield f"{key}_orientation {text}{key}_heading", f"{key}_orientation"
         if heading is not None and space:
             text = "is for a cable in a plane; gravity has three numbers. Try: "
             yield f"{key}_heading {text}{key}_orientation", f"{key}_heading"
+        if heading is not None and how == "clamped" and abs(heading) > most:
+            text = f"{heading:g} rad: in degrees? then {math.radians(heading):.4g}"
+            yield f"{key}_heading: {text}", f"{key}_heading"
         for kind, count, what in (
             ("force", len(experiment.gravity), "[fx, fy, fz]" if space else "[fx, fy]"),
             ("moment", 3 if space else 1, "[mx, my, mz]" if space else "one number"),
@@ -229,13 +204,17 @@ def _frame_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, s
             reading = getattr(pose, f"{key}_{kind}")
             if reading is not None and len(reading) != count:
                 yield f"{key}_{kind}: {what} belongs here ({numbers})", f"{key}_{kind}"
-        if getattr(held, key) != "clamped":
-            continue
-        if space and orientation is None:
+        if how == "clamped" and space and orientation is None:
             yield f"a clamped {key} needs a {key}_orientation [qx, qy, qz, qw]", None
-        if not space and heading is None:
+        if how == "clamped" and not space and heading is None:
             how = " [rad]" if key == "start" else " [rad], continuous along the cable"
             yield f"a clamped {key} needs a{'n' * (key == 'end')} {key}_heading{how}", None
+    if held.end != "free" and pose.end is None:
+        yield f"a {held.end} end needs its position: end: {axes}", None
+    if held.end == "free":
+        for key in ("end", "end_heading", "end_orientation", "end_force", "end_moment"):
+            if getattr(pose, key) is not None:
+                yield f"a free end has no {key}; boundary.end: pinned or clamped?", None
     if pose.turns and not (space and held.start == held.end == "clamped"):
         yield "turns are of a cable in space that is clamped at both ends", "turns"
     if pose.branch in ("ccw", "cw") and space:
@@ -263,12 +242,8 @@ def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) ->
 
 def _missing(poses: Iterable[Pose]) -> dict[str, str]:
     """Find poses of which no file exists."""
-    reasons: dict[str, str] = {}
-    for pose in poses:
-        found = [_absent(path) for path in pose.paths]
-        if all(found):
-            reasons[pose.name] = "; ".join(found)
-    return reasons
+    found = {pose.name: [_absent(path) for path in pose.paths] for pose in poses}
+    return {name: "; ".join(reasons) for name, reasons in found.items() if all(reasons)}
 
 
 def _absent(file: Path) -> str:
@@ -291,17 +266,6 @@ def _near(file: Path) -> str:
         names = []
     near = difflib.get_close_matches(file.name, names, 1, cutoff=0.8)
     return f"did you mean {near[0]}?" if near else "files are found relative to the YAML"
-
-
-def _no_fit_pose(poses: Sequence[Pose], skipped: Mapping[str, str]) -> list[Problem]:
-    return [
-        Problem(
-            ("experiment", "poses", i),
-            f"pose {i + 1} ({pose.shown_by}): {skipped[pose.name]}",
-        )
-        for i, pose in enumerate(poses)
-        if pose.role == "fit" and pose.name in skipped
-    ]
 
 
 def _oddities(file: File) -> list[str]:
@@ -354,16 +318,11 @@ def _oddities(file: File) -> list[str]:
 
 
 def _impossible_values(experiment: Experiment, length: float) -> Iterator[Problem]:
-    """Find what lies beyond the ranges above, for a cable of that length [m]."""
-    at = ("experiment",)
-    for place, message in implausible_gravity(experiment.gravity):
-        yield Problem((*at, *place), f"gravity: {message}")
+    """Find noise and tolerances that are impossible for a cable of that length [m]."""
     std = experiment.measurement.std
-    if std is not None:
-        for place, message in Range(FINEST_STD, length, "m").problems(
-            (*at, "measurement", "std"), std, "; without it, it is estimated from the data"
-        ):
-            yield Problem(place, f"std: {message}")
+    if std is not None and std not in (possible := Range(FINEST_STD, length, "m")):
+        text = f"std: {possible.complaint(std)}; without it, it is estimated from the data"
+        yield Problem(("experiment", "measurement", "std"), text)
     # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
     torsional_stiffness = 1.0 if experiment.in_space else None
     cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
@@ -376,26 +335,5 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Proble
     }
     for key, q in taken_up.items():
         most = min(q.upper - q.nominal, q.nominal - q.lower)
-        for place, message in Range(FINEST_TOLERANCE, most, q.unit).problems(
-            (*at, "tolerances", key), declared[key]
-        ):
-            yield Problem(place, f"tolerances.{key}: {message}")
-    for i, pose in enumerate(experiment.poses):
-        for key in ("start", "end"):
-            for k, value in enumerate(getattr(pose, key) or ()):
-                for place, message in COORDINATE.problems((*at, "poses", i, key, k), value):
-                    yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")
-        for key, values in pose.readings.items():
-            possible = FORCE if key.endswith("force") else MOMENT
-            for value in values:
-                for place, message in possible.problems((*at, "poses", i, key), value):
-                    yield Problem(place, f"pose {i + 1} ({pose.shown_by}) {key}: {message}")
-    stds = experiment.measurement
-    for key, value, possible in (
-        ("force_std", stds.force_std, FORCE),
-        ("moment_std", stds.moment_std, MOMENT),
-    ):
-        if value is not None:
-            finest = possible._replace(least=FINEST_READING)
-            for place, message in finest.problems((*at, "measurement", key), value):
-                yield Problem(place, f"{key}: {message}")
+        if wrong := Range(FINEST_TOLERANCE, most, q.unit).complaint(declared[key]):
+            yield Problem(("experiment", "tolerances", key), f"tolerances.{key}: {wrong}")

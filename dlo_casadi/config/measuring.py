@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from dlo_casadi.config.limits import COORDINATE, MARKER, implausible_camera, implausible_pixels
-from dlo_casadi.config.problems import Contradiction, Problem, did_you_mean
-from dlo_casadi.config.values import NonNegative, Number, Positive, Row, Section, Vector
+from dlo_casadi.config.limits import (
+    COORDINATE,
+    DISTORTION,
+    FOCAL_LENGTH,
+    FORCE_STD,
+    MARKER,
+    MOMENT_STD,
+    PIXELS,
+)
+from dlo_casadi.config.problems import did_you_mean
+from dlo_casadi.config.values import NonNegative, Number, Positive, Row, Section, Vector, within
 from dlo_casadi.errors import counted
 from dlo_casadi.model.tolerances import Tolerances as Known
 
@@ -22,24 +30,31 @@ class Camera(Section):
 
     matrix: tuple[Row, Row, Row]
     """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel]."""
-    distortion: tuple[Number, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Annotated[tuple[Number, ...], within(DISTORTION)] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """OpenCV's 4, 5, 8, 12 or 14 coefficients k1, k2, p1, p2, k3, k4, ...; [] for none."""
 
-    @model_validator(mode="after")
-    def _plausible(self) -> Camera:
-        (fx, skew, _), (below, fy, _), last = self.matrix
+    @field_validator("matrix")
+    @classmethod
+    def _pinhole(cls, matrix: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+        (fx, skew, cx), (below, fy, cy), last = matrix
         if fx <= 0.0 or fy <= 0.0 or skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
             text = "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
-            raise Contradiction(Problem(("matrix",), text))
-        if len(self.distortion) not in (0, 4, 5, 8, 12, 14):
-            text = (
-                f"found {counted(len(self.distortion), 'number')}; OpenCV knows 4, 5 "
+            raise ValueError(text)
+        wrong = [FOCAL_LENGTH.complaint(f) for f in (fx, fy)]
+        wrong += [PIXELS.complaint(c) for c in (cx, cy)]
+        if any(wrong):
+            raise ValueError("; ".join(filter(None, wrong)))
+        return matrix
+
+    @field_validator("distortion")
+    @classmethod
+    def _known_to_opencv(cls, distortion: tuple[float, ...]) -> tuple[float, ...]:
+        if len(distortion) not in (0, 4, 5, 8, 12, 14):
+            raise ValueError(
+                f"found {counted(len(distortion), 'number')}; OpenCV knows 4, 5 "
                 "[k1, k2, p1, p2, k3], 8, 12 or 14"
             )
-            raise Contradiction(Problem(("distortion",), text))
-        if problems := implausible_camera(self.matrix, self.distortion):
-            raise Contradiction(*problems)
-        return self
+        return distortion
 
 
 ARUCO_DICTIONARIES = (
@@ -50,6 +65,8 @@ ARUCO_DICTIONARIES = (
 )
 
 _FAMILIES = {"ORIGINAL": 1024, "36h12": 250, "16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587}
+_MOST_MARKERS = max(_FAMILIES.values())
+_Centers: TypeAlias = dict[Annotated[int, Field(ge=0)], Annotated[Vector, within(COORDINATE)]]
 
 
 class Board(Section):
@@ -57,66 +74,54 @@ class Board(Section):
 
     dictionary: str
     """OpenCV's name of the marker dictionary, such as DICT_4X4_50."""
-    marker_size: Positive
+    marker_size: Annotated[Positive, within(MARKER)]
     """Side of the black square of a marker [m]."""
-    standoff: NonNegative = 0.0
+    standoff: Annotated[NonNegative, within(COORDINATE)] = 0.0
     """Distance of the cable's axis in front of the board [m]; other than 0 needs a camera, or
     photographs from several directions that show it."""
-    marker_centers: Annotated[
-        dict[Annotated[int, Field(ge=0)], Vector],
-        Field(min_length=1, max_length=max(_FAMILIES.values())),
-    ]
+    marker_centers: Annotated[_Centers, Field(min_length=1, max_length=_MOST_MARKERS)]
     """Centre of each marker by its id: {0: [x, y], 1: [x, y], ...} [m]."""
 
-    @model_validator(mode="after")
-    def _plausible(self) -> Board:
-        sizes = MARKER.problems(("marker_size",), self.marker_size)
-        sizes += COORDINATE.problems(("standoff",), self.standoff)
-        for i, center in self.marker_centers.items():
-            for value in center:
-                sizes += COORDINATE.problems(("marker_centers", i), value)
-        if sizes:
-            raise Contradiction(*sizes)
-        if self.dictionary not in ARUCO_DICTIONARIES:
-            hint = did_you_mean(self.dictionary, ARUCO_DICTIONARIES)
-            text = f"OpenCV has no dictionary {self.dictionary!r}{hint}"
-            raise Contradiction(Problem(("dictionary",), text))
-        size = self.dictionary.rsplit("_", 1)[1]
-        count = int(size) if size.isdigit() else _FAMILIES[size]
-        too_large = [i for i in self.marker_centers if i >= count]
-        if too_large:
-            text = f"{self.dictionary} has no marker {too_large[0]:g}: its ids end at {count - 1}"
-            raise Contradiction(Problem(("marker_centers",), text))
-        for (i, a), (j, b) in itertools.combinations(self.marker_centers.items(), 2):
-            if math.dist(a, b) < self.marker_size:
-                text = (
+    @field_validator("dictionary")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name not in ARUCO_DICTIONARIES:
+            raise ValueError(
+                f"OpenCV has no dictionary {name!r}{did_you_mean(name, ARUCO_DICTIONARIES)}"
+            )
+        return name
+
+    @field_validator("marker_centers")
+    @classmethod
+    def _plausible(cls, centers: _Centers, info: ValidationInfo) -> _Centers:
+        name, side = info.data.get("dictionary", ""), info.data.get("marker_size", 0.0)
+        size = name.rsplit("_", 1)[-1]
+        count = int(size) if size.isdigit() else _FAMILIES.get(size, _MOST_MARKERS)
+        if too_large := [i for i in centers if i >= count]:
+            raise ValueError(f"{name} has no marker {too_large[0]:g}: its ids end at {count - 1}")
+        for (i, a), (j, b) in itertools.combinations(centers.items(), 2):
+            if math.dist(a, b) < side:
+                raise ValueError(
                     f"markers {i} and {j} are {math.dist(a, b):g} m apart, closer than their "
-                    f"size of {self.marker_size:g} m: all in metres?"
+                    f"size of {side:g} m: all in metres?"
                 )
-                raise Contradiction(Problem(("marker_centers",), text))
-        return self
+        return centers
 
 
 class Reference(Section):
     """Two known points in the photograph: scale, rotation and origin of a similarity transform."""
 
-    pixels: tuple[Vector, Vector]
+    pixels: tuple[Annotated[Vector, within(PIXELS)], Annotated[Vector, within(PIXELS)]]
     """The two points in the photograph [[u, v], [u, v]], u to the right, v down [pixel]."""
-    points: tuple[Vector, Vector]
+    points: tuple[Annotated[Vector, within(COORDINATE)], Annotated[Vector, within(COORDINATE)]]
     """The same two points in the board frame [[x, y], [x, y]] [m]."""
 
-    @model_validator(mode="after")
-    def _distinct(self) -> Reference:
-        for name, (a, b) in (("pixels", self.pixels), ("points", self.points)):
-            if a == b:
-                raise Contradiction(Problem((name,), f"the two points are the same: {list(a)}"))
-        if problems := implausible_pixels(("pixels",), [x for pair in self.pixels for x in pair]):
-            raise Contradiction(*problems)
-        for k, point in enumerate(self.points):
-            for value in point:
-                if problems := COORDINATE.problems(("points", k), value):
-                    raise Contradiction(*problems)
-        return self
+    @field_validator("pixels", "points")
+    @classmethod
+    def _distinct(cls, pair: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+        if pair[0] == pair[1]:
+            raise ValueError(f"the two points are the same: {list(pair[0])}")
+        return pair
 
 
 class Measurement(Section):
@@ -125,9 +130,9 @@ class Measurement(Section):
     std: Positive | None = None
     """Standard deviation of one centre-line coordinate [m]; estimated when absent, and, with a
     warning, where the points scatter more."""
-    force_std: Positive | None = None
+    force_std: Annotated[Positive, within(FORCE_STD)] | None = None
     """Standard deviation of one component of a force on a fixture [N]; estimated when absent."""
-    moment_std: Positive | None = None
+    moment_std: Annotated[Positive, within(MOMENT_STD)] | None = None
     """Standard deviation of one component of a moment on a fixture [N m]; estimated when absent."""
 
 
@@ -148,8 +153,7 @@ class Images(Measurement):
     def _one_frame(self) -> Images:
         if (self.board is None) == (self.reference is None):
             found = "neither" if self.board is None else "both"
-            text = f"kind: images needs either a board or a reference, found {found}"
-            raise Contradiction(Problem((), text))
+            raise ValueError(f"kind: images needs either a board or a reference, found {found}")
         return self
 
 

@@ -11,13 +11,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from dlo_casadi.config.limits import STIFFNESS, implausible_sizes
+from dlo_casadi.config.limits import STIFFNESS, implausible_gravity, implausible_sizes
 from dlo_casadi.config.measuring import Centerlines, Images, Tolerances
 from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
 from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, show
-from dlo_casadi.config.values import Moment, Number, Place, Positive, Quaternion, Section, optional
+from dlo_casadi.config.values import (
+    Direction,
+    Force,
+    Moment,
+    Number,
+    Place,
+    Positive,
+    Quaternion,
+    Section,
+    optional,
+    within,
+)
 from dlo_casadi.errors import well_formed
 from dlo_casadi.rod.ends import REACTIONS
 
@@ -41,7 +52,7 @@ class Cable(Section):
     """Young's modulus E of a solid round rod [Pa], a crude prior; or give bending_stiffness."""
     bending_stiffness: Positive | None = None
     """Bending stiffness EI [N m^2], a crude prior; or give youngs_modulus."""
-    torsional_stiffness: Positive | None = None
+    torsional_stiffness: Annotated[Positive, within(STIFFNESS)] | None = None
     """Torsional stiffness GJ [N m^2] of a cable in space, a crude prior; EI / 1.3 when absent."""
     rest_shape: Literal["straight", "curved"] = "curved"
     """Shape without load: straight (no rest curvature is fitted) or curved."""
@@ -69,26 +80,15 @@ class Cable(Section):
 
     @model_validator(mode="after")
     def _plausible(self) -> Cable:
-        problems = implausible_sizes(
-            self.length, self.prior_mass, self.diameter, self.bending_stiffness
-        )
-        if self.youngs_modulus is not None and self.bending_stiffness is None:
-            stiffness = self.prior_bending_stiffness
-            problems += STIFFNESS.problems(
-                ("youngs_modulus",), stiffness, " for EI = E pi d^4 / 64"
-            )
-        if self.torsional_stiffness is not None:
-            problems += STIFFNESS.problems(("torsional_stiffness",), self.torsional_stiffness)
-        if self.youngs_modulus is None and self.bending_stiffness is None:
-            problems.append(
-                Problem((), "give youngs_modulus [Pa] or bending_stiffness [N m^2], found neither")
-            )
-        if self.youngs_modulus is not None and self.bending_stiffness is not None:
-            problems.append(
-                Problem(
-                    ("bending_stiffness",), "give youngs_modulus or bending_stiffness, found both"
-                )
-            )
+        declared, young = self.bending_stiffness, self.youngs_modulus
+        problems = implausible_sizes(self.length, self.prior_mass, self.diameter, declared)
+        if (young is None) == (declared is None):
+            found, key = ("neither", ()) if young is None else ("both", ("bending_stiffness",))
+            text = f"give youngs_modulus [Pa] or bending_stiffness [N m^2], found {found}"
+            problems.append(Problem(key, text))
+        elif young is not None:
+            said = " for EI = E pi d^4 / 64"
+            problems += STIFFNESS.problems(("youngs_modulus",), self.prior_bending_stiffness, said)
         if problems:
             raise Contradiction(*problems)
         return self
@@ -101,10 +101,6 @@ class Boundary(Section):
     """Start of the cable: pinned (free to turn) or clamped (its heading is held)."""
     end: Literal["pinned", "clamped", "free"]
     """End of the cable: pinned, clamped or free."""
-
-
-"""Names of OpenCV's predefined marker dictionaries."""
-"""Markers of the dictionaries whose name does not tell."""
 
 
 # pose_01_a -> pose_01: a digit, and letters after it.
@@ -136,13 +132,13 @@ class Pose(Section):
     its x axis; 0.5 or -0.5 tells which way a clamp is rolled by half a turn."""
     role: Literal["fit", "held_out"] = "fit"
     """fit, or held_out to check the prediction."""
-    start_force: Place | None = None
+    start_force: Force | None = None
     """Force [N] that the cable exerts on its start fixture, in the frame of gravity; what hangs
     between sensor and cable is taken off before."""
     start_moment: Moment | None = None
     """Moment [N m] that the cable exerts on its start fixture, about `start`, counter-clockwise;
     in space [mx, my, mz] about axes parallel to the world's."""
-    end_force: Place | None = None
+    end_force: Force | None = None
     """Force [N] that the cable exerts on its end fixture, as start_force."""
     end_moment: Moment | None = None
     """Moment [N m] that the cable exerts on its end fixture, about `end`, as start_moment."""
@@ -183,7 +179,7 @@ class Pose(Section):
 
     @field_validator("file", mode="before")
     @classmethod
-    def _absolute(cls, value: object, info: ValidationInfo) -> object:
+    def _absolute(cls, value: object, info: ValidationInfo) -> Path:
         if not isinstance(value, str | Path) or not str(value).strip():
             raise ValueError(f"a file name belongs here, found {show(value)}")
         if value == PLACEHOLDER:
@@ -193,29 +189,36 @@ class Pose(Section):
 
     @field_validator("files", mode="before")
     @classmethod
-    def _all_absolute(cls, value: object, info: ValidationInfo) -> object:
+    def _all_absolute(cls, value: object, info: ValidationInfo) -> tuple[Path, ...]:
         if not isinstance(value, list | tuple) or not value:
             raise ValueError(f"file names [a.jpg, b.jpg] belong here, found {show(value)}")
-        return tuple(cls._absolute(item, info) for item in value)
+        if info.data.get("file") is not None:
+            raise ValueError("give file or files, found both")
+        files = tuple(cls._absolute(item, info) for item in value)
+        if len({well_formed(file.stem) for file in files}) < len(files):
+            names = ", ".join(file.name for file in files)
+            raise ValueError(f"each photograph needs a name of its own, found {names}")
+        return files
 
     @model_validator(mode="after")
     def _shown(self) -> Pose:
         if self.file is None and not self.files:
-            text = "'file' is missing: a photograph or CSV; or files: [a.jpg, b.jpg] of photographs"
-            raise Contradiction(Problem((), text))
-        if self.file is not None and self.files:
-            raise Contradiction(Problem(("files",), "give file or files, found both"))
-        twice = [path.name for path in self.files if len(self.photographs) < len(self.files)]
-        if twice:
-            text = f"each photograph needs a name of its own, found {', '.join(twice)}"
-            raise Contradiction(Problem(("files",), text))
+            raise ValueError(
+                "'file' is missing: a photograph or CSV; or files: [a.jpg, b.jpg] of photographs"
+            )
         return self
+
+
+def _possible_gravity(gravity: tuple[float, ...]) -> tuple[float, ...]:
+    for problem in implausible_gravity(gravity):
+        raise ValueError(problem.message)
+    return gravity
 
 
 class Experiment(Section):
     """What was measured, and under which conditions."""
 
-    gravity: Place
+    gravity: Annotated[Direction, AfterValidator(_possible_gravity)]
     """Gravity in the board frame, such as [0.0, -9.81] [m/s^2]; three numbers put the cable in
     space."""
     boundary: Boundary

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.problems import PLACEHOLDER
 
 _TOP = """\
@@ -128,13 +129,5 @@ def template(
 
 
 def _quoted(text: str) -> str:
-    """Text in YAML's quotes, where it needs them: double ones for what cannot be printed."""
-    plain = text.replace("_", "").replace("/", "").replace(".", "").replace("-", "")
-    if plain.isascii() and plain.isalnum() and text[0].isalpha() and plain.lower() not in _WORDS:
-        return text
-    if not text.isprintable():
-        return '"' + text.encode("unicode_escape").decode().replace('"', '\\"') + '"'
-    return "'" + text.replace("'", "''") + "'"
-
-
-_WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
+    """Text as YAML writes it inside a list: in quotes where it needs them."""
+    return dump_yaml([text]).strip()[1:-1]

@@ -44,7 +44,7 @@ def view_pictures_of(outcome: Outcome) -> list[Picture]:
 def _picture(
     pose: PoseInput, view: ViewInput, stages: Sequence[tuple[str, str, Stage]], budget: int
 ) -> Picture:
-    viewpoint, pixels = view.sight.viewpoint, view.sight.pixels
+    viewpoint, pixels = view.seen.viewpoint, view.seen.pixels
     lines, facts, drawn = [], [], [pixels]
     for kind, label, stage in stages:
         shape = stage.shapes.get(pose.name)

@@ -121,7 +121,7 @@ def write_numbers(folder: Path, outcome: Outcome) -> None:
             write_points(lines / f"{pose.name}.csv", pose.points, pose.s)
         for k, view in enumerate(pose.views, 1):
             which = view.name.removeprefix(pose.name).lstrip("-_. ") or str(k)
-            write_table(lines / f"{pose.name}_{which}.csv", ["u_px", "v_px"], view.sight.pixels)
+            write_table(lines / f"{pose.name}_{which}.csv", ["u_px", "v_px"], view.seen.pixels)
 
 
 def draw(folder: Path, outcome: Outcome, executor: Executor) -> None:

@@ -16,7 +16,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import OfPoints
-from dlo_casadi.vision import Sight, Viewpoint, compare_pixels, nearest_in_order
+from dlo_casadi.vision import ImageCurve, Viewpoint, compare_pixels, nearest_in_order
 
 FloatArray = NDArray[np.floating]
 
@@ -43,7 +43,7 @@ class ViewInput:
     name : str
         File stem.
     image : Path
-    sight : Sight
+    seen : ImageCurve
         What is seen in it.
     places : (K, 3) [m]
         About where its pixels lie in space; nan for those that are not of the cable.
@@ -51,7 +51,7 @@ class ViewInput:
 
     name: str
     image: Path
-    sight: Sight
+    seen: ImageCurve
     places: FloatArray
 
 
@@ -180,7 +180,7 @@ class Pixels(OfPoints):
 
 def pixel_std(views: Sequence[ViewInput]) -> float:
     """Median standard deviation [m] of the pixels of photographs, at the cable's distance."""
-    return float(np.median(np.concatenate([view.sight.std * _size(view) for view in views])))
+    return float(np.median(np.concatenate([view.seen.std * _size(view) for view in views])))
 
 
 def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | None:
@@ -194,42 +194,42 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     Parameters
     ----------
     view : ViewInput
-        With a sight.
+        With what is seen in it.
     std : scalar [m]
         Standard deviation of a pixel of weight one.
     """
-    sight = view.sight
-    every = max(1, int(np.ceil(sight.correlation / sight.spacing)))
-    steps = np.linalg.norm(np.diff(sight.pixels, axis=0), axis=1)
+    curve = view.seen
+    every = max(1, int(np.ceil(curve.correlation / curve.spacing)))
+    steps = np.linalg.norm(np.diff(curve.pixels, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    sure = sight.whole & (sight.std < _UNSURE * np.median(sight.std))
+    sure = curve.whole & (curve.std < _UNSURE * np.median(curve.std))
     sure &= _across(view) > _STEEP
     foreign = np.concatenate([[0.0], along[~sure], along[-1:]])
-    away = np.abs(along[:, None] - foreign).min(axis=1) > _REACH * sight.correlation / np.sqrt(
+    away = np.abs(along[:, None] - foreign).min(axis=1) > _REACH * curve.correlation / np.sqrt(
         np.pi
     )
     kept = np.flatnonzero(away & sure)[::every]
     if len(kept) < 2:
         return None
-    size, pixels, points = _size(view), sight.pixels[kept], view.places[kept]
+    size, pixels, points = _size(view), curve.pixels[kept], view.places[kept]
     tangent = np.gradient(pixels, axis=0)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    viewpoint = sight.viewpoint
+    viewpoint = curve.viewpoint
     by_shift = np.einsum("ki,kij->kj", normal, viewpoint.project(points)[1])
     by_shift = by_shift @ viewpoint.rotation.T
     by_turn = np.cross(viewpoint.in_camera(points), by_shift)
     error = np.linalg.cholesky(viewpoint.covariance)
     together = size * np.column_stack([by_turn, by_shift]) @ error
-    weight = sight.std[kept] * size / std
+    weight = curve.std[kept] * size / std
     # Of an average with a Gaussian, whose errors are correlated over sqrt(2) of its own length.
-    grain = np.sqrt(2.0 / np.pi) * sight.correlation * size
-    return Pixels(viewpoint, pixels, sight.diameter, points, weight, size, together, grain, on_line)
+    grain = np.sqrt(2.0 / np.pi) * curve.correlation * size
+    return Pixels(viewpoint, pixels, curve.diameter, points, weight, size, together, grain, on_line)
 
 
 def _across(view: ViewInput) -> FloatArray:
     """Sine (K,) of the angle between cable and line of sight; 0 where no place is known."""
-    places = view.sight.viewpoint.in_camera(view.places)
+    places = view.seen.viewpoint.in_camera(view.places)
     along = np.gradient(places, axis=0)
     sizes = np.linalg.norm(along, axis=1) * np.linalg.norm(places, axis=1)
     sine = np.linalg.norm(np.cross(along, places), axis=1) / np.maximum(sizes, 1e-300)
@@ -238,6 +238,6 @@ def _across(view: ViewInput) -> FloatArray:
 
 def _size(view: ViewInput) -> float:
     """Size [m] of a pixel of a photograph at the cable, the median."""
-    viewpoint = view.sight.viewpoint
+    viewpoint = view.seen.viewpoint
     depth = viewpoint.in_camera(view.places)[:, 2]
     return float(np.nanmedian(depth)) / viewpoint.camera.focal

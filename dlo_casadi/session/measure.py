@@ -181,20 +181,20 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
         length=config.cable.length,
     )
     problems += views.problems.values()
-    if not views.sights:
+    if not views.curves:
         raise MeasurementError(" ".join([*problems, *views.messages]))
     points = np.zeros((0, 3)) if views.line is None else views.line.points
-    numbers = [set(sight.viewpoint.numbers) for sight in views.sights.values()]
+    numbers = [set(curve.viewpoint.numbers) for curve in views.curves.values()]
     return PoseInput(
         pose.name,
         pose.role,
         points[:: max(1, -(-len(points) // MOST_POINTS))],
-        confidence=min(sight.confidence for sight in views.sights.values()),
+        confidence=min(curve.confidence for curve in views.curves.values()),
         messages=(*problems, *views.messages),
         markers=tuple(sorted(set.intersection(*numbers))),
         views=tuple(
-            ViewInput(name, pose.photographs[name], sight, views.places[name])
-            for name, sight in views.sights.items()
+            ViewInput(name, pose.photographs[name], curve, views.places[name])
+            for name, curve in views.curves.items()
         ),
     )
 
@@ -221,7 +221,7 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
         weight=(line.std / np.median(line.std))[kept],
         coverage=line.coverage,
         confidence=line.confidence,
-        messages=(*line.messages, *_marker_messages(config, view)),
+        messages=(*line.messages, *view.messages),
         markers=view.numbers,
     )
 
@@ -309,19 +309,6 @@ def _steps_in_space(config: Config, pose: DeclaredPose, image: np.ndarray) -> di
     )
 
 
-def _marker_messages(config: Config, view: vision.View) -> list[str]:
-    """Sentences on markers of the board that were not used."""
-    measurement = config.experiment.measurement
-    if measurement.kind != "images" or measurement.board is None:
-        return []
-    declared = set(measurement.board.marker_centers)
-    used = f"{len(view.numbers)} of {len(declared)} are used"
-    lost = sorted(declared - set(view.numbers) - set(view.misplaced))
-    messages = [f"marker {n} not found; {used}" for n in lost]
-    messages += [f"marker {n} is not where it is declared; {used}" for n in view.misplaced]
-    return messages
-
-
 def _turned(config: Config, pose: DeclaredPose, image: np.ndarray) -> str:
     """Sentence for a photograph that can be measured once it is turned.
 
@@ -349,11 +336,9 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
     measurement = config.experiment.measurement
     assert measurement.kind == "images"
     if measurement.reference is not None:
-        reference = vision.Reference(
-            np.array(measurement.reference.pixels), np.array(measurement.reference.points)
-        )
-        _check_reference(reference.pixels, image.shape)
-        return vision.from_reference(reference, image.shape)
+        pixels = np.array(measurement.reference.pixels)
+        _check_reference(pixels, image.shape)
+        return vision.from_reference(pixels, measurement.reference.points, image.shape)
     camera = None if measurement.camera is None else _camera(measurement.camera)
     return vision.locate_board(image, board_of(measurement), camera)
 

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.image import spoilt
-from dlo_casadi.vision.view import Array, Camera, View
-from dlo_casadi.vision.viewpoint import Viewpoint
+from dlo_casadi.vision.view import Array, Camera, View, Viewpoint
 
 MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
 LEAST_MARKERS = 3  # for the pose of a camera: fewer span no more than a line of the board
-_BEST_CORNER_PX = 0.05  # what sampling and rounding to grey levels leave of a corner at least
-# Of no more than so many times the size a picture is made smaller or larger.
+_BEST_CORNER_PX = 0.05  # least error of a corner, from sampling and rounding to grey levels
+# Largest factor by which a picture is taken to have been made smaller or larger.
 _RESIZED = 20.0
 CORNERS_THAT_SHARE = 4  # corners that share light, blur and print: those of a marker count as one
 
@@ -81,17 +80,16 @@ def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None =
             "plane can be measured. Try: give camera.matrix, or standoff: 0."
         )
     seen, repeated = detect_markers(image, board)
-    found, plane, rms = _agreeing(seen, image.shape, board, camera)
-    normal = np.cross(plane[:, 0], plane[:, 1])
-    raised = plane + board.standoff * np.outer(normal, [0.0, 0.0, 1.0])
+    fit = _agreeing(seen, image.shape, board, camera)
+    normal = np.cross(fit.plane[:, 0], fit.plane[:, 1])
     return View(
-        raised,
+        fit.plane + board.standoff * np.outer(normal, [0.0, 0.0, 1.0]),
         (image.shape[0], image.shape[1]),
         camera,
-        rms,
-        np.array(list(found.values())),
-        tuple(sorted(found)),
-        tuple(sorted((set(seen) - set(found)) | repeated)),
+        fit.rms,
+        np.array(list(fit.found.values())),
+        tuple(sorted(fit.found)),
+        _unused(board, seen, repeated, fit),
     )
 
 
@@ -115,22 +113,16 @@ def locate_camera(image: NDArray[np.uint8], board: Board, camera: Camera) -> Vie
         If fewer than three of the board's markers are seen where they are declared.
     """
     seen, repeated = detect_markers(image, board)
-    messages = [
-        f"marker {n} is seen more than once and not used. Try: cover or remove the copy."
-        for n in sorted(repeated)
-    ]
     if len(seen) < LEAST_MARKERS:
         raise VisionError(
             f"the camera's place needs {LEAST_MARKERS} markers of the board, and "
             f"{'only ' if seen else ''}{sorted(seen)} of {sorted(board.marker_centers)} are seen. "
             "Try: a photograph with the whole board in it, sharp and not covered."
             + spoilt(image)
-            + "".join(f" The {message[:1].lower()}{message[1:]}" for message in messages)
+            + "".join(f" The {_copied(n)}" for n in sorted(repeated))
         )
-    found, plane, rms = _agreeing(seen, image.shape, board, camera)
-    for n in sorted(set(board.marker_centers) - set(found) - repeated):
-        why = "is not where it is declared" if n in seen else "is not found"
-        messages.append(f"marker {n} {why}; {len(found)} of {len(board.marker_centers)} are used")
+    fit = _agreeing(seen, image.shape, board, camera)
+    found, plane = fit.found, fit.plane
     if len(found) < LEAST_MARKERS:
         raise VisionError(
             f"the camera's place needs {LEAST_MARKERS} markers of the board where they are "
@@ -143,45 +135,65 @@ def locate_camera(image: NDArray[np.uint8], board: Board, camera: Camera) -> Vie
         rotation,
         plane[:, 2],
         (image.shape[0], image.shape[1]),
-        _pose_covariance(corners @ rotation[:, :2].T + plane[:, 2], rms, camera),
-        rms,
+        _pose_covariance(corners @ rotation[:, :2].T + plane[:, 2], fit.rms, camera),
+        fit.rms,
         np.array(list(found.values())),
         tuple(sorted(found)),
-        tuple(messages),
+        _unused(board, seen, repeated, fit),
     )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The board's plane as markers show it."""
+
+    found: dict[int, Array]  # corners (4, 2) [px] of each marker
+    plane: Array  # (3, 3), homography to pixels; with a camera [r_1, r_2, t]
+    errors: dict[int, float]  # [px], RMS of each marker
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt(np.mean(np.square(list(self.errors.values())))))
+
+    @property
+    def worst(self) -> float:
+        return max(self.errors.values())
 
 
 def _agreeing(
     seen: dict[int, Array], shape: tuple[int, ...], board: Board, camera: Camera | None
-) -> tuple[dict[int, Array], Array, float]:
-    """Markers that agree with their declared places, the board's plane and their RMS error [px].
-
-    Raises
-    ------
-    VisionError
-        If there is none, or if more than half of them contradict their declared places.
-    """
+) -> _Fit:
+    """Fit of the markers that agree with their declared places."""
     if not seen:
         raise VisionError(
             "every marker of the board is seen more than once. Try: cover or remove the copies."
         )
-    found = seen
-    places = {marker: board.corners(marker) for marker in found}
-    plane, errors = _fit(found, places, camera)
-    if camera is not None and (text := _other_picture(found, places, camera, shape)):
+    fit = _fit(seen, board, camera)
+    if camera is not None and (text := _other_picture(fit, board, camera, shape)):
         raise VisionError(text)
-    majority = len(found) // 2 + 1
-    while max(errors.values()) > MAX_ERROR_PX and len(found) > majority:
-        found, plane, errors = _without_worst(found, places, camera)
-    rms = _rms(errors)
-    if rms > MAX_ERROR_PX:
+    while fit.worst > MAX_ERROR_PX and len(fit.found) > len(seen) // 2 + 1:
+        rests = [{n: q for n, q in fit.found.items() if n != left_out} for left_out in fit.found]
+        fit = min((_fit(rest, board, camera) for rest in rests), key=lambda trial: trial.worst)
+    if fit.rms > MAX_ERROR_PX:
         raise VisionError(
-            f"the markers {sorted(found)} are {rms:.1f} px RMS off their declared places. "
+            f"the markers {sorted(fit.found)} are {fit.rms:.1f} px RMS off their declared places. "
             "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
             f"The picture is {shape[1]} x {shape[0]} px."
             f"{_other_axes(seen, board, camera)}"
         )
-    return found, plane, rms
+    return fit
+
+
+def _copied(n: int) -> str:
+    return f"marker {n} is seen more than once and not used. Try: cover or remove the copy."
+
+
+def _unused(board: Board, seen: dict[int, Array], repeated: set[int], fit: _Fit) -> tuple[str, ...]:
+    """Sentences on the markers of the board that were not used."""
+    used = f"{len(fit.found)} of {len(board.marker_centers)} are used"
+    lost = sorted(set(board.marker_centers) - set(fit.found) - repeated)
+    why = {n: "is not where it is declared" if n in seen else "is not found" for n in lost}
+    return (*map(_copied, sorted(repeated)), *(f"marker {n} {why[n]}; {used}" for n in lost))
 
 
 def _pose_covariance(at: Array, rms: float, camera: Camera) -> Array:
@@ -191,9 +203,7 @@ def _pose_covariance(at: Array, rms: float, camera: Camera) -> Array:
     together. On rendered boards poses are off by up to five times what sixteen independent
     corners would leave.
     """
-    still = np.zeros(3)
-    slopes = cv2.projectPoints(at, still, still, camera.matrix, camera.distortion)[1]
-    by_shift = np.asarray(slopes[:, 3:6], float).reshape(-1, 2, 3)
+    by_shift = camera.project(at)[1]
     by_turn = np.cross(at[:, None, :], by_shift)
     J = np.concatenate([by_turn, by_shift], axis=2).reshape(-1, 6)
     free = 2 * len(at) - 6
@@ -201,13 +211,7 @@ def _pose_covariance(at: Array, rms: float, camera: Camera) -> Array:
     return np.asarray(np.linalg.inv(J.T @ J) * scatter * CORNERS_THAT_SHARE)
 
 
-def _rms(errors: Mapping[int, float]) -> float:
-    return float(np.sqrt(np.mean(np.square(list(errors.values())))))
-
-
-def _other_picture(
-    found: dict[int, Array], places: dict[int, Array], camera: Camera, shape: tuple[int, ...]
-) -> str:
+def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, ...]) -> str:
     """Sentence on a matrix of a picture of another size, or turned; empty if it fits as it is.
 
     A principal point is near the middle of the picture that it was found in.
@@ -215,28 +219,27 @@ def _other_picture(
     height, width = shape[:2]
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
     size = float(np.sqrt(4 * abs(cx * cy) / (width * height)))
-    scaled = (fx / size, fy / size, cx / size, cy / size) if 1 / _RESIZED < size < _RESIZED else ()
     turn = "turn it back, as the pictures that it was calibrated with; was its EXIF tag lost?"
-    others = {
-        (
-            f"divided by {size:.3g}",
-            f"pictures of the size that it was calibrated with, or fx, fy, cx, cy over {size:.3g}.",
-        ): scaled,
-        ("turned by 90 degrees", turn): (fy, fx, cy, height - 1 - cx),
-        ("turned by -90 degrees", turn): (fy, fx, width - 1 - cy, cx),
-        ("turned by 180 degrees", turn): (fx, fy, width - 1 - cx, height - 1 - cy),
-    }
-    errors = {}
-    for said, (a, b, u, v) in ((said, numbers) for said, numbers in others.items() if numbers):
-        other = Camera(np.array([[a, 0.0, u], [0.0, b, v], [0.0, 0.0, 1.0]]), camera.distortion)
-        errors[said] = _rms(_fit(found, places, other)[1])
-    own, (how, cure) = _rms(_fit(found, places, camera)[1]), min(errors, key=lambda k: errors[k])
-    if max(errors[how, cure], _BEST_CORNER_PX) > own / 2:
+    others = [
+        ("turned by 90 degrees", turn, (fy, fx, cy, height - 1 - cx)),
+        ("turned by -90 degrees", turn, (fy, fx, width - 1 - cy, cx)),
+        ("turned by 180 degrees", turn, (fx, fy, width - 1 - cx, height - 1 - cy)),
+    ]
+    if 1 / _RESIZED < size < _RESIZED:
+        cure = (
+            f"pictures of the size that it was calibrated with, or fx, fy, cx, cy over {size:.3g}."
+        )
+        scaled = (fx / size, fy / size, cx / size, cy / size)
+        others.insert(0, (f"divided by {size:.3g}", cure, scaled))
+    matrices = [np.array([[a, 0, u], [0, b, v], [0, 0, 1]]) for *_, (a, b, u, v) in others]
+    errors = [_fit(fit.found, board, Camera(m, camera.distortion)).rms for m in matrices]
+    how, cure, _ = others[int(np.argmin(errors))]
+    if max(min(errors), _BEST_CORNER_PX) > fit.rms / 2:
         return ""
     return (
         f"camera.matrix, with its principal point at ({cx:g}, {cy:g}) px, is not that of this "
-        f"picture of {width} x {height} px: the markers are {own:.2g} px RMS off their declared "
-        f"places, but {errors[how, cure]:.2g} px with the matrix {how}. Try: {cure}"
+        f"picture of {width} x {height} px: the markers are {fit.rms:.2g} px RMS off their "
+        f"declared places, but {min(errors):.2g} px with the matrix {how}. Try: {cure}"
     )
 
 
@@ -255,9 +258,8 @@ def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) ->
     """Sentence on the axes with which the declared places would fit, if some do."""
     for what, axes in _AXES.items():
         centers = {n: axes @ np.asarray(board.marker_centers[n], float) for n in found}
-        turned = replace(board, marker_centers=centers)
-        _, errors = _fit(found, {n: turned.corners(n) for n in found}, camera)
-        if len(found) > 1 and max(errors.values()) < MAX_ERROR_PX:
+        fit = _fit(found, replace(board, marker_centers=centers), camera)
+        if len(found) > 1 and fit.worst < MAX_ERROR_PX:
             return f" With {what} in marker_centers they fit."
     return ""
 
@@ -342,52 +344,29 @@ def _meet(one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
     return one[0] + steps[0] * one[1]
 
 
-def _fit(
-    found: dict[int, Array], places: dict[int, Array], camera: Camera | None
-) -> tuple[Array, dict[int, float]]:
-    """Homography of the board's plane ([r_1, r_2, t] with a camera), errors per marker [px]."""
+def _fit(found: dict[int, Array], board: Board, camera: Camera | None) -> _Fit:
+    """Fit the board's plane to markers."""
     pixels = np.vstack(list(found.values()))
-    points = np.vstack([places[marker] for marker in found])
+    points = np.vstack([board.corners(marker) for marker in found])
     if camera is None:
-        homography, _ = cv2.findHomography(points, pixels)
-        projected = View(homography, (1, 1)).to_pixels(points)
+        plane, _ = cv2.findHomography(points, pixels)
+        projected = View(plane, (1, 1)).to_pixels(points)
     else:
         solid = np.column_stack([points, np.zeros(len(points))])
-        _, rotation, shift = _pose(solid, pixels, camera)
-        projected = cv2.projectPoints(solid, rotation, shift, camera.matrix, camera.distortion)[0]
-        axes = cv2.Rodrigues(rotation)[0]
-        homography = np.column_stack([axes[:, :2], shift.ravel()])
-    miss = np.sum((projected.reshape(-1, 4, 2) - pixels.reshape(-1, 4, 2)) ** 2, axis=2)
-    return homography, dict(zip(found, np.sqrt(miss.mean(axis=1)), strict=True))
+        rotation, shift, projected = _pose(solid, pixels, camera)
+        plane = np.column_stack([cv2.Rodrigues(rotation)[0][:, :2], shift.ravel()])
+    miss = np.sum((projected - pixels) ** 2, axis=1).reshape(-1, 4)
+    return _Fit(found, plane, dict(zip(found, np.sqrt(miss.mean(axis=1)), strict=True)))
 
 
-def _pose(solid: Array, pixels: Array, camera: Camera) -> tuple[float, Array, Array]:
-    """Pose of least reprojection error among the two that a plane allows."""
-    _, rotations, shifts, _ = cv2.solvePnPGeneric(
-        solid, pixels, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE
-    )
-    best: tuple[float, Array, Array] | None = None
-    for rotation, shift in zip(rotations, shifts, strict=True):
-        polished = cv2.solvePnPRefineLM(
-            solid, pixels, camera.matrix, camera.distortion, rotation.copy(), shift.copy()
-        )
-        seen = cv2.projectPoints(solid, *polished, camera.matrix, camera.distortion)[0]
-        error = float(np.mean((seen.reshape(-1, 2) - pixels) ** 2))
-        if best is None or error < best[0]:
-            best = (error, *polished)
-    if best is None:
-        raise VisionError("the pose of the board cannot be solved from its markers.")
-    return best
-
-
-def _without_worst(
-    found: dict[int, Array], places: dict[int, Array], camera: Camera | None
-) -> tuple[dict[int, Array], Array, dict[int, float]]:
-    """Leave out the marker without which the others agree best."""
+def _pose(solid: Array, pixels: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    """Pose of least reprojection error among the two that a plane allows, and its pixels."""
+    lens = camera.matrix, camera.distortion
+    _, rotations, shifts, _ = cv2.solvePnPGeneric(solid, pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
     trials = []
-    for marker in found:
-        rest = {n: q for n, q in found.items() if n != marker}
-        homography, errors = _fit(rest, places, camera)
-        trials.append((max(errors.values()), rest, homography, errors))
-    _, rest, homography, errors = min(trials, key=lambda trial: trial[0])
-    return rest, homography, errors
+    for rotation, shift in zip(rotations, shifts, strict=True):
+        pose = cv2.solvePnPRefineLM(solid, pixels, *lens, rotation.copy(), shift.copy())
+        trials.append((*pose, cv2.projectPoints(solid, *pose, *lens)[0][:, 0]))
+    if not trials:
+        raise VisionError("the pose of the board cannot be solved from its markers.")
+    return min(trials, key=lambda trial: float(np.mean((trial[2] - pixels) ** 2)))

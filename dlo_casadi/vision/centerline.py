@@ -8,20 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.ordering import Course
-from dlo_casadi.vision.search import find_cable
+from dlo_casadi.vision.curve import length_of
+from dlo_casadi.vision.search import Workings, find_cable
 from dlo_casadi.vision.trace import Trace, trace_cable
 from dlo_casadi.vision.view import Array, View
-from dlo_casadi.vision.workings import Workings
-from dlo_casadi.vision.workplane import rectify
+from dlo_casadi.vision.workplane import ExpectedLine, rectify
 
-_SPACING = 0.0025  # m
+SPACING = 0.0025  # m, between points of a line
 _MOST_POINTS = 400
-_FAR = 0.2  # of the length: a line that ends so far from a fixture in the picture is not the cable
-_LEAST = 0.2  # of the length: what must be measured
-_AROUND = 0.3  # of the length: how far beyond its reach other cables are looked for, in a plane
-_DOUBTFUL = 0.8  # confidence below which a user is told why
-_SHORT = 0.97  # of the length: a line that ends at both fixtures and is shorter is not to scale
+_FAR = 0.2  # largest distance of the line's end from a fixture in the picture, of the length
+_LEAST = 0.2  # least part of the length that must be measured
+_DOUBTFUL = 0.8  # confidence below which a message says why
+_SHORT = 0.97  # of the length: a shorter line between both fixtures is not to scale
 
 
 @dataclass(frozen=True)
@@ -89,11 +87,9 @@ def extract_centerline(
     from the normal of the board, has its silhouette's middle r^2 tan(a) / D beside its axis: 7 um
     for r = 6 mm, D = 1.7 m, a = 17 degrees, and therefore left uncorrected.
     """
-    first = np.asarray(start, float)
     last = None if end is None else np.asarray(end, float)
-    measured = measure_line(
-        image, view, first, last, diameter, Course(length, length), workings or Workings()
-    )
+    expected = ExpectedLine(np.asarray(start, float), last, diameter, length, length)
+    measured = measure_line(image, view, expected, workings or Workings())
     trace, kept, gaps, seen = measured.trace, measured.kept, measured.gaps, measured.seen
     points = trace.points[kept]
     return Centerline(
@@ -105,7 +101,7 @@ def extract_centerline(
         measured.confidence,
         (
             *_gap_messages(trace, kept, gaps, length),
-            *_messages(points, seen, first, last, length),
+            *_fit_messages(points, seen, expected),
             *measured.messages,
         ),
     )
@@ -113,101 +109,59 @@ def extract_centerline(
 
 @dataclass(frozen=True)
 class MeasuredLine:
-    """The trace of a cable and what of it counts.
-
-    Parameters
-    ----------
-    trace : Trace
-        The middle of the cable, profile by profile.
-    kept : (K,) int
-        Sound profiles, evenly spaced.
-    gaps : tuple of int
-        Indices of the kept ones after which a stretch is missing.
-    seen : scalar [m]
-        Length along the kept ones, without the gaps.
-    confidence : scalar in 0..1
-        Share of the line inside the picture that was measured soundly.
-    messages : tuple of str
-        On its width and soundness.
-    """
+    """The trace of a cable and what of it counts."""
 
     trace: Trace
-    kept: NDArray[np.intp]
-    gaps: tuple[int, ...]
-    seen: float
-    confidence: float
-    messages: tuple[str, ...]
+    kept: NDArray[np.intp]  # (K,), sound profiles, evenly spaced
+    gaps: tuple[int, ...]  # indices of the kept ones after which a stretch is missing
+    seen: float  # [m], length along the kept ones, without the gaps
+    confidence: float  # share of the line inside the picture that was measured soundly
+    messages: tuple[str, ...]  # on its width and soundness
 
 
 def measure_line(
-    image: NDArray[np.uint8],
-    view: View,
-    start: Array,
-    end: Array | None,
-    diameter: float,
-    course: Course,
-    workings: Workings,
+    image: NDArray[np.uint8], view: View, expected: ExpectedLine, workings: Workings
 ) -> MeasuredLine:
-    """Find the line in a plane, trace it, and choose the sound and evenly spaced profiles.
+    """Find the line in a plane, trace it, and choose the sound and evenly spaced profiles."""
+    diameter = expected.diameter
+    workings.plane = rectify(image, view, expected)
+    chain = find_cable(workings.plane, expected, workings)
+    workings.trace = trace = trace_cable(image, view, chain.strands, expected)
 
-    Raises
-    ------
-    VisionError
-        If no cable or more than one is found, or if it does not lead to the fixtures.
-    """
-    plane = rectify(
-        image,
-        view,
-        start=start,
-        end=end,
-        diameter=diameter,
-        length=course.longest,
-        margin=0.0 if course.in_space else _AROUND * course.longest,
-    )
-    workings.plane = plane
-    chain = find_cable(
-        plane, start=start, end=end, diameter=diameter, course=course, workings=workings
-    )
-    trace = trace_cable(
-        image,
-        view,
-        chain.strands,
-        start=start,
-        end=end,
-        diameter=diameter,
-        in_space=course.in_space,
-    )
-    workings.trace = trace
-
-    step = max(_SPACING, float(trace.t[-1] - trace.t[0]) / _MOST_POINTS)
+    step = max(SPACING, float(trace.t[-1] - trace.t[0]) / _MOST_POINTS)
     kept = np.nonzero(trace.sound)[0]
     kept = kept[np.unique(np.floor(trace.t[kept] / step), return_index=True)[1]]
     jumps = np.diff(trace.t[kept])
     missing = jumps > max(2.5 * step, 0.5 * diameter)
     seen = float(jumps[~missing].sum())
-    if seen < _LEAST * course.typical:
+    found = f"no cable found: a line of {chain.supported:.3f} m was found, but "
+    if seen < _LEAST * expected.typical:
         raise VisionError(
-            f"no cable found: a line of {chain.supported:.3f} m was found, but only {seen:.3f} m "
-            f"of it look like a cable of {1e3 * diameter:.1f} mm with an edge on both sides. "
-            "Try: the right diameter; a sharper photograph; a plainer background; more contrast."
+            f"{found}only {seen:.3f} m of it look like a cable of {1e3 * diameter:.1f} mm with an "
+            "edge on both sides. Try: the right diameter; a sharper photograph; a plainer "
+            "background; more contrast."
         )
-    width = trace.shape.width
-    if not 0.45 * diameter < width < max(1.7 * diameter, diameter + 2.5 / view.scale):
+    width, pixel = trace.shape.width, 1.0 / view.scale
+    if not 0.45 * diameter < width < max(1.7 * diameter, diameter + 2.5 * pixel):
         raise VisionError(
-            f"no cable found: a line of {chain.supported:.3f} m was found, but it is "
-            f"{1e3 * width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm. "
+            f"{found}it is {1e3 * width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm. "
             "Try: the right diameter, in metres; is the cable in the picture?"
         )
-    _check_fixtures(trace.points[kept], view, start, end, course)
+    _check_fixtures(trace.points[kept], view, expected)
     confidence = float(np.clip(trace.sound.sum() / max(1, trace.inside.sum()), 0.0, 1.0))
-    return MeasuredLine(
-        trace,
-        kept,
-        tuple(int(i) for i in np.nonzero(missing)[0]),
-        seen,
-        confidence,
-        (*_width_message(width, diameter, 1.0 / view.scale), *_confidence_message(confidence)),
-    )
+    messages = []
+    if abs(width - diameter) >= 0.3 * diameter + pixel:
+        messages.append(
+            f"the line is {1e3 * width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm: "
+            "check the diameter, and whether a shadow was taken for the cable"
+        )
+    if confidence < _DOUBTFUL:
+        messages.append(
+            f"only {100 * confidence:.0f} % of the line look like a cable with an edge on both "
+            "sides: a sharper photograph, a plainer background or more contrast would help"
+        )
+    gaps = tuple(int(i) for i in np.nonzero(missing)[0])
+    return MeasuredLine(trace, kept, gaps, seen, confidence, tuple(messages))
 
 
 def _in_picture(point: Array, view: View) -> bool:
@@ -216,18 +170,12 @@ def _in_picture(point: Array, view: View) -> bool:
     return bool(0 <= u <= width - 1 and 0 <= v <= height - 1)
 
 
-def _check_fixtures(
-    points: Array, view: View, start: Array, end: Array | None, course: Course
-) -> None:
+def _check_fixtures(points: Array, view: View, expected: ExpectedLine) -> None:
     """Raise if the line ends far from a fixture that is in the picture."""
-    places = [("start", start, points[0])]
-    if end is not None:
-        places.append(("end", end, points[-1]))
-    for name, fixture, tip in places:
-        away = float(np.linalg.norm(tip - fixture))
-        if away <= _FAR * course.typical or not _in_picture(fixture, view):
+    for name, fixture, tip, away in expected.tips(points):
+        if away <= _FAR * expected.typical or not _in_picture(fixture, view):
             continue
-        if course.in_space:
+        if expected.in_space:
             (u, v), (at_u, at_v) = view.to_pixels([fixture, tip])
             raise VisionError(
                 f"the cable does not reach its {name}: the line found ends at ({at_u:.0f}, "
@@ -240,25 +188,6 @@ def _check_fixtures(
             f"({fixture[0]:.3f}, {fixture[1]:.3f}) m, at ({tip[0]:.3f}, {tip[1]:.3f}) m. "
             f"Try: {name} in metres and in the board frame? Is the cable hidden there?"
         )
-
-
-def _width_message(width: float, diameter: float, pixel: float) -> tuple[str, ...]:
-    """Warn of a line that is much wider or thinner than the cable."""
-    if abs(width - diameter) < 0.3 * diameter + pixel:
-        return ()
-    return (
-        f"the line is {1e3 * width:.1f} mm wide and the cable {1e3 * diameter:.1f} mm: "
-        "check the diameter, and whether a shadow was taken for the cable",
-    )
-
-
-def _confidence_message(confidence: float) -> tuple[str, ...]:
-    if confidence >= _DOUBTFUL:
-        return ()
-    return (
-        f"only {100 * confidence:.0f} % of the line look like a cable with an edge on both sides: "
-        "a sharper photograph, a plainer background or more contrast would help",
-    )
 
 
 def _gap_messages(
@@ -282,32 +211,25 @@ def _gap_messages(
     return messages
 
 
-def _messages(
-    points: Array, seen: float, start: Array, end: Array | None, length: float
-) -> list[str]:
+def _fit_messages(points: Array, seen: float, expected: ExpectedLine) -> list[str]:
     """Sentences on how the line fits the fixtures and the length."""
-    messages = []
-    ends = [("start", start, 0)]
-    if end is not None:
-        ends.append(("end", end, -1))
-    for name, fixture, k in ends:
-        away = float(np.linalg.norm(points[k] - fixture))
+    messages, length, whole = [], expected.typical, length_of(points)
+    for name, _, _, away in expected.tips(points):
         if away > max(0.03 * length, 0.01):
             messages.append(f"the measured line stops {away:.3f} m before the {name} fixture")
-    whole = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    if end is not None:
-        whole += float(np.linalg.norm(points[0] - start) + np.linalg.norm(points[-1] - end))
+        if expected.end is not None:
+            whole += away
     off = f"{100 * abs(whole / length - 1):.1f} %"
     if whole > 1.03 * length:
         messages.append(
             f"the line found is {off} longer than declared ({whole:.3f} of {length:g} m): "
             "check the scale and the length"
         )
-    elif end is not None and whole < _SHORT * length:
+    elif expected.end is not None and whole < _SHORT * length:
         messages.append(
             f"the line found is {off} shorter than declared ({whole:.3f} of {length:g} m, up to "
             "both fixtures): check the scale and the length"
         )
-    elif end is None and seen < 0.9 * length:
+    elif expected.end is None and seen < 0.9 * length:
         messages.append(f"only {seen:.3f} m of {length:g} m were measured")
     return messages

@@ -16,21 +16,11 @@ _SIGNIFICANT = 5.0  # standard deviations of the background's noise
 
 @dataclass(frozen=True)
 class Contrast:
-    """Difference of a picture from its local background, in units of the background's noise.
+    """Difference of a picture from its local background, in units of the background's noise."""
 
-    Parameters
-    ----------
-    difference : (h, w, 3)
-        (pixel - background) / noise, per channel.
-    reachable : (h, w) bool
-        Pixels that count.
-    noise : (3,)
-        Robust standard deviation per channel [grey levels].
-    """
-
-    difference: NDArray[np.float32]
-    reachable: NDArray[np.bool_]
-    noise: Array
+    difference: NDArray[np.float32]  # (h, w, 3), (pixel - background) / noise, per channel
+    reachable: NDArray[np.bool_]  # (h, w), pixels that count
+    noise: Array  # (3,) [grey levels], robust standard deviation per channel
 
 
 def local_contrast(
@@ -50,18 +40,11 @@ def local_contrast(
 
 
 def candidate_maps(contrast: Contrast, area_px: float) -> Iterator[NDArray[np.float32]]:
-    """Scalar pictures in which the cable may be bright, the likeliest first.
+    """Scalar pictures in which a cable of an area [px^2] may be bright, the likeliest first.
 
     The strongest pixels fall into a few directions of colour (dark, bright, orange, ...); each
     gives one picture, the difference projected on it. The last one is the plain size of the
     difference: it finds a cable that changes its colour on the way.
-
-    Parameters
-    ----------
-    contrast : Contrast
-        From `local_contrast`.
-    area_px : scalar [px^2]
-        Area that the whole cable covers.
     """
     strength = np.linalg.norm(contrast.difference, axis=2)
     level = _upper_level(strength[contrast.reachable], 3.0 * area_px)
@@ -97,6 +80,6 @@ def _upper_level(values: NDArray[np.float32], area: float) -> float:
     """Value that is exceeded in `area` pixels; zero where nothing significant is left."""
     high = values[values > _SIGNIFICANT]
     rank = int(max(area, 1))
-    return (
-        float(np.partition(high, high.size - rank)[high.size - rank]) if high.size >= rank else 0.0
-    )
+    if high.size < rank:
+        return 0.0
+    return float(np.partition(high, high.size - rank)[high.size - rank])

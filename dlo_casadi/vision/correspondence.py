@@ -7,34 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.vision.sight import Sight
+from dlo_casadi.vision.image_curve import ImageCurve
 from dlo_casadi.vision.view import Array
 
-_CAP = 3.0  # standard deviations: from there on, a pair costs as much as a pixel that is left over
-_GOOD = 2.0  # standard deviations: a pair
-_STEP = 0.05  # cost of a pair: of equal ways, along an epipolar line, the shortest is taken
+_CAP = 3.0  # standard deviations at which a pair costs as much as a pixel that is left over
+_GOOD = 2.0  # largest distance of the pixels of a pair, standard deviations
+_STEP = 0.05  # cost of a pair: prefers the shortest of equal ways along an epipolar line
 _NEAR_PX = 2.0  # how far off a curve may be seen; pixels three times as far are not of it
-_POSE_PX = 0.5  # px: what the cameras' places add to the error of an epipolar line
+_POSE_PX = 0.5  # error of an epipolar line from the cameras' places
 
 
 @dataclass(frozen=True)
 class Match:
-    """Pairs of pixels of two photographs, in order along the cable.
+    """Pairs of pixels of two photographs, in order along the cable."""
 
-    Parameters
-    ----------
-    first, second : (P,) int
-        Their places in the two lines.
-    share : scalar in 0..1
-        Share of the pixels of both lines that found a partner on their epipolar line.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    share: float
+    first: NDArray[np.intp]  # (P,), their places in the two lines
+    second: NDArray[np.intp]
+    share: float  # of the pixels of both lines that found a partner on their epipolar line
 
 
-def match_lines(one: Sight, other: Sight) -> Match:
+def match_lines(one: ImageCurve, other: ImageCurve) -> Match:
     """Match two lines, in order, by the distances from each other's epipolar lines.
 
     For rays a and b of the same point b^T E a = 0, with the essential matrix E = [t]_x R of the
@@ -55,30 +47,30 @@ def match_lines(one: Sight, other: Sight) -> Match:
     variance = one.std[:, None] ** 2 + other.std[None, :] ** 2 + _POSE_PX**2
     off /= np.sqrt(variance)
     cost = np.minimum(off, _CAP) ** 2 + _STEP
-    first, second = cheapest_way(cost)
+    first, second = _cheapest_way(cost)
     good = off[first, second] < _GOOD
     first, second = first[good], second[good]
     found = len(np.unique(first)) + len(np.unique(second))
     return Match(first, second, found / (len(one.pixels) + len(other.pixels)))
 
 
-def places_along(sight: Sight, points: Array) -> Array:
-    """Where along a curve the pixels of a photograph lie, in order.
+def places_along(curve: ImageCurve, points: Array) -> Array:
+    """Where along a line in space the pixels of a photograph lie, in order.
 
     Parameters
     ----------
-    sight : Sight
+    curve : ImageCurve
         What is seen.
     points : (M, 3) [m]
-        Along the curve, evenly and closely spaced.
+        Along the line in space, evenly and closely spaced.
 
     Returns
     -------
     (K,) share of the way along the curve, 0 to 1, of the point that is seen nearest to each pixel;
     nan where none is near.
     """
-    seen = sight.viewpoint.to_pixels(points)
-    away = np.linalg.norm(sight.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX
+    seen = curve.viewpoint.to_pixels(points)
+    away = np.linalg.norm(curve.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX
     found = nearest_in_order(np.minimum(away, _CAP))
     off = away[np.arange(len(found)), np.maximum(found, 0)]
     return np.where((found >= 0) & (off < _CAP), found / (len(points) - 1), np.nan)
@@ -90,23 +82,23 @@ def nearest_in_order(away: Array) -> NDArray[np.intp]:
     Distances in standard deviations. Of several columns of a row the nearest is taken; -1 where
     the row is left over at an end.
     """
-    first, second = cheapest_way(away**2 + _STEP)
+    first, second = _cheapest_way(away**2 + _STEP)
     order = np.argsort(-away[first, second], kind="stable")  # the nearest is written last
     found = np.full(len(away), -1)
     found[first[order]] = second[order]
     return found
 
 
-def triangulate(one: Sight, other: Sight, match: Match) -> Array:
+def triangulate(one: ImageCurve, other: ImageCurve, match: Match) -> Array:
     """Points (P, 3) [m] of least squares from the matched rays.
 
     With a = q_xy / q_z and q = R p + t each ray gives two equations, (a R_z - R_xy) p = t_xy - a
     t_z.
     """
     rows, sides = [], []
-    for sight, chosen in ((one, match.first), (other, match.second)):
-        R, t = sight.viewpoint.rotation, sight.viewpoint.translation
-        rays = sight.rays[chosen]
+    for seen, chosen in ((one, match.first), (other, match.second)):
+        R, t = seen.viewpoint.rotation, seen.viewpoint.translation
+        rays = seen.rays[chosen]
         rows.append(rays[:, :, None] * R[2] - R[:2])
         sides.append(t[:2] - rays * t[2])
     A, b = np.concatenate(rows, axis=1), np.concatenate(sides, axis=1)
@@ -114,7 +106,7 @@ def triangulate(one: Sight, other: Sight, match: Match) -> Array:
     return np.linalg.solve(normal, np.einsum("pki,pk->pi", A, b)[..., None])[..., 0]
 
 
-def _epipolar_distance(one: Sight, other: Sight) -> Array:
+def _epipolar_distance(one: ImageCurve, other: ImageCurve) -> Array:
     """Sampson's distance (K, L) [px] of all pairs of pixels."""
     R = other.viewpoint.rotation @ one.viewpoint.rotation.T
     t = other.viewpoint.translation - R @ one.viewpoint.translation
@@ -127,7 +119,7 @@ def _epipolar_distance(one: Sight, other: Sight) -> Array:
     return np.asarray(focal * np.abs(in_other @ b.T) / np.sqrt(slope))
 
 
-def cheapest_way(cost: Array) -> tuple[np.ndarray, np.ndarray]:
+def _cheapest_way(cost: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Places (P,), (P,) of the pairs on the cheapest way through a table of costs (K, L).
 
     In a row, D_l = c_l + min(A_l, D_l-1) with A the best from the row before; with C the running
@@ -151,18 +143,12 @@ def cheapest_way(cost: Array) -> tuple[np.ndarray, np.ndarray]:
     way = [(k, m)]
     while k > 0 or m > 0:
         behind = total[k, m] - cost[k, m]
-        ways = [(total[i, j], i, j) for i, j in _before(k, m)]
+        before = [(k - 1, m - 1), (k - 1, m), (k, m - 1)]
+        best, i, j = min((total[i, j], i, j) for i, j in before if i >= 0 and j >= 0)
         skipped = _CAP**2 * (m if k == 0 else k if m == 0 else np.inf)
-        best = min(ways)
-        if skipped <= behind + 1e-9 and skipped <= best[0]:
+        if skipped <= behind + 1e-9 and skipped <= best:
             break
-        _, k, m = best
+        k, m = i, j
         way.append((k, m))
     first, second = np.array(way[::-1]).T
     return first, second
-
-
-def _before(k: int, m: int) -> list[tuple[int, int]]:
-    """Pairs from which (k, m) can be reached."""
-    steps = [(k - 1, m - 1), (k - 1, m), (k, m - 1)]
-    return [(i, j) for i, j in steps if i >= 0 and j >= 0]

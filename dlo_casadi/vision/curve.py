@@ -16,15 +16,9 @@ _DEGREE = 3
 
 @dataclass(frozen=True)
 class SmoothCurve:
-    """A cubic B-spline r(t), with t close to arc length.
+    """A cubic B-spline r(t), with t close to arc length."""
 
-    Parameters
-    ----------
-    spline : BSpline
-        Vector-valued spline, t [m] -> (x, y) [m].
-    """
-
-    spline: BSpline
+    spline: BSpline  # t [m] -> (x, y) [m]
 
     def position(self, t: Array) -> Array:
         """Points (K, 2) [m] at t (K,) [m]."""
@@ -32,15 +26,24 @@ class SmoothCurve:
 
     def normal(self, t: Array) -> Array:
         """Give the unit normals (K, 2), to the left of the direction of travel."""
-        slope = np.asarray(self.spline(t, 1))
-        slope /= np.linalg.norm(slope, axis=1, keepdims=True)
-        return np.column_stack([-slope[:, 1], slope[:, 0]])
+        return normals(self.spline(t, 1))
+
+
+def normals(steps: Array) -> Array:
+    """Unit vectors (K, 2) to the left of steps (K, 2)."""
+    sizes = np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
+    return steps[:, ::-1] * [-1.0, 1.0] / sizes
 
 
 def chord_length(points: Array) -> Array:
     """Distance travelled (K,) [m] along points (K, 2) [m]."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def length_of(points: Array) -> float:
+    """Length [m] of a polygon through points (K, d) [m]."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: float) -> SmoothCurve:
@@ -51,18 +54,8 @@ def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: floa
     with knots every `knot` metres, second differences D^2 of the coefficients c, and W the sum of
     the weights per coefficient. Gaps need no special case: there the curve bends least.
 
-    Parameters
-    ----------
-    t : (K,) [m]
-        Increasing parameter of the points.
-    points : (K, 2) [m]
-        What to pass near.
-    weights : (K,)
-        Inverse variances up to a factor; zero leaves a point out.
-    knot : scalar [m]
-        Spacing of the knots.
-    smooth : scalar [m]
-        Wavelengths (over 2 pi) well below it are smoothed away.
+    `t` (K,) [m] increases along the points (K, 2) [m]; the weights (K,) are inverse variances up to
+    a factor. Wavelengths (over 2 pi) well below `smooth` are smoothed away.
     """
     lower, upper = float(t[0]), float(t[-1])
     count = max(1, round((upper - lower) / knot))
@@ -70,27 +63,12 @@ def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: floa
     knots = lower + step * np.arange(-_DEGREE, count + _DEGREE + 1)
     inside = np.clip(t, lower, upper - 1e-12 * (upper - lower))
     basis = csr_array(BSpline.design_matrix(inside, knots, _DEGREE))
-    size = len(knots) - _DEGREE - 1
+    size = basis.shape[1]
     weighted = csr_array(diags_array(weights) @ basis)
-    normal = csr_array(basis.T @ weighted)
-    banded = np.zeros((_DEGREE + 1, size))
-    for offset in range(min(_DEGREE, size - 1) + 1):
-        banded[_DEGREE - offset, offset:] = normal.diagonal(offset)
+    rough = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(size - 2, size))
     penalty = (smooth / step) ** 4 * max(float(weights.sum()), 1e-12) / size
-    for offset, row in enumerate(_second_differences(size)):
-        banded[_DEGREE - offset, offset:] += penalty * row
-    banded[_DEGREE] += 1e-12 * banded[_DEGREE].max()
+    normal = csr_array(basis.T @ weighted + penalty * (rough.T @ rough))
+    banded = np.array([np.pad(normal.diagonal(k), (k, 0)) for k in range(_DEGREE, -1, -1)])
+    banded[-1] += 1e-12 * banded[-1].max()
     coefficients = solveh_banded(banded, np.asarray(weighted.T @ points))
     return SmoothCurve(BSpline(knots, coefficients, _DEGREE))
-
-
-def _second_differences(size: int) -> list[Array]:
-    """Diagonals 0, 1, 2 of D^T D for second differences of `size` coefficients."""
-    if size < 3:
-        return [np.zeros(size)]
-    main, first = np.zeros(size), np.zeros(size - 1)
-    for shift, value in enumerate((1.0, -2.0, 1.0)):
-        main[shift : size - 2 + shift] += value**2
-    first[: size - 2] += -2.0
-    first[1:] += -2.0
-    return [main, first, np.ones(size - 2)]

@@ -9,14 +9,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+from PIL import (
+    BmpImagePlugin,
+    ImageFile,
+    JpegImagePlugin,
+    PngImagePlugin,
+    TiffImagePlugin,
+    WebPImagePlugin,
+)
 
 from dlo_casadi.errors import VisionError, counted
 
 _WHITE, _MUCH_WHITE = 250, 0.3  # grey level, and share of a picture that is overexposed
 _BLURRED_PX = 2.0  # standard deviation of edges from which markers of some 30 px are not read
-_JPEG_START = b"\xff\xd8"
-_PNG_START = b"\x89PNG\r\n\x1a\n"
 
 # Pictures with more pixels are not decoded. The camera step was measured to hold 15 bytes a pixel:
 # 1.5 GB for this many, which show a board of 1 m at 0.1 mm a pixel.
@@ -48,46 +53,45 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
     Raises
     ------
     VisionError
-        If the file is missing, not an image, cut short, or of more than `MOST_PIXELS`. Decoders
-        fill the missing part of a JPEG with grey and say nothing; its end is therefore looked for
-        here.
+        If the file is missing, not an image, cut short, or of more than `MOST_PIXELS`. OpenCV
+        fills the missing part of a JPEG with grey and says nothing; Pillow tells.
     """
     path = Path(path)
+
+    def refuse(message: str) -> VisionError:
+        return VisionError(message, pose=path.name)
+
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        raise VisionError(
-            f"no such image: {path}. Try: is the file name right, relative to the configuration?",
-            pose=path.name,
+        raise refuse(
+            f"no such image: {path}. Try: is the file name right, relative to the configuration?"
         ) from None
     except OSError as error:
-        raise VisionError(
+        raise refuse(
             f"cannot read the image {path}: {error.strerror or error}. Try: is it a file that you "
-            "are allowed to read?",
-            pose=path.name,
+            "are allowed to read?"
         ) from None
     if not data:
-        raise VisionError("the file is empty. Try: copy the photograph again.", pose=path.name)
-    if _is_truncated(data):
-        raise VisionError(
-            f"the image is truncated: it ends after {counted(len(data), 'byte')}, before its end "
-            "marker. Try: copy the photograph again.",
-            pose=path.name,
-        )
-    width, height = _declared_size(data)
+        raise refuse("the file is empty. Try: copy the photograph again.")
+    picture = _opened(data)
+    width, height = (0, 0) if picture is None else picture.size
     if width * height > MOST_PIXELS:
-        raise VisionError(
+        raise refuse(
             f"the picture is {width} x {height} px, {width * height / 1e6:.0f} million pixels; at "
             f"most {MOST_PIXELS / 1e6:.0f} million are decoded. Try: make the picture smaller (and "
-            "camera.matrix with it), or cut it to the board; is it the photograph?",
-            pose=path.name,
+            "camera.matrix with it), or cut it to the board; is it the photograph?"
+        )
+    if picture is not None and not _is_whole(picture):
+        raise refuse(
+            f"the image is truncated: its {counted(len(data), 'byte')} hold a part of the picture. "
+            "Try: copy the photograph again."
         )
     image = _decode(data) if width * height else None
     if image is None:
-        raise VisionError(
+        raise refuse(
             f"the file is not an image that can be decoded ({counted(len(data), 'byte')}). "
-            "Try: JPEG or PNG; is it the photograph?",
-            pose=path.name,
+            "Try: JPEG or PNG; is it the photograph, and copied whole?"
         )
     return image
 
@@ -112,16 +116,28 @@ def spoilt(image: NDArray[np.uint8]) -> str:
     return ""
 
 
-def _declared_size(data: bytes) -> tuple[int, int]:
-    """Width and height [px] that the file's header declares; zeros if it is no known image."""
+def _opened(data: bytes) -> ImageFile.ImageFile | None:
+    """The picture of which only the header is read; None if it is no known image."""
     for header in _HEADERS:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of damaged tags that nobody needs
             try:
-                return header(BytesIO(data)).size
+                return header(BytesIO(data))
             except (SyntaxError, OSError, ValueError):  # of another format, or damaged
                 continue
-    return 0, 0
+    return None
+
+
+def _is_whole(picture: ImageFile.ImageFile) -> bool:
+    """Whether the file holds all of a picture; a JPEG is read at an eighth of its size."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            picture.draft(None, (1, 1))
+            picture.load()
+        except (SyntaxError, OSError, ValueError, EOFError):
+            return False
+    return True
 
 
 def _decode(data: bytes) -> NDArray[np.uint8] | None:
@@ -131,35 +147,3 @@ def _decode(data: bytes) -> NDArray[np.uint8] | None:
     except cv2.error:
         return None
     return None if image is None else np.asarray(image, np.uint8)
-
-
-def _is_truncated(data: bytes) -> bool:
-    """Whether a JPEG lacks its end-of-image marker or a PNG its last chunk."""
-    if data.startswith(_JPEG_START):
-        return not _jpeg_ends(data)
-    if data.startswith(_PNG_START):
-        return b"IEND" not in data[-64:] and b"IEND\xaeB`\x82" not in data
-    return False
-
-
-def _jpeg_ends(data: bytes) -> bool:
-    """Walk the segments of a JPEG to its end-of-image marker.
-
-    A search for the marker's two bytes alone would stop at the thumbnail in the header.
-    """
-    at = 2
-    while True:
-        at = data.find(b"\xff", at)
-        if at < 0 or at + 1 >= len(data):
-            return False
-        marker = data[at + 1]
-        if marker == 0xD9:
-            return True
-        if marker == 0xFF:  # a fill byte
-            at += 1
-        elif marker in (0x00, 0x01) or 0xD0 <= marker <= 0xD8:  # no length follows
-            at += 2
-        else:
-            if at + 3 >= len(data):
-                return False
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")

@@ -8,72 +8,32 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.vision.curve import length_of
 from dlo_casadi.vision.view import Array
+from dlo_casadi.vision.workplane import ExpectedLine
 
 _State: TypeAlias = tuple[float, tuple[int, ...], float, float]  # cost, path, seen, total
 _BEAM = 40
 _LENGTH_TOLERANCE = 0.05  # relative; two clicked reference points are no better than this
 _TURN, _TURN_FOLDED = 2.0, 0.5  # price of a turn between strands, in diameters per rad^2
-_FOLD_REACH = 6.0  # diameters: so near to each other two strands may be those of a fold
-
-
-@dataclass(frozen=True)
-class Course:
-    """What is known of the line before it is seen.
-
-    Parameters
-    ----------
-    shortest, longest : scalar [m]
-        Its length lies between them: both are the cable's where that lies in the plane; in front
-        of it the picture may show less (a part that points to the camera) or more (a near one).
-    in_space : bool
-        Whether it may turn back sharply, as a bend seen from its side does, and pass in front of
-        other things than the board.
-    """
-
-    shortest: float
-    longest: float
-    in_space: bool = False
-
-    @property
-    def typical(self) -> float:
-        """Length [m] by which other lengths and areas are judged."""
-        return 0.5 * (self.shortest + self.longest)
+_FOLD_REACH = 6.0  # diameters between two strands up to which they may be those of a fold
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Strands in the order in which the cable runs through them.
+    """Strands in the order in which the cable runs through them."""
 
-    Parameters
-    ----------
-    strands : tuple of (K, 2) [m]
-        Lines, each directed from start to end.
-    used : tuple of int
-        Their places in the list that was searched.
-    supported : scalar [m]
-        Length that was seen.
-    total : scalar [m]
-        Length including straight gaps.
-    cost : scalar [m]
-        Lower is better; about -length for a cable that is seen without a gap.
-    """
-
-    strands: tuple[Array, ...]
-    used: tuple[int, ...]
-    supported: float
-    total: float
-    cost: float
+    strands: tuple[Array, ...]  # each (K, 2) [m], directed from start to end
+    used: tuple[int, ...]  # their places in the list that was searched
+    supported: float  # [m], length that was seen
+    total: float  # [m], length with straight gaps
+    cost: float  # [m], lower is better; about -length for a cable that is seen without a gap
 
 
 def order_strands(
     strands: list[Array],
     widths: list[float],
-    *,
-    start: Array,
-    end: Array | None,
-    diameter: float,
-    course: Course,
+    expected: ExpectedLine,
 ) -> Chain | None:
     """Find the chain of strands that explains the cable best.
 
@@ -86,35 +46,23 @@ def order_strands(
     direction of the strand: a is the difference of the turns into and out of the gap (0 on a
     circle), b the whole turn, p = 0.8 max(0, |log(width / d)| - 0.25), at most 1/2; S and L are
     the shortest and the longest possible length. Where the line may fold, a turn costs d b^2 / 2.
-
-    Parameters
-    ----------
-    strands : list of (K, 2) [m]
-        Unbranched lines.
-    widths : list of scalar
-        Their widths, relative to the cable's.
-    start, end : (2,) [m]
-        The fixtures; `end` is None for a free end.
-    diameter : scalar [m]
-        Of the cable.
-    course : Course
-        How long the line may be.
+    `widths` are those of the unbranched `strands`, relative to the cable's.
     """
     if not strands:
         return None
+    diameter, length = expected.diameter, expected.longest
     ways = [way for strand in strands for way in (strand, strand[::-1])]
-    seen = np.array([np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways])
+    seen = np.array([length_of(way) for way in ways])
     first = np.array([way[0] for way in ways])
     last = np.array([way[-1] for way in ways])
     inwards = np.array([_tangent(way, diameter) for way in ways])
     outwards = np.array([-_tangent(way[::-1], diameter) for way in ways])
     excess = np.abs(np.log(np.repeat(widths, 2))) - 0.25
     worth = seen * (1 - np.clip(0.8 * excess, 0.0, 0.5))
-    gap, link = _links(last, outwards, first, inwards, diameter, course.in_space)
-    length = course.longest
-
-    to_first = np.linalg.norm(first - start, axis=1)
-    to_end = np.zeros(len(ways)) if end is None else np.linalg.norm(last - end, axis=1)
+    gap, link = _links(last, outwards, first, inwards, diameter, expected.in_space)
+    to_first = np.linalg.norm(first - expected.start, axis=1)
+    free = expected.end is None
+    to_end = np.zeros(len(ways)) if free else np.linalg.norm(last - expected.end, axis=1)
     states: list[_State] = [
         (float(to_first[w] - worth[w]), (w,), float(seen[w]), float(seen[w] + to_first[w]))
         for w in range(len(ways))
@@ -127,7 +75,7 @@ def order_strands(
         for cost, path, supported, total in states[:_BEAM]:
             tip = path[-1]
             whole = total + to_end[tip]
-            off = max(whole / length - 1.0, 1.0 - whole / course.shortest)
+            off = max(whole / length - 1.0, 1.0 - whole / expected.shortest)
             misfit = max(0.0, off - 0.02) / _LENGTH_TOLERANCE
             closed = cost + to_end[tip] + 0.5 * length * misfit**2
             if best is None or closed < best[0]:

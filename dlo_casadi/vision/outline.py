@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dlo_casadi.vision.view import Array
-from dlo_casadi.vision.viewpoint import Viewpoint
+from dlo_casadi.vision.view import Array, Viewpoint
 
 
 @dataclass(frozen=True)
@@ -24,14 +23,11 @@ class Outline:
     slopes : (K, 2, 3) [px/m]
         d(pixel)/d(point) in the board frame, that of the axis: the middle follows it to a part in
         1e-4.
-    half_widths : (K,) [px]
-        Distance of an edge from the middle.
     """
 
     pixels: Array
     normals: Array
     slopes: Array
-    half_widths: Array
 
 
 def project_outline(
@@ -76,7 +72,6 @@ def project_outline(
     # A cable seen on end shows its section, whose middle is the axis to a radius.
     squares = np.maximum(B**2 * (1.0 - sin**2) - (g * sin) ** 2, sin**2)
     off = np.clip(radius * g * sin / squares, -radius, radius) / p[:, 2]
-    half = radius * B * np.sqrt(1.0 - sin**2) / p[:, 2] / squares
     across = b[:, :2] / B[:, None]
     # d(pixel)/d(ray) = p_z d(pixel)/d(p_xy), and a step along the ray's plane moves no depth
     by_ray = p[:, 2, None, None] * (slopes @ viewpoint.rotation.T)[:, :, :2]
@@ -87,7 +82,6 @@ def project_outline(
         pixels + off[:, None] * step,
         np.column_stack([-along[:, 1], along[:, 0]]),
         slopes,
-        half * np.linalg.norm(step, axis=1),
     )
 
 

@@ -8,21 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dlo_casadi.vision.search import Workings
 from dlo_casadi.vision.view import Array, View
-from dlo_casadi.vision.workings import Workings
 from dlo_casadi.vision.workplane import WorkPlane
 
 Picture = NDArray[np.uint8]
 
 # Blue, green, red.
-_BLUE, _ORANGE, _RED, _GREEN, _GREY = (
-    (178, 114, 0),
-    (0, 159, 230),
-    (0, 94, 213),
-    (115, 158, 0),
-    (150, 150, 150),
-)
-_SATURATED = 4.0  # a contrast of so many times the cut is drawn white
+_BLUE, _ORANGE, _RED = (178, 114, 0), (0, 159, 230), (0, 94, 213)
+_GREEN, _GREY = (115, 158, 0), (150, 150, 150)
+_SATURATED = 4.0  # contrast that is drawn white, over the cut
 
 
 def draw_steps(
@@ -56,19 +51,20 @@ def draw_steps(
     dict of (h, w, 3) uint8
         By the name of the step, in order: 1_workplane, 2_contrast, 3_strands, 4_centerline.
     """
-    first = np.asarray(start, float)
-    last = None if end is None else np.asarray(end, float)
+    declared = {"start": start, "end": end}
+    fixtures = {name: np.asarray(at, float) for name, at in declared.items() if at is not None}
     pictures: dict[str, Picture] = {}
     plane = workings.plane
     if plane is not None:
-        pictures["1_workplane"] = _workplane(plane, first, last)
+        pictures["1_workplane"] = _workplane(plane, fixtures)
     if plane is not None and workings.candidate is not None:
         pictures["2_contrast"] = _contrast(plane, workings.candidate, workings.cut)
         pictures["3_strands"] = _strands(plane, workings)
     pictures["4_centerline"] = image.copy()
     if view is not None:
         _draw_line(pictures["4_centerline"], view, workings, line, gaps)
-        _draw_fixtures(pictures["4_centerline"], view, first, last)
+        for name, at in fixtures.items():
+            _mark(pictures["4_centerline"], view.to_pixels(at)[0], name, 0.6 * _size(image))
     return pictures
 
 
@@ -77,13 +73,12 @@ def encoded(picture: Picture, ending: str) -> bytes:
     return bytes(cv2.imencode(ending, picture)[1])
 
 
-def _workplane(plane: WorkPlane, start: Array, end: Array | None) -> Picture:
+def _workplane(plane: WorkPlane, fixtures: dict[str, Array]) -> Picture:
     """The rectified picture; what the cable cannot reach, and the markers, are dimmed."""
     picture = plane.image.copy()
     picture[~plane.reachable] //= 3
-    for name, at in (("start", start), ("end", end)):
-        if at is not None:
-            _mark(picture, plane.to_pixels(np.atleast_2d(at))[0], name, 0.5)
+    for name, at in fixtures.items():
+        _mark(picture, plane.to_pixels(at), name, 0.5)
     return picture
 
 
@@ -124,12 +119,6 @@ def _draw_line(
         for part in np.split(line, np.array(gaps, dtype=int) + 1):
             _polyline(picture, part, _BLUE, thick)
         _arrows(picture, line, size)
-
-
-def _draw_fixtures(picture: Picture, view: View, start: Array, end: Array | None) -> None:
-    for name, fixture in (("start", start), ("end", end)):
-        if fixture is not None:
-            _mark(picture, view.to_pixels(fixture)[0], name, 0.6 * _size(picture))
 
 
 def _size(picture: Picture) -> float:

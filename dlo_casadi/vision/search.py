@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import cv2
@@ -12,38 +12,47 @@ from scipy.ndimage import gaussian_filter1d
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.contrast import Contrast, candidate_maps, local_contrast, thresholds
-from dlo_casadi.vision.ordering import Chain, Course, order_strands
+from dlo_casadi.vision.curve import length_of
+from dlo_casadi.vision.ordering import Chain, order_strands
 from dlo_casadi.vision.strands import find_strands
+from dlo_casadi.vision.trace import Trace
 from dlo_casadi.vision.view import Array
-from dlo_casadi.vision.workings import Workings
-from dlo_casadi.vision.workplane import WorkPlane
+from dlo_casadi.vision.workplane import ExpectedLine, WorkPlane
 
 _GOOD = -0.7  # cost per length of a cable that is seen nearly from fixture to fixture
 _GOOD_FOLDED = -0.9  # the same where a cable's length in the picture is not known beforehand
-_LEAST = 0.25  # share of the length that must be seen
-_TWIN = 0.5  # other strands this long, relative to the cable, are a second cable
-_ROOT = 3.0  # diameters: so near to the chain begins a strand that it covers twice
-_ALIKE = 0.5  # of its difference from the surroundings: how far strands of a cable differ in colour
-_TWIN_CONTRAST = 0.6  # ... if they stand out as well, relative to the cable
+_LEAST = 0.25  # least share of the length that must be seen
+_TWIN = 0.5  # of the cable's length: longer strands beside it are a second cable
+_ROOT = 3.0  # diameters from the chain within which a strand that it covers twice begins
+_ALIKE = 0.5  # largest difference in colour of a cable's strands, of that from the surroundings
+_TWIN_CONTRAST = 0.6  # least contrast of a second cable, relative to the first
+
+
+@dataclass
+class Workings:
+    """What the steps of one extraction have seen: filled as far as it comes."""
+
+    plane: WorkPlane | None = None
+    candidate: NDArray[np.float32] | None = None  # (h, w), how much its pixels stand out
+    cut: float = 0.0  # level above which a pixel may be cable
+    lines: list[Array] = field(default_factory=list)  # all strands at that level, (K, 2) [m]
+    chosen: tuple[Array, ...] = ()  # those that make up the cable, from start to end
+    trace: Trace | None = None  # the cable's middle, profile by profile
 
 
 @dataclass(frozen=True)
 class _Line:
-    """A strand in metres, its width relative to the cable's, and how it looks.
+    """A strand in metres, and how it looks."""
 
-    How much it stands out from its surroundings, its colour, and its difference from them [grey
-    levels].
-    """
-
-    points: Array
-    width: float
-    level: float
-    colour: Array
-    step: Array
+    points: Array  # (K, 2) [m]
+    width: float  # relative to the cable's
+    level: float  # how much it stands out from its surroundings
+    colour: Array  # (3,) [grey levels]
+    step: Array  # (3,) [grey levels], its difference from the surroundings
 
     @property
     def length(self) -> float:
-        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+        return length_of(self.points)
 
 
 @dataclass(frozen=True)
@@ -57,23 +66,10 @@ class _Finding:
     cut: float
 
 
-def find_cable(
-    plane: WorkPlane,
-    *,
-    start: Array,
-    end: Array | None,
-    diameter: float,
-    course: Course,
-    workings: Workings | None = None,
-) -> Chain:
-    """Try the candidate pictures in turn and keep the chain of least cost.
-
-    Raises
-    ------
-    VisionError
-        If no chain shows a quarter of the cable, or if what is left over shows a second cable.
-    """
-    length = course.typical
+def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> Chain:
+    """Try the candidate pictures in turn and keep the chain of least cost."""
+    diameter = expected.diameter
+    length = expected.typical
     width_px = diameter / plane.pixel
     area_px = length * diameter / plane.pixel**2
     if plane.reachable.sum() < 2 * area_px * _LEAST:
@@ -81,31 +77,28 @@ def find_cable(
             "no cable found: almost nothing of the place that it can reach is in the picture. "
             "Try: start, end and length in metres and in the board frame?"
         )
-    fixtures = [start] if end is None else [start, end]
     contrast = local_contrast(plane.image, plane.reachable, width_px)
     best: _Finding | None = None
     longest = 0.0
-    good = _GOOD_FOLDED if course.in_space else _GOOD
+    good = _GOOD_FOLDED if expected.in_space else _GOOD
     for candidate in candidate_maps(contrast, area_px):
         for cut in thresholds(candidate[plane.reachable], area_px):
             mask = (candidate > cut) & plane.reachable
-            lines = _lines(mask, candidate, plane, contrast, fixtures, diameter)
+            lines = _lines(mask, candidate, plane, contrast, expected)
             longest = max([longest, *(line.length for line in lines)])
-            if workings is not None and best is None:
-                workings.candidate, workings.cut = candidate, cut
-                workings.lines = [line.points for line in lines]
-            chain = _chain(lines, start, end, diameter, course)
-            if chain is not None and course.in_space:
+            chain = _chain(lines, expected)
+            if chain is not None and expected.in_space:
                 lines = _of_one_colour(lines, [lines[i] for i in chain.used])
-                chain = _chain(lines, start, end, diameter, course)
-            if chain is not None and (best is None or chain.cost < best.chain.cost):
+                chain = _chain(lines, expected)
+            better = chain is not None and (best is None or chain.cost < best.chain.cost)
+            if chain is not None and better:
                 ours = [lines[i] for i in chain.used]
                 rest = [lines[i] for i in range(len(lines)) if i not in chain.used]
                 best = _Finding(chain, ours, rest, candidate, cut)
-                if workings is not None:
-                    workings.candidate, workings.cut = candidate, cut
-                    workings.lines = [line.points for line in lines]
-                    workings.chosen = chain.strands
+                workings.chosen = chain.strands
+            if better or best is None:
+                workings.candidate, workings.cut = candidate, cut
+                workings.lines = [line.points for line in lines]
         if best is not None and best.chain.cost < good * min(best.chain.total, length):
             break
     if best is None or best.chain.supported < _LEAST * length:
@@ -117,26 +110,16 @@ def find_cable(
             "picture and in focus? start, end, length and diameter right? a background of another "
             "brightness or colour?"
         )
-    if course.in_space:
+    if expected.in_space:
         best = replace(best, chain=_with_folds(best, diameter))
-        if workings is not None:
-            workings.chosen = best.chain.strands
-    _refuse_twins(best, plane, contrast, fixtures, diameter, course)
+        workings.chosen = best.chain.strands
+    _refuse_twins(best, plane, contrast, expected)
     return best.chain
 
 
-def _chain(
-    lines: list[_Line], start: Array, end: Array | None, diameter: float, course: Course
-) -> Chain | None:
+def _chain(lines: list[_Line], expected: ExpectedLine) -> Chain | None:
     """Put strands in order."""
-    return order_strands(
-        [line.points for line in lines],
-        [line.width for line in lines],
-        start=start,
-        end=end,
-        diameter=diameter,
-        course=course,
-    )
+    return order_strands([line.points for line in lines], [line.width for line in lines], expected)
 
 
 def _of_one_colour(lines: list[_Line], chosen: list[_Line]) -> list[_Line]:
@@ -190,14 +173,13 @@ def _lines(
     candidate: NDArray[np.float32],
     plane: WorkPlane,
     contrast: Contrast,
-    fixtures: list[Array],
-    diameter: float,
+    expected: ExpectedLine,
 ) -> list[_Line]:
     """Strands of a mask in metres, without their staircase, cut where they pass a fixture.
 
     What lies beyond a fixture, a tail of the cable, is then not taken for the measured part.
     """
-    width_px = diameter / plane.pixel
+    width_px = expected.diameter / plane.pixel
     margin = max(2, round(width_px))
     lines = []
     for strand in find_strands(mask, width_px):
@@ -208,10 +190,10 @@ def _lines(
         smooth = gaussian_filter1d(strand.points, 0.5 * width_px, axis=0, mode="nearest")
         points = plane.to_board(smooth[1:-1:2])
         cuts = [0, len(points)]
-        for fixture in fixtures:
+        for fixture in expected.fixtures.values():
             away = np.linalg.norm(points - fixture, axis=1)
             nearest = int(np.argmin(away)) if len(away) else 0
-            if margin <= nearest < len(points) - margin and away[nearest] < diameter:
+            if margin <= nearest < len(points) - margin and away[nearest] < expected.diameter:
                 cuts.append(nearest)
         parts = [points[a:b] for a, b in pairwise(sorted(cuts))]
         width = strand.width / width_px
@@ -220,19 +202,14 @@ def _lines(
 
 
 def _refuse_twins(
-    best: _Finding,
-    plane: WorkPlane,
-    contrast: Contrast,
-    fixtures: list[Array],
-    diameter: float,
-    course: Course,
+    best: _Finding, plane: WorkPlane, contrast: Contrast, expected: ExpectedLine
 ) -> None:
     """Raise if strands away from the chain look like a second cable.
 
     Within reach of the fixtures all of them count together; beyond, where the cable cannot be
     anyway, only one long strand does.
     """
-    length = course.typical
+    diameter, length = expected.diameter, expected.typical
     rest = ((best.candidate > best.cut) & plane.inside).astype(np.uint8)
     for strand in best.chain.strands:
         at = np.round(plane.to_pixels(strand)).astype(np.int32)
@@ -242,8 +219,8 @@ def _refuse_twins(
     level = float(np.median([line.level for line in best.ours]))
     width = float(np.median([line.width for line in best.ours]))
     near, far = 0.0, 0.0
-    lines = _lines(rest > 0, best.candidate, plane, contrast, fixtures, diameter)
-    for line in _of_one_colour(lines, best.ours) if course.in_space else lines:
+    lines = _lines(rest > 0, best.candidate, plane, contrast, expected)
+    for line in _of_one_colour(lines, best.ours) if expected.in_space else lines:
         alike = line.level > _TWIN_CONTRAST * level and 0.6 < line.width / width < 1.6
         if not alike or line.length < 5 * diameter:
             continue
@@ -264,8 +241,7 @@ def _refuse_twins(
 def _light(plane: WorkPlane) -> str:
     """What is wrong with the light, if anything."""
     mean = float(plane.image[plane.reachable].mean())
-    if mean < 15:
-        return f"the picture is too dark (mean brightness {mean:.0f} of 255, try more light), "
-    if mean > 245:
-        return f"the picture is overexposed (mean brightness {mean:.0f} of 255, try less light), "
-    return ""
+    if 15 <= mean <= 245:
+        return ""
+    what, cure = ("too dark", "more light") if mean < 15 else ("overexposed", "less light")
+    return f"the picture is {what} (mean brightness {mean:.0f} of 255, try {cure}), "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +13,15 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.vision.correspondence import places_along
+from dlo_casadi.vision.curve import chord_length, length_of
+from dlo_casadi.vision.image_curve import ImageCurve
 from dlo_casadi.vision.outline import compare_pixels
-from dlo_casadi.vision.sight import Sight
-from dlo_casadi.vision.view import Array
-from dlo_casadi.vision.viewpoint import Viewpoint
+from dlo_casadi.vision.view import Array, Viewpoint
 
 _DEGREE = 3
-_GRID = 401  # places along the curve among which the nearest to a pixel is looked for
-_TANGENTIAL = 1e-5  # m: a curve does not change by moving along itself
-_HUBER = 3.0  # standard deviations, from where on a pixel counts less
+_GRID = 401  # places along the curve among which a pixel's nearest is searched
+_TANGENTIAL = 1e-5  # m: std of the prior that holds a curve along itself, which no picture shows
+_HUBER = 3.0  # standard deviations beyond which a pixel counts less
 # Spectral densities q of the third derivative that are tried, in L^2, where a curve of length L has
 # 0 <= t <= 1: from a bow of 0.3 L to waves of 300 L; afterwards those near the last.
 _WANDER, _WANDER_NEXT = np.logspace(-1.0, 5.0, 13), np.array([0.3, 0.6, 1.0, 1.7, 3.0])
@@ -29,15 +30,9 @@ _LOOPS, _SETTLED = 15, 3e-5  # m: a quarter of the smallest std of a line from t
 
 @dataclass(frozen=True)
 class SpaceCurve:
-    """A cubic B-spline r(t), 0 <= t <= 1, with t close to arc length over the whole.
+    """A cubic B-spline r(t), 0 <= t <= 1, with t close to arc length over the whole."""
 
-    Parameters
-    ----------
-    coefficients : (n, 3) [m]
-        In the board frame.
-    """
-
-    coefficients: Array
+    coefficients: Array  # (n, 3) [m], in the board frame
 
     def design(self, t: Array) -> Array:
         """Basis functions (K, n) at t (K,)."""
@@ -55,13 +50,17 @@ class SpaceCurve:
     @property
     def length(self) -> float:
         """Arc length [m]."""
-        return float(np.linalg.norm(np.diff(self.position(_fine()), axis=0), axis=1).sum())
+        return length_of(self.position(_fine()))
+
+    def away_from(self, fixtures: Sequence[Array]) -> Array:
+        """Distances [m] of its ends from the fixtures: one of the start alone, or both."""
+        ends = self.position(np.array([0.0, 1.0]))[: len(fixtures)]
+        return np.asarray(np.linalg.norm(ends - np.array(fixtures), axis=1))
 
     def evenly(self) -> SpaceCurve:
         """Give the same curve with t proportional to its arc length."""
         grid = _fine()
-        steps = np.linalg.norm(np.diff(self.position(grid), axis=0), axis=1)
-        s = np.concatenate([[0.0], np.cumsum(steps)])
+        s = chord_length(self.position(grid))
         at = np.interp(grid * s[-1], s, grid)
         even = np.linalg.lstsq(self.design(grid), self.position(at), rcond=None)[0]
         return SpaceCurve(np.asarray(even, float))
@@ -69,47 +68,33 @@ class SpaceCurve:
 
 @dataclass(frozen=True)
 class CurveFit:
-    """A curve, how well it is known, and where on it each pixel lies.
-
-    Parameters
-    ----------
-    curve : SpaceCurve
-        The estimate.
-    covariance : (n, 3, n, 3) [m^2]
-        Of its coefficients, across the curve.
-    params : tuple of (K,)
-        Parameter of each pixel of each photograph; nan where it does not belong to the curve.
-    residuals : tuple of (K,) [px]
-        Distance of the pixel across the projected curve; nan there.
-    surprise : scalar
-        -2 log of the marginal likelihood, up to a constant: tells hypotheses on the pixels apart.
-    """
+    """A curve, how well it is known, and where on it each pixel lies."""
 
     curve: SpaceCurve
-    covariance: Array
-    params: tuple[Array, ...]
-    residuals: tuple[Array, ...]
-    surprise: float
+    covariance: Array  # (n, 3, n, 3) [m^2] of its coefficients, across the curve
+    params: tuple[Array, ...]  # (K,) of each photograph's pixels; nan where not of the curve
+    residuals: tuple[Array, ...]  # (K,) [px], distances across the projected curve; nan there
+    surprise: float  # -2 log of the marginal likelihood, up to a constant: compares hypotheses
 
-    def std(self, t: Array) -> tuple[Array, Array]:
-        """Covariance (K, 3, 3) [m^2] and largest standard deviation (K,) [m] of points at t."""
+    @property
+    def places(self) -> list[Array]:
+        """Places (K, 3) [m] of the pixels of each photograph; nan where it does not belong."""
+        places = []
+        for params in self.params:
+            known = np.isfinite(params)
+            places.append(np.full((len(params), 3), np.nan))
+            places[-1][known] = self.curve.position(params[known])
+        return places
+
+    def std(self, t: Array) -> Array:
+        """Largest standard deviation (K,) [m], in any direction across the curve, at t."""
         basis = self.curve.design(t)
         at = np.einsum("ka,aibj,kb->kij", basis, self.covariance, basis, optimize=True)
-        return at, np.sqrt(np.maximum(np.linalg.eigvalsh(at)[:, -1], 0.0))
+        return np.sqrt(np.maximum(np.linalg.eigvalsh(at)[:, -1], 0.0))
 
 
 def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
-    """Smooth curve through scattered points.
-
-    Parameters
-    ----------
-    points : (P, 3) [m]
-        In order.
-    along : (P,)
-        Not decreasing: how far along the curve each lies.
-    spans : int
-        Polynomials of the spline.
-    """
+    """Smooth curve of `spans` polynomials through points (P, 3) [m], `along` it in this order."""
     t = (along - along[0]) / (along[-1] - along[0])
     n = spans + _DEGREE
     basis, rough = _design(t, n), np.diff(np.eye(n), 3, axis=0)
@@ -118,8 +103,8 @@ def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
     return SpaceCurve(np.asarray(np.linalg.solve(normal, basis.T @ points), float)).evenly()
 
 
-def fit_curve_to_sights(
-    sights: Sequence[Sight], first: SpaceCurve, params: Sequence[Array] | None = None
+def fit_curve_to_images(
+    curves: Sequence[ImageCurve], first: SpaceCurve, params: Sequence[Array] | None = None
 ) -> CurveFit:
     """Move a curve onto what all photographs show of it.
 
@@ -133,64 +118,54 @@ def fit_curve_to_sights(
     density q, fills gaps as smoothly as the rest of the curve is; q has the largest marginal
     likelihood. Pixels far off count less (Huber).
 
-    Parameters
-    ----------
-    sights : sequence of Sight
-        At least two photographs.
-    first : SpaceCurve
-        Close enough to be seen within some pixels of the right place.
-    params : sequence of (K,), optional
-        About where on it the pixels of each photograph lie; the nearest places, in order, if not
-        given.
+    The curve `first` must be seen within some pixels of the right place. `params` tell about where
+    on it the pixels of each photograph lie; the nearest places, in order, if not given.
 
     References
     ----------
     Wahba, Spline Models for Observational Data, 1990: smoothing splines as Gaussian processes.
     """
-    curve = first
-    n = len(curve.coefficients)
+    curve, n, m = first, len(first.coefficients), len(curves)
     grid = np.linspace(0.0, 1.0, _GRID)
-    params = list(params or [places_along(sight, curve.position(grid)) for sight in sights])
-    motions = [np.zeros(6) for _ in sights]
-    whitened = [_independent_std(sight) for sight in sights]
-    rigid = [np.linalg.inv(sight.viewpoint.covariance) for sight in sights]
+    params = list(params or [places_along(seen, curve.position(grid)) for seen in curves])
+    motions = np.zeros((m, 6))
+    whitened = [_independent_std(seen) for seen in curves]
+    rigid = [np.linalg.inv(seen.viewpoint.covariance) for seen in curves]
     prior = block_diag(np.zeros((3 * n, 3 * n)), *rigid)
-    rough = block_diag(_roughness(n), np.zeros((6 * len(sights), 6 * len(sights))))
+    rough = block_diag(_roughness(n), np.zeros((6 * m, 6 * m)))
     wander = _WANDER * curve.length**2
     for loop in range(_LOOPS):
-        still = np.hstack([_along_itself(curve), np.zeros((3 * n, 6 * len(sights)))])
+        still = np.hstack([_along_itself(curve), np.zeros((3 * n, 6 * m))])
         rows, errors, residuals = [still], [np.zeros(3 * n)], []
-        for v, sight in enumerate(sights):
-            params[v] = _nearest(curve, sight, motions[v], params[v])
-            J, error = _linearise(curve, sight, motions[v], params[v])
+        for v, (seen, std) in enumerate(zip(curves, whitened, strict=True)):
+            camera = moved_camera(seen.viewpoint, motions[v])
+            params[v] = _nearest(curve, seen, camera, params[v])
+            by_curve, by_motion, error = _linearise(curve, seen, camera, motions[v], params[v])
             residuals.append(error)
             used = np.isfinite(error)
-            whole = np.zeros((int(used.sum()), 3 * n + 6 * len(sights)))
-            whole[:, : 3 * n] = J[used, : 3 * n]
-            whole[:, 3 * n + 6 * v : 3 * n + 6 * v + 6] = J[used, 3 * n :]
-            scaled = error[used] / whitened[v][used]
+            whole = np.zeros((len(by_curve), 3 * n + 6 * m))
+            whole[:, : 3 * n] = by_curve
+            whole[:, 3 * n + 6 * v : 3 * n + 6 * v + 6] = by_motion
+            scaled = error[used] / std[used]
             weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(scaled), 1e-9)))
-            rows.append(whole * (weight / whitened[v][used])[:, None])
+            rows.append(whole * (weight / std[used])[:, None])
             errors.append(scaled * weight)
         A, e = np.vstack(rows), np.concatenate(errors)
-        x = np.concatenate([curve.coefficients.ravel(), *motions])
+        x = np.concatenate([curve.coefficients.ravel(), motions.ravel()])
         solved = _solve(A, e, x, rough, prior, wander)
         wander = solved.q * _WANDER_NEXT
         x = x + solved.step
         moved = float(np.abs(_design(_fine(), n) @ solved.step[: 3 * n].reshape(n, 3)).max())
-        motions = [x[3 * n + 6 * v : 3 * n + 6 * v + 6] for v in range(len(sights))]
+        motions = x[3 * n :].reshape(m, 6)
         curve = SpaceCurve(x[: 3 * n].reshape(n, 3)).evenly()
         if loop > 2 and moved < _SETTLED:
             break
-    covariance = cho_solve(solved.factor, np.eye(len(x)))[: 3 * n, : 3 * n]
-    return CurveFit(
-        curve, covariance.reshape(n, 3, n, 3), tuple(params), tuple(residuals), solved.surprise
-    )
+    covariance = cho_solve(solved.factor, np.eye(len(x)))[: 3 * n, : 3 * n].reshape(n, 3, n, 3)
+    return CurveFit(curve, covariance, tuple(params), tuple(residuals), solved.surprise)
 
 
-@dataclass(frozen=True)
-class _Step:
-    """A Gauss-Newton step under the likeliest prior."""
+class _Step(NamedTuple):
+    """A Gauss-Newton step under a prior."""
 
     step: Array
     factor: tuple[Array, bool]
@@ -206,17 +181,16 @@ def _solve(A: Array, e: Array, x: Array, rough: Array, prior: Array, wander: Arr
     """
     n = int(np.count_nonzero(np.diag(rough))) // 3
     fixed, gradient = A.T @ A + prior, A.T @ e - prior @ x
-    best: _Step | None = None
-    for q in wander:
+
+    def step_of(q: float) -> _Step:
         factor = cho_factor(fixed + rough / q)
         step = cho_solve(factor, gradient - rough @ x / q)
         y = x + step
         surprise = np.sum((e - A @ step) ** 2) + y @ prior @ y + y @ rough @ y / q
         surprise += 2.0 * np.log(np.diag(factor[0])).sum() + 2 * (n - _DEGREE) * np.log(q)
-        if best is None or surprise < best.surprise:
-            best = _Step(step, factor, float(surprise), float(q))
-    assert best is not None
-    return best
+        return _Step(step, factor, float(surprise), q)
+
+    return min(map(step_of, wander.tolist()), key=lambda found: found.surprise)
 
 
 def _along_itself(curve: SpaceCurve) -> Array:
@@ -226,28 +200,20 @@ def _along_itself(curve: SpaceCurve) -> Array:
     return rows.reshape(len(t), -1)
 
 
-def _linearise(curve: SpaceCurve, sight: Sight, motion: Array, t: Array) -> tuple[Array, Array]:
-    """Residuals (K,) [px] across the projected curve, and minus their slopes (K, 3 n + 6)."""
-    n = len(curve.coefficients)
-    error = np.full(len(t), np.nan)
-    J = np.zeros((len(t), 3 * n + 6))
-    used = np.isfinite(t)
-    camera = moved_camera(sight.viewpoint, motion)
-    basis, points = curve.design(t[used]), curve.position(t[used])
-    error[used], slopes = compare_pixels(
-        camera, sight.pixels[used], points, curve.tangent(t[used]), sight.diameter
-    )
-    by_point = -slopes
-    by_shift = by_point @ camera.rotation.T
+def _linearise(
+    curve: SpaceCurve, seen: ImageCurve, camera: Viewpoint, motion: Array, t: Array
+) -> tuple[Array, Array, Array]:
+    """Residuals (K,) [px] across the projected curve, nan where no place t is known.
+
+    Before them minus their slopes, of the others, by coefficients (k, 3 n) and motions (k, 6).
+    """
+    error, used = np.full(len(t), np.nan), np.isfinite(t)
+    basis, points, tangents = curve.design(t[used]), curve.position(t[used]), curve.tangent(t[used])
+    error[used], slopes = compare_pixels(camera, seen.pixels[used], points, tangents, seen.diameter)
+    by_shift = -slopes @ camera.rotation.T
     turned = points @ camera.rotation.T + camera.translation - motion[3:]
-    J[used] = np.hstack(
-        [
-            (basis[:, :, None] * by_point[:, None, :]).reshape(len(points), 3 * n),
-            np.cross(turned, by_shift),
-            by_shift,
-        ]
-    )
-    return J, error
+    by_curve = (basis[:, :, None] * -slopes[:, None, :]).reshape(len(points), -1)
+    return by_curve, np.hstack([np.cross(turned, by_shift), by_shift]), error
 
 
 def moved_camera(viewpoint: Viewpoint, motion: Array) -> Viewpoint:
@@ -260,28 +226,27 @@ def moved_camera(viewpoint: Viewpoint, motion: Array) -> Viewpoint:
     )
 
 
-def _nearest(curve: SpaceCurve, sight: Sight, motion: Array, t: Array) -> Array:
+def _nearest(curve: SpaceCurve, seen: ImageCurve, camera: Viewpoint, t: Array) -> Array:
     """Nearest places on the projected curve, from near ones; nan beyond its ends."""
     t = t.copy()
-    camera = moved_camera(sight.viewpoint, motion)
     for _ in range(2):
         used = np.nonzero(np.isfinite(t))[0]
         pixels, slopes = camera.project(curve.position(t[used]))
         tangent = np.einsum("kij,kj->ki", slopes, curve.tangent(t[used])) * curve.length
-        off = np.sum((sight.pixels[used] - pixels) * tangent, axis=1)
+        off = np.sum((seen.pixels[used] - pixels) * tangent, axis=1)
         step = off / np.maximum(np.sum(tangent**2, axis=1), 1e-9)
         moved = t[used] + np.clip(step, -2.0 / _GRID, 2.0 / _GRID)
         t[used] = np.where((moved >= 0.0) & (moved <= 1.0), moved, np.nan)
     return t
 
 
-def _independent_std(sight: Sight) -> Array:
+def _independent_std(seen: ImageCurve) -> Array:
     """Standard deviations (K,) [px] of independent pixels that tell as much.
 
     Pixels a distance h apart whose errors are correlated over the length c (the integral of the
     correlation, on both sides) are worth h / (2 c) independent ones.
     """
-    return sight.std * np.sqrt(max(2.0 * sight.correlation / max(sight.spacing, 1e-6), 1.0))
+    return seen.std * np.sqrt(max(2.0 * seen.correlation / max(seen.spacing, 1e-6), 1.0))
 
 
 def _roughness(n: int) -> Array:

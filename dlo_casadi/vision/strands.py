@@ -16,23 +16,10 @@ _NARROWEST, _WIDEST = 0.4, 1.8  # of the cable's width
 
 @dataclass(frozen=True)
 class Strand:
-    """One unbranched line of the skeleton.
+    """One unbranched line of the skeleton."""
 
-    Parameters
-    ----------
-    points : (K, 2) [px]
-        Column and row of neighbouring pixels, in order.
-    width : scalar [px]
-        Median width of the mask about it.
-    """
-
-    points: Array
-    width: float
-
-    @property
-    def length(self) -> float:
-        """Length along the line [px]."""
-        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+    points: Array  # (K, 2) [px], column and row of neighbouring pixels, in order
+    width: float  # [px], median width of the mask about it
 
 
 def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[Strand]:

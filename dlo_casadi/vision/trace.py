@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter1d, label
 
 from dlo_casadi.vision.curve import SmoothCurve, chord_length, fit_curve
-from dlo_casadi.vision.refine import (
+from dlo_casadi.vision.profiles import (
     Crossings,
     EdgeShape,
     Profiles,
-    average,
     cable_direction,
     edge_shape,
     find_edges,
@@ -21,9 +20,10 @@ from dlo_casadi.vision.refine import (
     sample_profiles,
 )
 from dlo_casadi.vision.view import Array, View
+from dlo_casadi.vision.workplane import ExpectedLine
 
 _STEP = 1 / 8  # of the diameter: between profiles
-_RAW, FINE = 0.15, 0.7  # of the diameter: average along the cable, to judge and to measure
+_RAW, FINE = 0.15, 0.7  # diameters averaged along the cable, to judge and to measure
 # Height and width vary by 1.5 % along a cable of seven pixels, by 6 % half a width from its end.
 _UNLIKE = 0.05
 _WHITE = 248  # grey level
@@ -32,50 +32,21 @@ _FLOOR_PX = 0.06  # what the sampling and compression of a photograph leave, alo
 
 @dataclass(frozen=True)
 class Trace:
-    """Middle of the cable at closely spaced profiles.
+    """Middle of the cable at closely spaced profiles."""
 
-    Parameters
-    ----------
-    t : (K,) [m]
-        Length along the line, gaps included.
-    points : (K, 2) [m]
-        Middle of the two edges.
-    std : (K,) [m]
-        Standard deviation across the cable.
-    sound : (K,) bool
-        Whether the profile shows the cable and nothing else.
-    inside : (K,) bool
-        Whether it lies in the photograph.
-    glare : (K,) bool
-        Whether the place of the cable is overexposed.
-    direction : (3,)
-        Weights of blue, green and red by which most of the cable stands out.
-    shape : EdgeShape
-        Typical width and blur; a width of 0 where no edges were found.
-    width_std : scalar [m]
-        Scatter of the width along the line.
-    """
-
-    t: Array
-    points: Array
-    std: Array
-    sound: NDArray[np.bool_]
-    inside: NDArray[np.bool_]
-    glare: NDArray[np.bool_]
-    direction: Array
-    shape: EdgeShape
-    width_std: float
+    t: Array  # (K,) [m], length along the line, gaps included
+    points: Array  # (K, 2) [m], middle of the two edges
+    std: Array  # (K,) [m], standard deviation across the cable
+    sound: NDArray[np.bool_]  # (K,), the profile shows the cable and nothing else
+    inside: NDArray[np.bool_]  # (K,), it lies in the photograph
+    glare: NDArray[np.bool_]  # (K,), the place of the cable is overexposed
+    direction: Array  # (3,), weights of blue, green and red by which most of the cable stands out
+    shape: EdgeShape  # typical width and blur; a width of 0 where no edges were found
+    width_std: float  # [m], scatter of the width along the line
 
 
 def trace_cable(
-    image: NDArray[np.uint8],
-    view: View,
-    strands: tuple[Array, ...],
-    *,
-    start: Array,
-    end: Array | None,
-    diameter: float,
-    in_space: bool = False,
+    image: NDArray[np.uint8], view: View, strands: tuple[Array, ...], expected: ExpectedLine
 ) -> Trace:
     """Lay a smooth curve through the strands and move it onto the middle between the edges.
 
@@ -83,7 +54,8 @@ def trace_cable(
     profiles that are averaged along the cable, over sound ones only. In space the cable may pass in
     front of things of several colours.
     """
-    curve, t = _first_curve(strands, diameter, start, end)
+    diameter, in_space = expected.diameter, expected.in_space
+    curve, t = _first_curve(strands, expected)
     bright = image.astype(np.float32)
     profiles = sample_profiles(bright, view, curve, t, diameter)
     usual = profiles.inside & (t > t[0] + 2 * diameter) & (t < t[-1] - 2 * diameter)
@@ -96,7 +68,7 @@ def trace_cable(
     guess = EdgeShape(diameter, 0.8 / view.scale)
     for _ in range(2):
         raw = sample_profiles(bright, view, curve, t, diameter)
-        raw = average(raw, raw.inside, _RAW * diameter)
+        raw = raw.average(raw.inside, _RAW * diameter)
         shape = edge_shape(raw, direction, usual, guess)
         rough = find_edges(raw, direction, shape)
         sound = raw.inside & _is_usual(rough, usual, diameter)
@@ -112,8 +84,8 @@ def trace_cable(
     raw = sample_profiles(bright, view, curve, t, diameter)
     # In a plane light shifts all photographs alike, harmonics that `edge_bias` takes up better: EI
     # of the rendered `connector` is 0.2 % off then, 2 % with what is left of them here.
-    rough = find_edges(average(raw, raw.inside, _RAW * diameter), direction, shape, in_space)
-    fine = find_edges(average(raw, sound, FINE * diameter), direction, shape, in_space)
+    rough = find_edges(raw.average(raw.inside, _RAW * diameter), direction, shape, in_space)
+    fine = find_edges(raw.average(sound, FINE * diameter), direction, shape, in_space)
     sound = _without_rims(
         raw.inside & _is_usual(rough, sound, diameter) & _is_usual(fine, sound, diameter)
     )
@@ -138,10 +110,9 @@ def _nothing(curve: SmoothCurve, t: Array, inside: NDArray[np.bool_]) -> Trace:
     return Trace(t, at, np.zeros(len(t)), none, inside, none, np.zeros(3), EdgeShape(0.0, 0.0), 0.0)
 
 
-def _first_curve(
-    strands: tuple[Array, ...], diameter: float, start: Array, end: Array | None
-) -> tuple[SmoothCurve, Array]:
+def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[SmoothCurve, Array]:
     """Smooth curve through the strands, extended straight at both ends, and its samples t."""
+    start, end, diameter = expected.start, expected.end, expected.diameter
     points = np.vstack(strands)
     t = chord_length(points)
     keep = np.concatenate([[True], np.diff(t) > 0])
@@ -209,13 +180,14 @@ def _without_rims(sound: NDArray[np.bool_]) -> NDArray[np.bool_]:
     rim = round(0.35 / _STEP)
     sound = sound.copy()
     sound[:rim] = sound[-rim:] = False
-    regions, count = label(~sound)
-    sizes = np.bincount(regions, minlength=count + 1)
-    long = ~sound & (sizes[regions] > rim)
-    kept = sound & ~binary_dilation(long, iterations=rim)
-    regions, count = label(kept)
-    sizes = np.bincount(regions, minlength=count + 1)
-    return kept & (sizes[regions] > 1.5 / _STEP)
+    kept = sound & ~binary_dilation(_longer(~sound, rim), iterations=rim)
+    return _longer(kept, 1.5 / _STEP)
+
+
+def _longer(flags: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+    """Those of the flags (K,) that stand in a run of more than `least`."""
+    runs, _ = label(flags)
+    return flags & (np.bincount(runs)[runs] > least)
 
 
 def _std(rough: Array, fine: Array, sound: NDArray[np.bool_], view: View) -> Array:

@@ -1,4 +1,4 @@
-"""Where a pixel lies on the cable's plane, and back."""
+"""Cameras: from the pixels of a photograph to the cable's plane, from space to pixels, and back."""
 
 from __future__ import annotations
 
@@ -42,12 +42,17 @@ class Camera:
         """Focal length [px], the mean of both axes."""
         return float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
 
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Pixels (K, 2) of points (K, 3) [m] in the camera's frame, d(pixel)/d(point) (K, 2, 3)."""
+        if not len(points):
+            return np.zeros((0, 2)), np.zeros((0, 2, 3))
+        still = np.zeros(3)
+        pixels, slopes = cv2.projectPoints(points, still, still, self.matrix, self.distortion)
+        return pixels[:, 0], slopes[:, 3:6].reshape(-1, 2, 3)
+
     def distort(self, rays: Array) -> Array:
         """Pixels (K, 2) at which undistorted normalised rays (K, 2) are seen."""
-        if not len(rays):
-            return rays
-        solid, still = np.column_stack([rays, np.ones(len(rays))]), np.zeros(3)
-        return cv2.projectPoints(solid, still, still, self.matrix, self.distortion)[0][:, 0]
+        return self.project(np.column_stack([rays, np.ones(len(rays))]))[0]
 
     def undistort(self, pixels: Array) -> Array:
         """Undistorted normalised rays (K, 2) of pixels (K, 2): the inverse of `distort`."""
@@ -55,26 +60,6 @@ class Camera:
             return pixels
         rays = cv2.undistortPoints(pixels, self.matrix, self.distortion, criteria=_UNDISTORTED)
         return np.asarray(rays, float).reshape(-1, 2)
-
-
-@dataclass(frozen=True)
-class Reference:
-    """Two points known in the picture and in the board frame.
-
-    Parameters
-    ----------
-    pixels : (2, 2) [px]
-        Column u and row v of each point.
-    points : (2, 2) [m]
-        The same points in the board frame, x right, y up.
-    """
-
-    pixels: Array
-    points: Array
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "pixels", np.asarray(self.pixels, float).reshape(2, 2))
-        object.__setattr__(self, "points", np.asarray(self.points, float).reshape(2, 2))
 
 
 @dataclass(frozen=True)
@@ -102,8 +87,8 @@ class View:
         Corners of the markers that were used.
     numbers : tuple of int
         Their numbers.
-    misplaced : tuple of int
-        Markers that were seen, but not where they are declared.
+    messages : tuple of str
+        Which markers were not used, and why.
     """
 
     homography: Array
@@ -112,7 +97,7 @@ class View:
     reprojection_error: float = 0.0
     markers: Array = field(default_factory=lambda: np.zeros((0, 4, 2)))
     numbers: tuple[int, ...] = ()
-    misplaced: tuple[int, ...] = ()
+    messages: tuple[str, ...] = ()
 
     def to_board(self, pixels: ArrayLike) -> Array:
         """Points of the cable's plane [m] seen at pixels (K, 2) [px]; shape (K, 2)."""
@@ -143,10 +128,89 @@ class View:
         height, width = self.shape
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
         corners = self.to_board(middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
-        return float(np.sqrt(4.0 / _area(corners)))
+        x, y = corners.T
+        area = abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+        return float(np.sqrt(4.0 / area))
 
 
-def from_reference(reference: Reference, shape: tuple[int, ...]) -> View:
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where the camera of one photograph stands.
+
+    A point p of the board frame (x right, y up, z out of the board) is at
+
+        q = R p + t
+
+    in the camera's frame (x right, y down, z ahead), and is seen at the pixel distort(q_xy / q_z).
+
+    Parameters
+    ----------
+    camera : Camera
+        Intrinsic matrix and lens.
+    rotation : (3, 3)
+        R, from the board's axes to the camera's.
+    translation : (3,) [m]
+        t, the board's origin in the camera's frame.
+    shape : (height, width) [px]
+        Size of the photograph.
+    covariance : (6, 6) [rad, m]
+        Of a small rotation w and a shift d of the board in the camera's frame, q -> q + w x q + d,
+        from the scatter of the corners.
+    reprojection_error : scalar [px]
+        Root mean square over the corners of the markers.
+    markers : (n, 4, 2) [px]
+        Corners of the markers that were used.
+    numbers : tuple of int
+        Their numbers.
+    messages : tuple of str
+        Which markers were not used, and why.
+    """
+
+    camera: Camera
+    rotation: Array
+    translation: Array
+    shape: tuple[int, int]
+    covariance: Array
+    reprojection_error: float
+    markers: Array
+    numbers: tuple[int, ...]
+    messages: tuple[str, ...] = ()
+
+    @property
+    def center(self) -> Array:
+        """Where the camera stands (3,) [m] in the board frame, C = -R^T t."""
+        return -self.rotation.T @ self.translation
+
+    def in_camera(self, points: ArrayLike) -> Array:
+        """Points (K, 3) [m] of the board frame in the camera's frame."""
+        return np.asarray(points, float).reshape(-1, 3) @ self.rotation.T + self.translation
+
+    def to_pixels(self, points: ArrayLike) -> Array:
+        """Pixels (K, 2) [px] at which points (K, 3) [m] are seen."""
+        return self.project(points)[0]
+
+    def project(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Pixels (K, 2) [px] of points (K, 3) [m], and d(pixel)/d(point) (K, 2, 3) [px/m]."""
+        pixels, slopes = self.camera.project(self.in_camera(points))
+        return pixels, slopes @ self.rotation
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Undistorted rays (K, 2), q_xy / q_z, of pixels (K, 2) [px]."""
+        return self.camera.undistort(np.asarray(pixels, float).reshape(-1, 2))
+
+    def flattened(self, points: ArrayLike, distance: float) -> Array:
+        """Places (K, 2) [m] in the plane of `facing` at which points (K, 3) [m] are seen."""
+        at = self.in_camera(points)
+        return np.asarray(at[:, :2] / at[:, 2:] * distance * [1.0, -1.0])
+
+    def facing(self, distance: float) -> View:
+        """View of the plane q_z = `distance` [m]: the undistorted photograph in metres, y up."""
+        homography = np.diag([1.0, -1.0, distance])
+        rms, markers, numbers = self.reprojection_error, self.markers, self.numbers
+        return View(homography, self.shape, self.camera, rms, markers, numbers)
+
+
+def from_reference(pixels: ArrayLike, points: ArrayLike, shape: tuple[int, ...]) -> View:
     """View of a camera that looks squarely at the cable, from two points known in the picture.
 
     With z = x + i y on the board and q = u - i v in the picture (rows run down, y runs up),
@@ -155,8 +219,10 @@ def from_reference(reference: Reference, shape: tuple[int, ...]) -> View:
 
     Parameters
     ----------
-    reference : Reference
-        The two points in both frames.
+    pixels : (2, 2) [px]
+        Column u and row v of each point.
+    points : (2, 2) [m]
+        The same points in the board frame, x right, y up.
     shape : (height, width, ...) [px]
         Size of the photograph.
 
@@ -165,8 +231,8 @@ def from_reference(reference: Reference, shape: tuple[int, ...]) -> View:
     VisionError
         If the two points coincide, in the picture or on the board.
     """
-    q = reference.pixels[:, 0] - 1j * reference.pixels[:, 1]
-    z = reference.points[:, 0] + 1j * reference.points[:, 1]
+    q = np.asarray(pixels, float) @ [1, -1j]
+    z = np.asarray(points, float) @ [1, 1j]
     if abs(q[1] - q[0]) < 1.0 or abs(z[1] - z[0]) < 1e-6:
         raise VisionError(
             f"the two reference points are {abs(q[1] - q[0]):.3g} px and {abs(z[1] - z[0]):.3g} m "
@@ -183,8 +249,3 @@ def from_reference(reference: Reference, shape: tuple[int, ...]) -> View:
 def _apply(homography: NDArray[np.floating], points: Array) -> Array:
     mapped = points @ homography[:, :2].T + homography[:, 2]
     return mapped[:, :2] / mapped[:, 2:]
-
-
-def _area(polygon: Array) -> float:
-    x, y = polygon.T
-    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)

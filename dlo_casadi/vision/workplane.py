@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -21,32 +20,53 @@ _LONGEST_SIDE = 32767
 _LEAST_PIXELS = 8
 """Sides of a photograph, shrunk until the cable is CABLE_PX wide: below, nothing of it is left."""
 
+_AROUND = 0.3  # of the length: how far beyond its reach other cables are looked for
 _MARKER_MARGIN = 1.45  # of the marker: its white margin is one cell of six or more
 
 
 @dataclass(frozen=True)
-class WorkPlane:
-    """The part of the cable's plane that the cable can reach, at a known scale.
+class ExpectedLine:
+    """What is known of the cable's line in a plane before it is seen.
 
-    Parameters
-    ----------
-    image : (h, w, 3) uint8
-        The rectified picture; rows run down, i.e. along -y.
-    pixel : scalar [m]
-        Side of one of its pixels.
-    origin : (2,) [m]
-        Board coordinates of the centre of its first pixel.
-    inside : (h, w) bool
-        Inside the photograph and off the markers.
-    reachable : (h, w) bool
-        Of that, near enough to the fixtures for a cable of this length.
+    Its length lies between `shortest` and `longest`: both are the cable's where that lies in the
+    plane; in front of it the picture may show less (a part that points to the camera) or more (a
+    near one). In space it may turn back sharply, as a bend seen from its side does, and pass in
+    front of other things than the board.
     """
 
-    image: NDArray[np.uint8]
-    pixel: float
-    origin: Array
-    inside: NDArray[np.bool_]
-    reachable: NDArray[np.bool_]
+    start: Array  # (2,) [m]
+    end: Array | None  # (2,) [m], None where it is free
+    diameter: float  # [m]
+    shortest: float  # [m]
+    longest: float  # [m]
+    in_space: bool = False
+
+    @property
+    def fixtures(self) -> dict[str, Array]:
+        """Places (2,) [m] of the ends that are held, by their names."""
+        held = {"start": self.start, "end": self.end}
+        return {name: at for name, at in held.items() if at is not None}
+
+    @property
+    def typical(self) -> float:
+        """Length [m] by which other lengths and areas are judged."""
+        return 0.5 * (self.shortest + self.longest)
+
+    def tips(self, points: Array) -> list[tuple[str, Array, Array, float]]:
+        """Name and place of each fixture, the line's end there, and how far [m] that is off."""
+        pairs = zip(self.fixtures.items(), points[[0, -1]], strict=False)
+        return [(name, at, tip, float(np.linalg.norm(tip - at))) for (name, at), tip in pairs]
+
+
+@dataclass(frozen=True)
+class WorkPlane:
+    """The part of the cable's plane that the cable can reach, at a known scale."""
+
+    image: NDArray[np.uint8]  # (h, w, 3), rectified; rows run down, i.e. along -y
+    pixel: float  # [m], side of one of its pixels
+    origin: Array  # (2,) [m], board coordinates of the centre of its first pixel
+    inside: NDArray[np.bool_]  # (h, w), inside the photograph and off the markers
+    reachable: NDArray[np.bool_]  # (h, w), of that, near enough to the fixtures for the cable
 
     def to_board(self, at: Array) -> Array:
         """Points (K, 2) [m] of pixels (K, 2) of the working picture."""
@@ -57,28 +77,22 @@ class WorkPlane:
         return (points - self.origin) / self.pixel * [1.0, -1.0]
 
 
-def rectify(
-    image: NDArray[np.uint8],
-    view: View,
-    *,
-    start: Array,
-    end: Array | None,
-    diameter: float,
-    length: float,
-    margin: float = 0.0,
-) -> WorkPlane:
+def rectify(image: NDArray[np.uint8], view: View, expected: ExpectedLine) -> WorkPlane:
     """Resample the photograph onto the cable's plane, where the cable is `CABLE_PX` wide.
 
     A cable of length L between two fixtures stays inside the ellipse |p - start| + |p - end| <= L;
     with a free end inside the disc |p - start| <= L. Both are widened a little, since the scale
-    may be off.
+    may be off. In a plane the picture goes on beyond, where a second cable is looked for.
     """
     height, width = image.shape[:2]
+    start, end, diameter, length = expected.start, expected.end, expected.diameter, expected.longest
     reach = 1.08 * length + 2 * diameter
     centre, half = _reachable_box(start, end, reach)
-    half = half + margin
-    lower = np.maximum(centre - half, _seen(view, np.min))
-    upper = np.minimum(centre + half, _seen(view, np.max))
+    if not expected.in_space:
+        half = half + _AROUND * length
+    seen = _border(view)
+    lower = np.maximum(centre - half, seen.min(axis=0))
+    upper = np.minimum(centre + half, seen.max(axis=0))
     size = np.maximum(upper - lower, diameter)
     pixel = max(
         diameter / CABLE_PX,
@@ -134,14 +148,12 @@ def _reachable_box(start: Array, end: Array | None, reach: float) -> tuple[Array
     return (start + end) / 2, np.sqrt(spare + focus**2)
 
 
-def _seen(view: View, extreme: Callable[..., Array]) -> Array:
-    """Extreme board coordinates (2,) [m] along the border of the photograph."""
-    height, width = view.shape
+def _border(view: View) -> Array:
+    """Board coordinates (K, 2) [m] along the border of the photograph."""
     share = np.linspace(0.0, 1.0, 33)
     zero, one = np.zeros_like(share), np.ones_like(share)
-    u = np.concatenate([share, one, share, zero]) * (width - 1)
-    v = np.concatenate([zero, share, one, share]) * (height - 1)
-    return extreme(view.to_board(np.column_stack([u, v])), axis=0)
+    u, v = np.concatenate([share, one, share, zero]), np.concatenate([zero, share, one, share])
+    return view.to_board(np.column_stack([u, v]) * [view.shape[1] - 1, view.shape[0] - 1])
 
 
 def _marker_mask(

@@ -13,7 +13,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.pixels import Pixels, ViewInput, pixel_std, pixels_of
 from dlo_casadi.sensing.sensors import line_or_markers
-from dlo_casadi.vision import Camera, Sight, Viewpoint, project_outline
+from dlo_casadi.vision import Camera, ImageCurve, Viewpoint, project_outline
 
 LENGTH, DIAMETER = 0.9, 0.008
 CAMERA = Camera(
@@ -107,11 +107,11 @@ def test_pixels_near_the_ends_and_beside_each_other_are_left_out():
     camera, count = viewpoint(0.0), 301
     pixels = np.column_stack([np.arange(count) + 400.0, np.full(count, 500.0)])
     places = np.column_stack([np.linspace(0.2, 0.6, count), np.zeros(count), np.zeros(count)])
-    sight = Sight(
+    curve = ImageCurve(
         camera, pixels, np.full(count, 0.05), np.ones(count, bool), 6.0, 0.1, DIAMETER, 1.2,
         4.0 * np.sqrt(np.pi), 1.0, (), np.zeros(3), 1.0,
     )  # fmt: skip
-    view = ViewInput("a", Path("a.jpg"), sight, places)
+    view = ViewInput("a", Path("a.jpg"), curve, places)
     assert pixel_std([view]) == pytest.approx(0.05 * 1.2 / 1000)
     found = pixels_of(view, pixel_std([view]))
     u = found.pixels[:, 0] - 400.0

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.spatial import cKDTree
 
-from dlo_casadi.vision import Reference, View, from_reference
+from dlo_casadi.vision import View, from_reference
 
 SCALE = 500.0  # px/m
 CORNER = np.array([100.0, 100.0])  # pixel of the board's origin
@@ -16,7 +16,7 @@ def square_view(shape):
     """View from straight ahead: the origin at CORNER, SCALE px/m."""
     points = np.array([[0.0, 0.0], [0.4, 0.0]])
     pixels = CORNER + SCALE * points * [1, -1]
-    view = from_reference(Reference(pixels, points), shape)
+    view = from_reference(pixels, points, shape)
     assert isinstance(view, View)
     return view
 

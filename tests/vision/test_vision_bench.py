@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from dlo_casadi.vision import (
     Board,
     Camera,
-    Reference,
     extract_centerline,
     from_reference,
     locate_board,
@@ -116,10 +115,9 @@ def test_the_real_black_wire_agrees_with_the_clicked_points():
     """After a similarity alignment: the two reference points are turned and scaled."""
     config = ROOT / "configs/black_wire_photo.yaml"
     cable, experiment = session(config)
-    reference = Reference(**experiment["measurement"]["reference"])
     pose = experiment["poses"][0]
     image = read_image(config.parent / pose["file"])
-    view = from_reference(reference, image.shape)
+    view = from_reference(**experiment["measurement"]["reference"], shape=image.shape)
     line = extract_centerline(
         image,
         view,

@@ -91,8 +91,14 @@ def test_every_format_is_read_whole_or_refused_by_name(tmp_path, ending):
             read_image(path)
 
 
-@pytest.mark.parametrize("data", [bytes(1000), b"\xff\xd8\xff\xd9", png(0, 0), png(50, 50)])
+@pytest.mark.parametrize("data", [bytes(1000), b"\xff\xd8\xff\xd9", png(0, 0)])
 def test_what_holds_no_picture_is_no_image(tmp_path, data):
     (tmp_path / "a.png").write_bytes(data)
     with pytest.raises(VisionError, match=r"a\.png: the file is not an image"):
+        read_image(tmp_path / "a.png")
+
+
+def test_a_picture_without_its_pixels_is_truncated(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(50, 50))
+    with pytest.raises(VisionError, match=r"a\.png: the image is truncated"):
         read_image(tmp_path / "a.png")

@@ -18,8 +18,9 @@ from dlo_casadi.vision import (
     project_outline,
     see_cable,
 )
-from dlo_casadi.vision.sight import loops_either_way
-from dlo_casadi.vision.space_line import _agreeing_fit, _unsure
+from dlo_casadi.vision.agreement import agreeing_fit
+from dlo_casadi.vision.image_curve import loops_either_way
+from dlo_casadi.vision.space_line import _unsure
 
 CURVES = {"bow": bow(), "loop": loop()}
 
@@ -107,7 +108,6 @@ def test_the_middle_of_an_outline_is_that_of_the_cylinders_surface(pictures):
         edges = profile.min(), profile.max()
         middle = (seen.pixels - view.to_pixels(axis))[0] @ seen.normals[0]
         assert middle == pytest.approx(np.mean(edges), abs=0.03)
-        assert seen.half_widths[0] == pytest.approx(0.5 * (edges[1] - edges[0]), abs=0.03)
 
 
 @pytest.mark.parametrize("name", CURVES)
@@ -116,7 +116,7 @@ def test_the_line_in_a_photograph(pictures, name, where):
     """It crosses itself, its shadow and the outline of the board."""
     curve = CURVES[name]
     view = locate_camera(pictures[name][where], BOARD, CAMERA)
-    sight = see_cable(
+    seen = see_cable(
         pictures[name][where],
         view,
         start=curve[0],
@@ -125,13 +125,13 @@ def test_the_line_in_a_photograph(pictures, name, where):
         length=length_of(curve),
     )
     truth = true_pixels(curve, where)
-    away, nearest = cKDTree(truth).query(sight.pixels)
+    away, nearest = cKDTree(truth).query(seen.pixels)
     # the picture's noise leaves 0.1 px; beside the squares of a marker single pixels are far off
-    middle, most = np.quantile(away[sight.whole], [0.5, 0.98])
+    middle, most = np.quantile(away[seen.whole], [0.5, 0.98])
     assert middle < 0.12
     assert most < 0.4
-    assert np.mean(cKDTree(sight.pixels).query(truth)[0] < 5.0) > 0.95
-    clear = nearest[sight.whole]
+    assert np.mean(cKDTree(seen.pixels).query(truth)[0] < 5.0) > 0.95
+    clear = nearest[seen.whole]
     assert np.mean(np.diff(clear) > 0) > 0.97  # from start to end, but for crossings
 
 
@@ -147,14 +147,14 @@ def test_the_line_in_space(pictures, name, places):
     assert rms(away) < 0.5e-3
     assert np.mean(cKDTree(found.line.points).query(curve)[0] < 2.5e-3) > 0.95
     assert rms(away / found.line.std) < 2.0
-    assert set(found.sights) == set(places)
+    assert set(found.curves) == set(places)
 
 
 def test_pixels_are_compared_with_a_curve_across_it(pictures):
     """Moved by 1 mm, the true curve is where the slopes say that it is seen."""
     curve = CURVES["loop"]
-    sight = measured(pictures["loop"], curve).sights["ahead"]
-    places = places_along(sight, curve[::5])
+    seen = measured(pictures["loop"], curve).curves["ahead"]
+    places = places_along(seen, curve[::5])
     assert np.isfinite(places).mean() > 0.98
     used = np.isfinite(places)
     u = np.linspace(0.0, 1.0, len(curve))
@@ -164,10 +164,10 @@ def test_pixels_are_compared_with_a_curve_across_it(pictures):
         steps = np.gradient(moved, axis=0)
         steps = np.stack([np.interp(places[used], u, steps[:, i]) for i in range(3)], axis=1)
         tangents = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-        return compare_pixels(sight.viewpoint, sight.pixels[used], at, tangents, DIAMETER)
+        return compare_pixels(seen.viewpoint, seen.pixels[used], at, tangents, DIAMETER)
 
     distance, slopes = compared(curve)
-    assert rms(distance[sight.whole[used]]) < 0.2
+    assert rms(distance[seen.whole[used]]) < 0.2
     move = np.array([3e-4, -8e-4, 5e-4])
     assert compared(curve + move)[0] == pytest.approx(distance + slopes @ move, abs=0.01)
 
@@ -176,7 +176,7 @@ def test_one_photograph_is_no_line_but_pixels(pictures):
     curve = CURVES["bow"]
     found = measured({"ahead": pictures["bow"]["ahead"]}, curve)
     assert found.line is None
-    assert rms(cKDTree(true_pixels(curve, "ahead")).query(found.sights["ahead"].pixels)[0]) < 0.15
+    assert rms(cKDTree(true_pixels(curve, "ahead")).query(found.curves["ahead"].pixels)[0]) < 0.15
     assert "ahead: one photograph alone gives no line in space" in found.messages[-1]
 
 
@@ -190,17 +190,17 @@ def test_a_photograph_of_another_pose_is_named_and_left_out(pictures):
     pair = {"left": pictures["bow"]["left"], "ahead": pictures["loop"]["ahead"]}
     found = measured(pair, curve)
     assert found.line is None
-    assert list(found.sights) == ["left"]
+    assert list(found.curves) == ["left"]
     assert found.problems["ahead"].startswith("ahead: ")
 
 
 def test_a_camera_whose_place_is_not_known_is_named(pictures):
     """Where its markers tell that to 6 mm; otherwise a part of the line is not seen well."""
     images = {where: pictures["bow"][where] for where in ("left", "ahead")}
-    sights = measured(images, CURVES["bow"]).sights
-    assert _unsure(sights, images, DIAMETER).startswith("hidden, or seen along their depth")
-    vague = replace(sights["left"].viewpoint, covariance=36e-6 * np.eye(6))
-    found = _unsure({**sights, "left": replace(sights["left"], viewpoint=vague)}, images, DIAMETER)
+    curves = measured(images, CURVES["bow"]).curves
+    assert _unsure(curves, images, DIAMETER).startswith("hidden, or seen along their depth")
+    vague = replace(curves["left"].viewpoint, covariance=36e-6 * np.eye(6))
+    found = _unsure({**curves, "left": replace(curves["left"], viewpoint=vague)}, images, DIAMETER)
     assert "markers in left tell where its camera stands to 6.0 mm" in found
 
 
@@ -208,7 +208,7 @@ def test_a_loop_that_was_read_the_wrong_way_round_is_turned(pictures):
     """Of both orders in one photograph the line in space tells which is likelier."""
     curve = CURVES["loop"]
     images = {where: pictures["loop"][where] for where in ("left", "right")}
-    sights = {
+    curves = {
         where: see_cable(
             image,
             locate_camera(image, BOARD, CAMERA),
@@ -219,10 +219,10 @@ def test_a_loop_that_was_read_the_wrong_way_round_is_turned(pictures):
         )
         for where, image in images.items()
     }
-    for where, sight in sights.items():
-        for way in loops_either_way(sight)[1:]:
-            found = {**sights, where: way}
-            fit, _ = _agreeing_fit(found, {}, [curve[0], curve[-1]], length_of(curve), 50)
+    for where, seen in curves.items():
+        for way in loops_either_way(seen)[1:]:
+            found = {**curves, where: way}
+            fit = agreeing_fit(found, {}, [curve[0], curve[-1]], length_of(curve), 50)
             away = cKDTree(curve).query(fit.curve.position(np.linspace(0.05, 0.95, 200)))[0]
             assert rms(away) < 1e-3
 

@@ -113,9 +113,15 @@ def test_markers_are_told_apart():
     board = Board("DICT_4X4_50", 60 / SCALE, 0.0, CENTERS)
     assert locate_board(board_picture(CENTERS), board).numbers == (0, 1, 2, 3)
     seen = locate_board(board_picture({n: CENTERS[n] for n in (0, 1, 3)}), board)
-    assert (seen.numbers, seen.misplaced) == ((0, 1, 3), ())
+    assert seen.numbers == (0, 1, 3)
+    assert seen.messages == ("marker 2 is not found; 3 of 4 are used",)
     moved = locate_board(board_picture(CENTERS | {2: (0.8, -0.5)}), board)
-    assert (moved.numbers, moved.misplaced) == ((0, 1, 3), (2,))
+    assert moved.numbers == (0, 1, 3)
+    assert moved.messages == ("marker 2 is not where it is declared; 3 of 4 are used",)
+    copied = np.minimum(board_picture(CENTERS), board_picture({2: (0.5, -0.3)}))
+    assert locate_board(copied, board).messages == (
+        "marker 2 is seen more than once and not used. Try: cover or remove the copy.",
+    )
 
 
 @pytest.mark.parametrize(

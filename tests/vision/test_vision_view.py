@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision import Board, Camera, Reference, View, from_reference, locate_board
+from dlo_casadi.vision import Board, Camera, View, from_reference, locate_board
 
 SHAPE = (480, 640)
 MATRIX = np.array([[620.0, 0.0, 322.0], [0.0, 618.0, 236.0], [0.0, 0.0, 1.0]])
@@ -195,7 +195,7 @@ def test_two_points_give_a_similarity_with_y_up():
     factor, offset = 1000 * np.exp(0.3j), 200 - 150j
     z = POINTS[:, 0] + 1j * POINTS[:, 1]
     pixels = np.column_stack([(factor * z + offset).real, -(factor * z + offset).imag])
-    view = from_reference(Reference(pixels[:2], POINTS[:2]), (300, 400, 3))
+    view = from_reference(pixels[:2], POINTS[:2], (300, 400, 3))
     assert view.to_pixels(POINTS) == pytest.approx(pixels, abs=1e-9)
     assert view.to_board(pixels) == pytest.approx(POINTS, abs=1e-12)
     assert view.scale == pytest.approx(1000.0)
@@ -203,4 +203,4 @@ def test_two_points_give_a_similarity_with_y_up():
 
 def test_two_equal_reference_points_are_refused():
     with pytest.raises(VisionError, match="too close for a scale"):
-        from_reference(Reference(np.zeros((2, 2)), np.array([[0, 0], [1, 0]])), (10, 10))
+        from_reference(np.zeros((2, 2)), [[0, 0], [1, 0]], (10, 10))

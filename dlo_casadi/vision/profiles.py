@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,67 +21,51 @@ _LOCAL = 2.0  # diameters along the cable, over which steps are averaged
 _LIT = 5.0
 _INNER = 0.15  # of the width: nearer to the middle both sides look alike
 _CLEAR = 1.3  # blurs inside an edge: there nine tenths of the step are behind
-_MOST_SHADE = 0.5  # of the step: a larger difference is no shading
-_FAINT = 0.3  # of the usual step: less is no cable
-_BARE = 0.35  # share of it that no highlight reaches
+_MOST_SHADE = 0.5  # of the step: a larger difference is not shading
+_FAINT = 0.3  # of the usual step: smaller ones are not the cable
+_BARE = 0.35  # share of the cable's width that no highlight reaches
 
 
 @dataclass(frozen=True)
 class Profiles:
-    """Brightness across the cable.
+    """Brightness across the cable."""
 
-    Parameters
-    ----------
-    t : (K,) [m]
-        Where along the curve.
-    offset : (M,) [m]
-        Where across it, positive to the left.
-    values : (K, M, 3)
-        Colours.
-    inside : (K,) bool
-        The cable and its edges lie in the photograph.
-    """
+    t: Array  # (K,) [m], where along the curve
+    offset: Array  # (M,) [m], where across it, positive to the left
+    values: Array  # (K, M, 3), colours
+    inside: NDArray[np.bool_]  # (K,), the cable and its edges lie in the photograph
 
-    t: Array
-    offset: Array
-    values: Array
-    inside: NDArray[np.bool_]
+    def average(self, trusted: NDArray[np.bool_], along: float) -> Profiles:
+        """Average trusted profiles along the curve, with a Gaussian of deviation `along` [m].
+
+        That lowers the noise of the pixels and of their compression, and bends nothing, since the
+        profiles follow the curve.
+        """
+        deviation = max(along / float(np.median(np.diff(self.t))), 0.1)
+        weight = trusted.astype(float)
+        total = gaussian_filter1d(weight, deviation, mode="constant")[:, None, None]
+        weighted = self.values * weight[:, None, None]
+        summed = gaussian_filter1d(weighted, deviation, axis=0, mode="constant")
+        values = np.where(total > 1e-3, summed / np.maximum(total, 1e-3), self.values)
+        return replace(self, values=values)
 
 
 @dataclass(frozen=True)
 class EdgeShape:
-    """How wide the cable is in the photograph, and how blurred its edges.
+    """How wide the cable is in the photograph, and how blurred its edges."""
 
-    Parameters
-    ----------
-    width, blur : scalar [m]
-        Distance of the two edges, and standard deviation of an edge's blur.
-    """
-
-    width: float
-    blur: float
+    width: float  # [m], distance of the two edges
+    blur: float  # [m], standard deviation of an edge's blur
 
 
 @dataclass(frozen=True)
 class Crossings:
-    """Where the cable lies across each profile.
+    """Where the cable lies across each profile."""
 
-    Parameters
-    ----------
-    offset : (K,) [m]
-        Middle between the two edges, relative to the curve.
-    width : (K,) [m]
-        Distance of the two edges.
-    rise : (K,) [m]
-        Blur of the edges, as a standard deviation.
-    height : (K,)
-        Step of brightness from the surroundings to the cable [grey levels].
-    """
-
-    offset: Array
-    width: Array
-    rise: Array
-    height: Array
+    offset: Array  # (K,) [m], middle between the two edges, relative to the curve
+    width: Array  # (K,) [m], distance of the two edges
+    rise: Array  # (K,) [m], blur of the edges, as a standard deviation
+    height: Array  # (K,) [grey levels], step from the surroundings to the cable
 
 
 def sample_profiles(
@@ -105,26 +89,6 @@ def sample_profiles(
         image, at.astype(np.float32), None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )
     return Profiles(t, offset, np.asarray(values, dtype=float), inside)
-
-
-def average(profiles: Profiles, trusted: NDArray[np.bool_], along: float) -> Profiles:
-    """Average trusted profiles along the curve, with a Gaussian of deviation `along` [m].
-
-    That lowers the noise of the pixels and of their compression, and bends nothing, since the
-    profiles follow the curve.
-    """
-    deviation = max(along / float(np.median(np.diff(profiles.t))), 0.1)
-    weight = trusted.astype(float)
-    total = gaussian_filter1d(weight, deviation, mode="constant")
-    summed = gaussian_filter1d(
-        profiles.values * weight[:, None, None], deviation, axis=0, mode="constant"
-    )
-    values = np.where(
-        total[:, None, None] > 1e-3,
-        summed / np.maximum(total, 1e-3)[:, None, None],
-        profiles.values,
-    )
-    return Profiles(profiles.t, profiles.offset, values, profiles.inside)
 
 
 def cable_direction(profiles: Profiles, trusted: NDArray[np.bool_], diameter: float) -> Array:
@@ -165,8 +129,8 @@ def local_directions(
     """
     core = profiles.values[:, np.abs(profiles.offset) < 0.3 * diameter].mean(axis=1)
     around = profiles.values[:, np.abs(profiles.offset) > 0.8 * diameter].mean(axis=1)
-    spacing = float(np.median(np.diff(profiles.t)))
-    step = gaussian_filter1d(core - around, _LOCAL * diameter / spacing, axis=0, mode="nearest")
+    deviation = _LOCAL * diameter / float(np.median(np.diff(profiles.t)))
+    step = gaussian_filter1d(core - around, deviation, axis=0, mode="nearest")
     usual = float(np.median((step @ direction)[trusted]))
     size = np.sum(step**2, axis=1)
     other = (step @ direction / usual < 0.5) & (size > (_FAINT * usual) ** 2)
