@@ -43,7 +43,6 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from dlo_casadi.prediction import PredictedShape
 from matplotlib import pyplot
 from matrix.cells import CELLS, Cell, pairwise
 from matrix.sessions import FULL, Session, Size, draw_session
@@ -52,7 +51,7 @@ from rich.console import Console
 from scipy.special import stdtrit
 
 import dlo_casadi as dlo
-from dlo_casadi.api import Result
+from dlo_casadi.api import PredictedShape, Result
 from dlo_casadi.cli import main as command
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.errors import DloError

@@ -1,5 +1,7 @@
 """A rod in space against closed forms, the plane, turned worlds, and itself on finer meshes."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import EFFECTS, Cable
+from dlo_casadi.equilibrium.batch import Sweep
 from dlo_casadi.equilibrium.descent import descend
 from dlo_casadi.equilibrium.initial_frames import same_sign
 from dlo_casadi.equilibrium.pose import Pose
@@ -317,3 +320,43 @@ def test_a_slot_is_differentiated_as_by_casadi_in_one_go(element, end):
     for one, other in zip(found, expected, strict=True):
         size = np.abs(np.array(other)).max()
         assert np.array(one) == pytest.approx(np.array(other), rel=1e-11, abs=1e-13 * size)
+
+
+@pytest.mark.parametrize("element", ["arc", "quadratic"])
+def test_a_straight_cable_between_ball_joints_is_stable_though_it_may_spin(element):
+    """Its turn about itself costs nothing and moves nothing: the shape is that in a plane."""
+    cable = Cable(LENGTH, 0.06, 0.008, EI, torsional_stiffness=GJ)
+    model = CableModel(cable, 12, element, gravity=DOWN)
+    pose = Pose((0.0, 0.0, 0.0), (0.5 * LENGTH, 0.1 * LENGTH, 0.05))
+    found = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
+    planar = CableModel(replace(cable, torsional_stiffness=None), 12, element)
+    level = np.hypot(*pose.end[:2])
+    alike = solve_equilibrium(
+        planar,
+        planar.nominal,
+        np.zeros(planar.chain.n_rests),
+        Pose((0.0, 0.0), (level, pose.end[2])),
+    )
+    # Arcs are the same in both; what bows inside an element is of the fifth order in h apart.
+    close = 1e-10 if element == "arc" else 1e-3
+    assert found.stable
+    assert found.energy == pytest.approx(alike.energy, rel=close)
+    flat = np.stack([found.points[:, :2] @ pose.end[:2] / level, found.points[:, 2]], axis=1)
+    np.testing.assert_allclose(flat, alike.points, atol=close * LENGTH)
+
+
+def test_a_cable_bent_against_its_rest_shape_is_no_minimum():
+    """Between ball joints it would turn about itself, to the side to which it is bent at rest."""
+    cable = Cable(LENGTH, 1e-6, 0.008, EI, torsional_stiffness=GJ)
+    model = CableModel(cable, 12, "arc", gravity=DOWN)
+    pose = Pose((0.0, 0.0, 0.0), (0.7 * LENGTH, 0.0, 0.0))
+    rest = np.zeros(model.chain.n_rests)
+    rest[model.chain.n_cells : 2 * model.chain.n_cells] = 2.0
+    found = solve_equilibrium(model, model.nominal, rest, pose)
+    against = Shapes.declared(found.x[None], found.multipliers[None])
+    assert found.stable
+    assert list(Sweep(model, [pose]).stable(against, model.nominal, rest)) == [True]
+    weak = -1e-3 * rest
+    shapes, solved = Sweep(model, [pose]).solve(against, model.nominal, weak)
+    assert solved.all()
+    assert list(Sweep(model, [pose]).stable(shapes, model.nominal, weak)) == [False]

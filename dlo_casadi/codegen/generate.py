@@ -233,6 +233,7 @@ def generate(
         **_values(model, prefix, digest),
         **own.values(model, p, meshes),
         "LENGTH": c_number(float(lagrangian_of(model).held(p, 0, 0)[1])),
+        "SPINS": str(int(model.may_spin and not rest.any())),
         "TABLE": table_to_c(numbers),
         "EXTRA": str(kernel_numbers),
         "CODE": str(size_of_code(meshes.values(), numbers)),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.codegen.records import pose_size
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import EndConditions
 
@@ -75,7 +75,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     d = model.node.dimension
     for name, place in (("start", pose.start), ("end", pose.end)):
         if place is not None and np.shape(place) != (d,):
-            raise DloError(f"{pose.name}: {name} must have {d} numbers, found {place!r}")
+            raise DloError(f"{pose.name}: {name} must have {counted(d, 'number')}, found {place!r}")
     try:
         numbers = np.asarray([*pose.ends, pose.turns], float)
     except (TypeError, ValueError):

@@ -273,7 +273,9 @@ class Search:
         limit = UNSEEN * max(fit.expected_error, validation.expected)
         if added:
             limit = max(limit, UNSEEN_LEFT * self.error)
-        unpredicted = (bool(added) or self.several) and validation.error > limit
+        # From one pose alone another one is not predicted to first order of the covariance.
+        told = bool(added) or len(self.declared.problem.used) > 2
+        unpredicted = told and validation.error > limit
         unexplained = structure.p_noise < self.significance or unpredicted
         unexplained |= fit.noise.source == "misfit"
         return Found(fit, tuple(added), ranked, validation, structure, unexplained)

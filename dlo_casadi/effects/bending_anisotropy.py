@@ -10,6 +10,7 @@ import casadi as ca
 from dlo_casadi.effects.cable import Cable
 from dlo_casadi.effects.effect import Effect, Params, SectionLaw
 from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.effects.setup import Setup
 
 # Ratios of the stiffnesses: a ribbon of the width w and thickness t has (w / t)^2.
 LARGEST = 100.0
@@ -37,6 +38,13 @@ class BendingAnisotropy(SectionLaw):
 
     name = "bending_anisotropy"
     in_plane = False
+    isotropic = False
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where a clamp or a rest curvature tells how the section is turned."""
+        told = "clamped" in (setup.start, setup.end) or setup.curved
+        return super().applies(setup) and told
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare ratio and angle."""
@@ -73,6 +81,7 @@ class _LinearAnisotropy(SectionLaw):
     """
 
     name = "linear_anisotropy"
+    isotropic = False
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare a and b."""

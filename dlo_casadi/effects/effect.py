@@ -187,6 +187,8 @@ class SectionLaw(Effect):
     """
 
     slot: ClassVar[str] = "section"
+    # Whether the section bends alike about all axes.
+    isotropic: ClassVar[bool] = True
 
     def along(self, cell: Cell, cable: Cable, params: Params) -> ca.SX:
         """Factor on the stiffnesses against bending and torsion of a cell."""

@@ -7,7 +7,7 @@ the derivatives of both and of the measured curve.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -200,7 +200,21 @@ class Assembly:
         value, slope, bend = self._call_slots("slot", shapes, given)
         end_value, end_slope, end_bend = self._call_ends("at_ends", shapes, given)
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
-        return total, self._added(slope, end_slope), self._band(bend, end_bend)
+        return total, self._added(slope, end_slope), self._held(self._band(bend, end_bend), given)
+
+    def _held(self, matrix: BandMatrix, given: Given) -> BandMatrix:
+        """Hold the first node of cables that turn about their own axis at no cost.
+
+        Straight at rest, such a cable has the null vector (1, 0, 0) at every node. A stiffness
+        against one of these turns leaves Newton steps and the inertia beside that vector as they
+        are: the part of any direction along it may be taken off.
+        """
+        if not self.model.may_spin:
+            return matrix
+        straight = ~given.rest.any(axis=1)
+        diagonal = matrix.diagonal.copy()
+        diagonal[straight, 0, 0, 0] += matrix.scale[straight]
+        return replace(matrix, diagonal=diagonal)
 
     def imbalance(self, shapes: Shapes, given: Given) -> Vector:
         """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""

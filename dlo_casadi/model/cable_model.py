@@ -10,7 +10,7 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.effects import Cable, Effect, Kinematics, Load, StateEffect
+from dlo_casadi.effects import Cable, Effect, Kinematics, Load, SectionLaw, StateEffect
 from dlo_casadi.effects.parameter import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.rest_curvature import RestCurvature
@@ -218,6 +218,16 @@ class CableModel:
     def has_state(self) -> bool:
         """Whether a pose changes the rest curvature of the next one."""
         return any(isinstance(effect, StateEffect) for effect in self.effects)
+
+    @property
+    def may_spin(self) -> bool:
+        """Whether nothing but a rest curvature tells how the cable is turned about its own axis.
+
+        So it is in space between ball joints, with a section that bends alike about all axes.
+        """
+        held = "clamped" in (self.start, self.end)
+        laws = [effect for effect in self.effects if isinstance(effect, SectionLaw)]
+        return self.in_space and not held and all(law.isotropic for law in laws)
 
     @property
     def shape_dependent_loads(self) -> tuple[str, ...]:

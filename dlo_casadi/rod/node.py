@@ -260,8 +260,10 @@ class Frame(Node):
 
     @classmethod
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
-        """Quaternions of either sign."""
-        return bool(np.abs(cls.difference(x, y)).max() < tolerance)
+        """Quaternions of either sign; a turn of the whole cable about itself is not seen."""
+        gap = cls.difference(x, y)
+        gap[:, 0] -= gap[:, 0].mean()
+        return bool(np.abs(gap).max() < tolerance)
 
 
 def quaternion_product(p: Any, q: Any) -> tuple[Any, Any, Any, Any]:

@@ -80,14 +80,11 @@ class BranchShape:
         What the pose has to name for it to be predicted; None if no name does.
     turns : 0.5, -0.5 or None
         Or tell, see `Pose`.
-    undecided : bool
-        Whether the parameters are so uncertain that either equilibrium may be the lower one.
     """
 
     rmse: float
     branch: PoseBranch | None
     turns: float | None = None
-    undecided: bool = False
 
     @property
     def chosen_by(self) -> str | None:
@@ -149,11 +146,14 @@ class PoseShape:
     spread : (M,) or (M, 2) or None [m]
         Standard deviation across the curve of the next hanging, as the residual; None if it was
         not computed.
-    expected : (K,) or None [m]
-        RMS distance of each measured point from the prediction that the noise and the next hanging
-        let expect, in the directions in which it is compared; None if it was not computed.
+    missed, expected : (K,) or None [m]
+        Distance of each measured point from the prediction in the directions in which it is
+        compared, and its RMS that the noise and the next hanging let expect; None if they were not
+        computed.
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
+    undecided : bool
+        Whether the uncertain parameters leave open that that one is the lowest.
     measured_side : BranchShape or None
         Of a fit pose that is compared on the side where it was measured, not the lower one.
     either_side : EitherSide or None
@@ -169,16 +169,13 @@ class PoseShape:
     stable: bool
     forces: FloatArray
     measured_branch: BranchShape | None = None
+    undecided: bool = False
     measured_side: BranchShape | None = None
     either_side: EitherSide | None = None
     spread: FloatArray | None = None
+    missed: FloatArray | None = None
     expected: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-
-    @property
-    def open(self) -> bool:
-        """Whether it was measured in another equilibrium that may as well be the lowest one."""
-        return self.measured_branch is not None and self.measured_branch.undecided
 
     def inside_band(self, length: float, noise: float) -> NDArray[np.bool_]:
         """Whether each measured point (K,) lies in its 90 % band, noise included."""

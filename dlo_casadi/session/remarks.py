@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from dlo_casadi.errors import counted
 from dlo_casadi.estimation.mesh import allowed_mesh_error
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.session.outcome import SIMPLER, BranchShape, PoseInput, PoseShape, Stage
+from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
 from dlo_casadi.thresholds import FIXTURES, UNSEEN
 
 FloatArray = NDArray[np.floating]
@@ -89,7 +89,7 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
                 f"stage {stage.name}: {', '.join(found)}: the equilibrium of lowest energy, which "
                 f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
                 f"off, on the measured branch {1e3 * measured:.3g} mm; {_cure(chosen_by)}"
-                + _open(found)
+                + _undecided(name for name in found if stage.shapes[name].undecided)
             )
         sides = stage.measured_side
         for chosen_by in dict.fromkeys(side.chosen_by for side in sides.values()):
@@ -108,9 +108,9 @@ def _cure(chosen_by: str | None) -> str:
     return f"`{chosen_by}` in these poses chooses it"
 
 
-def _open(found: Mapping[str, BranchShape]) -> str:
-    """That the parameters do not tell which equilibrium is lower, where so."""
-    names = ", ".join(name for name, shape in found.items() if shape.undecided)
+def _undecided(found: Iterable[str]) -> str:
+    """That the parameters do not tell which equilibrium of some poses is lower."""
+    names = ", ".join(found)
     return f". The fit is too uncertain to tell which of both is lower in {names}" if names else ""
 
 
@@ -229,16 +229,17 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
 def _judged(stage: Stage) -> set[str]:
     """Poses whose errors tell of the model: an equilibrium that is open tells nothing."""
     known = (name for name, shape in stage.shapes.items() if shape.expected is not None)
-    return {name for name in known if not stage.shapes[name].open}
+    return {name for name in known if not stage.shapes[name].undecided}
 
 
 def _errors(shape: PoseShape) -> FloatArray:
     """Squares (2, K) [m^2] of a pose's distances from its prediction: measured, expected."""
     assert shape.expected is not None
+    assert shape.missed is not None
     expected, there = shape.expected**2, shape.measured_branch
     if there is not None and (there.branch not in SIGNS or shape.either_side is not None):
         return np.stack([np.full_like(expected, there.rmse**2), expected])
-    return np.stack([(shape.gap**2).sum(axis=1), expected])
+    return np.stack([shape.missed**2, expected])
 
 
 def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[str]:

@@ -188,11 +188,10 @@ def _stage(
                 shape = shapes[item.pose.name]
                 shape = _expected(model, p, item, known, shape, uncertainty, noise)
                 either = _either_side(model, p, item, known, other, uncertainty)
-                branch = shape.measured_branch
-                if branch is not None and other is not None:
-                    undecided = _undecided(model, p, item, known, other, uncertainty)
-                    branch = replace(branch, undecided=undecided)
-                shape = replace(shape, either_side=either, measured_branch=branch)
+                undecided = other is not None and _undecided(
+                    model, p, item, known, other, uncertainty
+                )
+                shape = replace(shape, either_side=either, undecided=undecided)
                 shapes[item.pose.name] = shape
     lost = [item for item in measured if item.pose.name not in shapes]
     if lost:
@@ -234,13 +233,20 @@ def _expected(
     eq = known.equilibrium
     curve, moved = displacements(model, p, known.rest, item.pose, eq, uncertainty, both)
     spread = spread_across(curve, places, moved[: len(places)])
-    expected = np.zeros(0)
+    expected: FloatArray = np.zeros(0)
+    missed = expected
     if len(shape.s):
         line = item.traced
-        rows = line.components(curve, shape.s, moved[len(places) :])
-        hanging = np.bincount(line.point_of, (rows**2).sum(axis=1))
-        expected = np.sqrt(hanging + (noise * line.noise_distances) ** 2)
-    return replace(shape, spread=spread if model.in_space else spread[:, 0], expected=expected)
+
+        def distances(moved: FloatArray) -> FloatArray:
+            """Lengths (K,) [m] of displacements (K, d, q) as the sensor compares points."""
+            rows = line.components(curve, shape.s, moved)[line.on_points]
+            return np.asarray(np.sqrt(np.bincount(line.point_of, (rows**2).sum(axis=1))))
+
+        missed = distances(shape.gap[..., None])
+        expected = np.hypot(distances(moved[len(places) :]), noise * line.noise_distances)
+    band = np.asarray(spread if model.in_space else spread[:, 0])
+    return replace(shape, spread=band, expected=expected, missed=missed)
 
 
 def _undecided(

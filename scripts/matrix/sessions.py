@@ -252,7 +252,11 @@ def true_shapes(
         for pose in poses
     ]
     found = predict_poses(model, p, rest.ravel(), true)
-    sound = [x for x in found if x is not None and x.equilibrium.stable and not x.either]
+    sound = [
+        x
+        for x in found
+        if x is not None and x.equilibrium.stable and x.equilibrium.other_side is None
+    ]
     return sound if len(sound) == len(found) else None
 
 
