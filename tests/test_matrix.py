@@ -24,18 +24,7 @@ def test_few_cells_hold_all_pairs_that_a_configuration_admits():
     assert all(admitted(cell) for cell in CELLS)
 
 
-# Clean sessions that are refused or called unexplained, or that take half a minute: they belong
-# among the others once they are not. scripts/check_matrix.py runs them.
-UNSETTLED = {
-    "pinned-pinned-space-markers-curved-read-nine-once",
-    "pinned-free-plane-photographs-straight-read-two-once",
-    "clamped-pinned-space-lines-curved-unread-two-once",
-}
-
-
-@pytest.mark.parametrize(
-    "cell", [x for x in pairwise() if x.name not in UNSETTLED], ids=lambda cell: cell.name
-)
+@pytest.mark.parametrize("cell", pairwise(), ids=lambda cell: cell.name)
 def test_a_clean_session_goes_all_the_way(cell, tmp_path):
     """Check, fit, files, terminal, notebook, prediction, generated C; nothing hidden or found.
 
