@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Shapes
@@ -61,6 +61,6 @@ def random_session(
         np.array([item.equilibrium.multipliers for item in found]),
         deviation,
     )
-    sweep = Sweep(model, poses)
-    shapes, converged = sweep.solve(shapes, p, rest)
-    return sweep.seen(shapes, p, rest) if converged.all() else None
+    equilibria = BatchEquilibrium(model, poses)
+    shapes, converged = equilibria.solve(shapes, p, rest)
+    return equilibria.seen(shapes, p, rest) if converged.all() else None

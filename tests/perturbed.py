@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dlo_casadi.model.assembly import Assembly, Directions, Given, Shapes
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
 from dlo_casadi.rod.ends import deviation_names
 
 FloatArray = np.ndarray
@@ -25,8 +25,8 @@ def any_rest(a: Assembly, m: int = 1) -> FloatArray:
     return np.random.default_rng(1).normal(size=(m, a.chain.n_rests))
 
 
-def directions(a: Assembly, m: int, *names: str) -> Directions:
-    """One column for each number of the named parts of `Directions`, the same in all poses."""
+def directions(a: Assembly, m: int, *names: str) -> Tangents:
+    """One column for each number of the named parts of `Tangents`, the same in all poses."""
     rows = {
         "x": a.n * a.b,
         "lam": a.k,
@@ -43,15 +43,15 @@ def directions(a: Assembly, m: int, *names: str) -> Directions:
             used += count
         parts[name] = block
     parts["x"] = parts["x"].reshape((m, a.n, a.b, q))
-    return Directions(**parts)
+    return Tangents(**parts)
 
 
 def central(
     a: Assembly,
-    function: Callable[[Shapes, Given], FloatArray],
+    function: Callable[[Shapes, Inputs], FloatArray],
     shapes: Shapes,
-    given: Given,
-    along: Directions,
+    given: Inputs,
+    along: Tangents,
     step: FloatArray | float = 1e-6,
 ) -> FloatArray:
     """Derivatives (..., q) of what a function of the shapes says, by steps (q,)."""

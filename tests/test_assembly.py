@@ -1,4 +1,4 @@
-"""Poses put together from slots: derivatives, independence of poses, memory that grows with n."""
+"""Poses put together from segments: derivatives, independence of poses, memory over n."""
 
 import pickle
 import tracemalloc
@@ -25,9 +25,9 @@ from dlo_casadi.effects import (
     StiffSection,
     UnknownPull,
 )
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Assembly, Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import ELEMENTS
@@ -50,7 +50,7 @@ MOST = (
 HOLDERS = {"pinned": (EndSpring(), EndOffset()), "clamped": (ClampAngle(),), "free": ()}
 
 
-def posed(element: str, boundary: tuple, effects=MOST, n=4) -> tuple[Assembly, Shapes, Given]:
+def posed(element: str, boundary: tuple, effects=MOST, n=4) -> tuple[Assembly, Shapes, Inputs]:
     """Three poses of a model with most effects, at nothing special."""
     effects = (*effects, *HOLDERS[boundary[1]])
     model = CableModel(CABLE, n, element, *boundary, effects=effects)
@@ -59,7 +59,7 @@ def posed(element: str, boundary: tuple, effects=MOST, n=4) -> tuple[Assembly, S
         0.3 * q.scale * (not q.log) * rng.uniform(0.2, 1) for q in model.parameters
     ]
     a = assembly_of(model)
-    return a, any_shapes(a, M), Given.of(p, any_rest(a, M), np.pad(ENDS, ((0, 0), (0, 3))))
+    return a, any_shapes(a, M), Inputs.of(p, any_rest(a, M), np.pad(ENDS, ((0, 0), (0, 3))))
 
 
 def steps(a: Assembly, *names: str) -> np.ndarray:
@@ -203,14 +203,14 @@ def most_memory(n: int) -> int:
     """Largest memory [bytes] that NumPy holds during a linearisation of three poses."""
     tracemalloc.start()
     model = CableModel(CABLE, n, effects=(LumpedMass(), RestCurvatureDrift()))
-    sweep = Sweep(model, [Pose((0.0, 0.0), (0.5, 0.1 * j)) for j in range(M)])
+    equilibria = BatchEquilibrium(model, [Pose((0.0, 0.0), (0.5, 0.1 * j)) for j in range(M)])
     s = model.chain.places / CABLE.length
-    shapes = sweep.start_shapes(np.broadcast_to((1 - 2 * s)[:, None], (M, len(s), 1)))
+    shapes = equilibria.start_shapes(np.broadcast_to((1 - 2 * s)[:, None], (M, len(s), 1)))
     rest = np.full(model.chain.n_cells, 0.5)
     p = np.array([0.02, 0.01, 0.3, 0.1])
     slopes, rest_slopes = np.eye(4, 13), np.hstack([np.zeros((n, 4)), model.rest_basis])
-    along = sweep.directions(shapes, p, rest, slopes, rest_slopes)
-    sweep.observe(shapes, p, rest, along)
+    along = equilibria.directions(shapes, p, rest, slopes, rest_slopes)
+    equilibria.observe(shapes, p, rest, along)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak

@@ -6,7 +6,7 @@ import pytest
 from dlo_casadi.effects import Cable, Tether
 from dlo_casadi.equilibrium.descent import _convex, descend
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix
 
@@ -37,7 +37,7 @@ def test_a_soft_cable_on_a_strong_tether_is_brought_to_rest(element, stiffness):
     p = np.array([2e-5, stiffness, 0.3, 0.25, 0.15])
     x = np.random.default_rng(0).normal(scale=0.5, size=(12, 11, 1)).cumsum(axis=1)
     shapes = Shapes.declared(x, np.zeros((12, model.n_border)))
-    given = Given.of(p, np.zeros(10), np.repeat(Pose((0.0, 0.0), (0.4, 0.1)).vector[None], 12, 0))
+    given = Inputs.of(p, np.zeros(10), np.repeat(Pose((0.0, 0.0), (0.4, 0.1)).vector[None], 12, 0))
 
     found = descend(assembly_of(model), shapes, given)
 

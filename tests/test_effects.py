@@ -26,17 +26,17 @@ from dlo_casadi.effects import (
     PointForce,
     SectionLaw,
     SideLoad,
-    Sight,
     StandoffError,
     StiffnessGradient,
     StiffSection,
     Tether,
     UnknownPull,
+    Viewpoint,
 )
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
@@ -52,7 +52,7 @@ POSE_IN_SPACE = Pose(
     end_orientation=(-0.3, 0.1, 0.2, 0.9),
 ).vector
 GRAVITY = {"plane": (1.0, -9.7), "space": (1.0, 0.5, -9.7)}
-SLOTS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
+KINDS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
 UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad", "rad/(N m)"}
 EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
@@ -97,12 +97,12 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
     return p
 
 
-def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[Shapes, Given]:
+def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[Shapes, Inputs]:
     """One pose, straight and unloaded or without any symmetry."""
     pose = POSE_IN_SPACE if model.in_space else POSE
     a, scale = assembly_of(model), 0.0 if headings == "straight" else 1.0
     shapes = any_shapes(a, scale=1.5 * scale)
-    given = Given.of(p, scale * any_rest(a)[0], pose[None])
+    given = Inputs.of(p, scale * any_rest(a)[0], pose[None])
     # Springs rest at the origin: their unknowns are those of no other model.
     lam = scale * shapes.lam * (np.arange(a.k) < model.n_conditions)
     return Shapes.declared(shapes.x, lam), given
@@ -139,7 +139,7 @@ def test_declaration(name):
     effect = EFFECTS[name]()
     assert isinstance(effect, Effect)
     assert (effect.name, effect.label) == (name, name)
-    assert effect.slot in SLOTS
+    assert effect.kind in KINDS
     declared = effect.parameters(CABLE if effect.in_plane else IN_SPACE)
     assert declared
     assert effect.in_plane or effect.in_space
@@ -240,8 +240,10 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, where, element):
     turned = replace(model, gravity=gravity)
     p = own_parameters(model, "off")
     shapes, given = posed(model, p)
-    start, end, frames, sight = np.split(given.poses[0], [d, 2 * d, 2 * (d + c)])
-    pose = np.concatenate([turn @ start + shift, turn @ end + shift, turned_nodes(frames), sight])
+    start, end, frames, viewpoint = np.split(given.poses[0], [d, 2 * d, 2 * (d + c)])
+    pose = np.concatenate(
+        [turn @ start + shift, turn @ end + shift, turned_nodes(frames), viewpoint]
+    )
     lam = shapes.lam.copy()  # multipliers of clamps are about the frames' own axes
     lam[:, :d] = lam[:, :d] @ turn.T
     there = Shapes.declared(turned_nodes(shapes.x), lam)
@@ -475,9 +477,9 @@ def test_clamp_angles_of_one_end_only():
     assert model.names == ("bending_stiffness", "clamp_angle.end_heading_error")
 
 
-def seen_from(camera_center, start=(0.0, 0.0)) -> Sight:
+def seen_from(camera_center, start=(0.0, 0.0)) -> Viewpoint:
     vector = ca.SX(ca.DM(Pose(start, camera_center=camera_center).vector))
-    return Sight(vector[:2], vector[6:8], vector[8])
+    return Viewpoint(vector[:2], vector[6:8], vector[8])
 
 
 def test_a_camera_at_infinity_sees_no_standoff():
@@ -489,9 +491,9 @@ def test_a_camera_at_infinity_sees_no_standoff():
 def test_over_the_start_fixture_a_standoff_error_is_a_scale():
     """By z / (z - d): the two cannot be told apart there."""
     point, start = ca.SX(ca.DM([0.5, 0.2])), (0.1, 0.05)
-    sight = seen_from((*start, 1.5), start)
-    seen = StandoffError().observe(point, ca.SX(0), sight, {"distance": ca.SX(0.02)})
-    scaled = ImageScale().observe(point, ca.SX(0), sight, {"factor": ca.SX(1.5 / 1.48)})
+    viewpoint = seen_from((*start, 1.5), start)
+    seen = StandoffError().observe(point, ca.SX(0), viewpoint, {"distance": ca.SX(0.02)})
+    scaled = ImageScale().observe(point, ca.SX(0), viewpoint, {"factor": ca.SX(1.5 / 1.48)})
     np.testing.assert_allclose(number(seen), number(scaled), rtol=1e-14)
 
 
@@ -537,6 +539,6 @@ def test_a_plastic_set_is_what_a_bend_exceeds_the_yield_by(space):
     np.testing.assert_allclose(left(0.0), 0.25 * bend, atol=1e-14)
 
 
-def test_an_effect_without_its_slot_says_so():
+def test_an_effect_without_its_segment_says_so():
     with pytest.raises(TypeError, match="Bare declares no parameters"):
         type("Bare", (Effect,), {"name": "bare"})().parameters(CABLE)

@@ -25,7 +25,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 
 FLAT = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
@@ -109,7 +109,7 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
     flat = solve_equilibrium(models[0], ps[0], rests[0], pose)
     shapes = [Shapes.declared(flat.x[None], flat.multipliers[None]), in_space(models[1], flat)]
     given = [
-        Given.of(*of) for of in zip(ps, rests, (pose.vector[None], same.vector[None]), strict=True)
+        Inputs.of(*of) for of in zip(ps, rests, (pose.vector[None], same.vector[None]), strict=True)
     ]
     planar, spatial = (
         (a.energy(s, g), a.curve(s, g), a.state_after(s, g)[0], a.balance(s, g)[1].rows)

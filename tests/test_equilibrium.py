@@ -28,7 +28,7 @@ from dlo_casadi.equilibrium.ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model.assembly import Given, assembly_of
+from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 
 DATA = Path(__file__).parent / "data"
@@ -495,7 +495,7 @@ def test_a_joint_at_its_bound_beside_others_that_bow(end, headings):
     np.testing.assert_allclose(held.points[-1], end, atol=1e-9)
     moments = held.bound_multipliers
     assert moments.any()
-    given = Given.of(model.nominal, np.zeros(20), pose.vector[None])
+    given = Inputs.of(model.nominal, np.zeros(20), pose.vector[None])
     force = assembly_of(model).balance(held.shapes, given)[1].x.ravel()
     turned = np.concatenate([[0.0], moments]) - np.concatenate([moments, [0.0]])
     np.testing.assert_allclose(force + turned, 0.0, atol=1e-10)

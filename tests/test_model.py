@@ -1,4 +1,4 @@
-"""CableModel: composition slot by slot, loads, stretch by two routes, messages."""
+"""CableModel: composition kind by kind, loads, stretch by two routes, messages."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.whole_pose import potential
@@ -34,8 +34,8 @@ STILL = np.zeros(len(deviation_names(Heading)))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 
 
-def given(model: CableModel, p: np.ndarray, rest: np.ndarray) -> Given:
-    return Given.of(p, rest, Pose((0.0, 0.0), (0.9, 0.1)).vector[None])
+def given(model: CableModel, p: np.ndarray, rest: np.ndarray) -> Inputs:
+    return Inputs.of(p, rest, Pose((0.0, 0.0), (0.9, 0.1)).vector[None])
 
 
 # ---- composition -------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def test_condensed_stretch_equals_the_minimisation_over_axial_strains(element):
     pose = Pose((0.0, 0.0), (1.1, -0.2))
     found = solve_equilibrium(model, p, rest, pose)
     assert found.stable
-    a, where = assembly_of(model), Given.of(p, rest, pose.vector[None])
+    a, where = assembly_of(model), Inputs.of(p, rest, pose.vector[None])
     shapes = Shapes.declared(found.x[None], found.multipliers[None])
     # Newton's last step leaves the rounding of terms of order one.
     assert np.abs(a.balance(shapes, where)[1].rows).max() < 1e-11
@@ -169,7 +169,7 @@ def test_condensed_stretch_equals_the_minimisation_over_axial_strains(element):
         },
         {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-11},
     )
-    x0 = np.concatenate([found.phi + 0.05, np.zeros(model.n_inner * a.chain.n_slots)])
+    x0 = np.concatenate([found.phi + 0.05, np.zeros(model.n_inner * a.chain.n_segments)])
     values = np.concatenate([p, rest, pose.vector, STILL])
     direct = solver(x0=x0, p=values, lbg=0, ubg=0)
     assert solver.stats()["success"]

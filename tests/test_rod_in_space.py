@@ -10,13 +10,13 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import EFFECTS, Cable
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.descent import descend
 from dlo_casadi.equilibrium.initial_frames import same_sign
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
@@ -156,7 +156,7 @@ def test_the_twist_at_which_a_ring_leaves_its_plane():
         x = same_sign((ring * roll).as_quat())
         place = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
         lam = np.zeros((1, m.n_border))
-        given = Given.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
+        given = Inputs.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
         # The exact ring is an equilibrium, stable or not: Newton's method stays there.
         shapes = Shapes.declared(x[None], lam)
         for _ in range(6):
@@ -185,7 +185,7 @@ def test_the_twist_at_which_a_straight_cable_between_clamps_buckles():
         rolls = np.outer(twist * m.chain.places / LENGTH, [1.0, 0.0, 0.0])
         x = same_sign(Rotation.from_rotvec(rolls).as_quat())
         place = Pose((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
-        given = Given.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
+        given = Inputs.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
         free = Shapes.declared(x[None], np.zeros((1, m.n_border)))
         _, force, matrix = assembly_of(m).balance(free, given)
         # Of the axial force, which the straight cable leaves open, least squares takes none.
@@ -224,7 +224,7 @@ def test_derivatives_by_increments():
     m = model(4, end="free")
     rng = np.random.default_rng(3)
     x = same_sign(Rotation.from_rotvec(0.4 * rng.normal(size=(5, 3)).cumsum(axis=0)).as_quat())
-    given = Given.of(m.nominal, curved(m), OUT_OF_PLANE.vector[None])
+    given = Inputs.of(m.nominal, curved(m), OUT_OF_PLANE.vector[None])
     shapes = Shapes.declared(x[None], rng.normal(size=(1, m.n_border)))
     _, force, matrix = assembly_of(m).balance(shapes, given)
     d = 1e-5
@@ -267,7 +267,7 @@ def test_descents_from_far_away_are_minima():
             for _ in range(4)
         ]
     )
-    given = Given.of(
+    given = Inputs.of(
         m.nominal, np.zeros(m.chain.n_rests), np.repeat(OUT_OF_PLANE.vector[None], 4, axis=0)
     )
     found = descend(assembly_of(m), Shapes.declared(x, np.zeros((4, m.n_border))), given)
@@ -279,7 +279,7 @@ def test_descents_from_far_away_are_minima():
 
 @pytest.mark.parametrize("end", ["clamped", "free"])
 @pytest.mark.parametrize("element", ["arc", "quadratic"])
-def test_a_slot_is_differentiated_as_by_casadi_in_one_go(element, end):
+def test_a_segment_is_differentiated_as_by_casadi_in_one_go(element, end):
     """Loads, a spring to a fixed point, a stretching cable and a softening section at once."""
     effects = [EFFECTS[name]() for name in ("tether", "axial_stretch", "bending_softening")]
     cable = Cable(LENGTH, 0.12, 0.006, EI, torsional_stiffness=GJ)
@@ -293,9 +293,9 @@ def test_a_slot_is_differentiated_as_by_casadi_in_one_go(element, end):
         ca.SX.sym("d", len(m.deviation_names)),
         ca.SX.sym("i", 6),
     )
-    place = m.chain.layout.slots[4]
+    place = m.chain.layout.segments[4]
     nodes = ca.vertcat(node.retract(x[:4], delta[:3]), node.retract(x[4:], delta[3:]))
-    value, advance = functions_of(m).slot_by_share(
+    value, advance = functions_of(m).segment_by_share(
         nodes, lam, p, rest, place, deviation, lagrangian_of(m).shares(p, place)
     )
     by = ca.vertcat(delta, lam)
@@ -314,8 +314,8 @@ def test_a_slot_is_differentiated_as_by_casadi_in_one_go(element, end):
     moved = 0.01 * rng.normal(size=len(m.deviation_names))
     expected = plain(frames, forces, numbers, own, moved)
     arguments = (frames, forces, numbers, own, place, moved)
-    slopes = functions_of(m).slot_curve_slopes(*arguments)
-    found = [*functions_of(m).slot(*arguments), functions_of(m).slot_sensitivity(*arguments)]
+    slopes = functions_of(m).segment_curve_slopes(*arguments)
+    found = [*functions_of(m).segment(*arguments), functions_of(m).segment_sensitivity(*arguments)]
     found += [slopes[1][:3, :], slopes[2][:3, :]]
     for one, other in zip(found, expected, strict=True):
         size = np.abs(np.array(other)).max()
@@ -355,8 +355,8 @@ def test_a_cable_bent_against_its_rest_shape_is_no_minimum():
     found = solve_equilibrium(model, model.nominal, rest, pose)
     against = Shapes.declared(found.x[None], found.multipliers[None])
     assert found.stable
-    assert list(Sweep(model, [pose]).stable(against, model.nominal, rest)) == [True]
+    assert list(BatchEquilibrium(model, [pose]).stable(against, model.nominal, rest)) == [True]
     weak = -1e-3 * rest
-    shapes, solved = Sweep(model, [pose]).solve(against, model.nominal, weak)
+    shapes, solved = BatchEquilibrium(model, [pose]).solve(against, model.nominal, weak)
     assert solved.all()
-    assert list(Sweep(model, [pose]).stable(shapes, model.nominal, weak)) == [False]
+    assert list(BatchEquilibrium(model, [pose]).stable(shapes, model.nominal, weak)) == [False]

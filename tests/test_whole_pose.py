@@ -1,4 +1,4 @@
-"""A pose as one expression for IPOPT: the same numbers as the assembly of its slots."""
+"""A pose as one expression for IPOPT: the same numbers as the assembly of its segments."""
 
 import casadi as ca
 import numpy as np
@@ -15,7 +15,7 @@ from dlo_casadi.effects import (
     LumpedMass,
     RestCurvatureDrift,
 )
-from dlo_casadi.model.assembly import Given, assembly_of
+from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, potential, rest_after
 from dlo_casadi.rod.chain import ELEMENTS
@@ -43,7 +43,7 @@ def test_expressions_are_what_the_assembly_says(element, boundary):
     model, p = model_of(element, boundary)
     a, s = assembly_of(model), PoseSymbols.of(model)
     shapes, rest = any_shapes(a), any_rest(a)[0]
-    given = Given.of(p, rest, ENDS[None])
+    given = Inputs.of(p, rest, ENDS[None])
     arguments = [s.x, s.lam, s.p, s.rest, s.pose, s.deviation]
     expressions = [balance(model, s), curve(model, s), rest_after(model, s)]
     numbers = ca.Function("pose", arguments, expressions)(
@@ -90,5 +90,5 @@ def test_minimum_over_what_is_inside_is_the_lagrangian(element, effect, own, hel
     value, slope, bend = (np.array(block) for block in derivatives(x, values))
     assert np.all(np.linalg.eigvalsh(bend) > 0)
     least = value - slope.T @ np.linalg.solve(bend, slope) / 2
-    exact = a.balance(shapes, Given.of(p, rest, ENDS[None]))[0][0]
+    exact = a.balance(shapes, Inputs.of(p, rest, ENDS[None]))[0][0]
     assert least.item() == pytest.approx(exact, rel=1e-12)

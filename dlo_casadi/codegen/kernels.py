@@ -1,4 +1,4 @@
-"""C text of the model's slots: CasADi prints the very functions that all else differentiates."""
+"""C text of the model's segments: CasADi prints the very functions that all else differentiates."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
-from dlo_casadi.model.lagrangian import SlotNumbers, lagrangian_of
+from dlo_casadi.model.lagrangian import SegmentNumbers, lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
 
 FloatArray = NDArray[np.floating]
 
 # Numbers that differ by less come from differences of the same mesh.
 _ROUNDING = 1e-14
-# Columns of a slot's own numbers: where it starts [m], and its rest curvature inside [1/m].
+# Columns of a segment's own numbers: where it starts [m], and its rest curvature inside [1/m].
 _OWN = 4
 # What CasADi calls by names of its own; the others are those of libm.
 _CALLS = {"casadi_sq": "square", "casadi_sign": "sign_of", "casadi_real": "double"}
@@ -51,14 +51,14 @@ def table_to_c(numbers: Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class Kernel:
-    """Slots of one kind, which differ in numbers only.
+    """Segments of one kind, which differ in numbers only.
 
     Parameters
     ----------
     members : (first, last) int
-        Slots first <= j < last.
+        Segments first <= j < last.
     rows : (last - first, k)
-        Numbers that differ from slot to slot.
+        Numbers that differ from segment to segment.
     derive : callable
         Makes the function.
     """
@@ -79,22 +79,22 @@ class Kernels:
 
     Parameters
     ----------
-    slots : tuple of Kernel
+    segments : tuple of Kernel
         In the order of the cable.
     ends : casadi.Function or None
         The holders' own energy by the first and last node; None where they have none.
     shared : (n_parameters,) or (0,)
-        Parameters that stand in the table, ahead of the slots' rows.
+        Parameters that stand in the table, ahead of the segments' rows.
     """
 
-    slots: tuple[Kernel, ...]
+    segments: tuple[Kernel, ...]
     ends: ca.Function | None
     shared: FloatArray
 
     @property
     def table(self) -> list[float]:
-        """What the kernels read: shared numbers, then the rows of all slots."""
-        rows = [kernel.rows.ravel() for kernel in self.slots]
+        """What the kernels read: shared numbers, then the rows of all segments."""
+        rows = [kernel.rows.ravel() for kernel in self.segments]
         return [float(number) for number in np.concatenate([self.shared, *rows])]
 
     @property
@@ -102,7 +102,7 @@ class Kernels:
         """Floating-point operations of all kernels."""
         counts = (
             (last - first) * kernel.function.n_nodes()
-            for kernel in self.slots
+            for kernel in self.segments
             for first, last in [kernel.members]
         )
         return sum(counts)
@@ -110,26 +110,26 @@ class Kernels:
     @property
     def code_size(self) -> int:
         """Bytes of their machine code, about."""
-        return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.slots))
+        return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.segments))
 
     def loops(self, name: str, table_at: int = 0) -> str:
         """Statements that call all kernels, `table_at` after the start of the solver's table."""
         found, offset = [], table_at + len(self.shared)
-        for k, kernel in enumerate(self.slots):
+        for k, kernel in enumerate(self.segments):
             (first, last), width = kernel.members, kernel.rows.shape[1]
             row = f"table + {offset} + (j - {first}) * {width}" if width else "table"
             state = kernel.function.numel_in(0) // 2
             found += [
                 f"    for (j = {first}; j < {last}; ++j)",
                 f"        {name}_{k}(x + {state} * j, lam, {row}, table,",
-                f"        {' ' * len(f'{name}_{k}')} slot + SLOT * j);",
+                f"        {' ' * len(f'{name}_{k}')} segment + SEGMENT * j);",
             ]
             offset += kernel.rows.size
         return "\n".join(found)
 
     def to_c(self, name: str) -> list[str]:
         """Kernel functions, called `name`_0, `name`_1, ..."""
-        return [_kernel_text(f"{name}_{k}", kernel) for k, kernel in enumerate(self.slots)]
+        return [_kernel_text(f"{name}_{k}", kernel) for k, kernel in enumerate(self.segments)]
 
 
 def text_of(meshes: dict[str, Kernels]) -> tuple[str, str, int]:
@@ -169,14 +169,14 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
     Parameters
     ----------
     inline : bool
-        Whether numbers that all slots share are written into the code; otherwise parameters and
+        Whether numbers that all segments share are written into the code; otherwise parameters and
         rows are in the table, and cables of one kind differ in it alone.
     """
-    places = model.chain.layout.slots
+    places = model.chain.layout.segments
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
-    # A force on a single place pulls at all of a slot, at nothing of it, or it stands in there.
+    # A force on a single place pulls at all of a segment, at nothing of it, or it stands in there.
     shares = np.array([np.array(lagrangian_of(model).shares(p, place)).ravel() for place in places])
     inside = (shares > 0) & (shares < 1)
     alone = np.arange(len(own))[:, None] * inside
@@ -184,12 +184,12 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
         np.column_stack([kinds.round(14), shares * ~inside, alone]) if inline else kinds.round(14)
     )
     edges = [0, *(np.flatnonzero(np.any(np.diff(told, axis=0), axis=1)) + 1), len(own)]
-    slots = tuple(
+    segments = tuple(
         _kernel(model, parameters, places[first], own[first:last], (first, last), inline)
         for first, last in pairwise(edges)
     )
     shared = np.zeros(0) if inline else np.asarray(p, float)
-    return Kernels(slots, _ends(model, parameters), shared)
+    return Kernels(segments, _ends(model, parameters), shared)
 
 
 def _kernel(
@@ -211,9 +211,9 @@ def _kernel(
         for varied, column in zip(varies, own.T, strict=True)
     ]
     start = values[0]
-    # The cell's start is counted from the slot's, so that slots of one kind differ in that alone.
+    # The cell's start counts from the segment's: segments of one kind differ in that alone.
     place = ca.vertcat(start, first[1], start + (first[2] - first[0]), *first[3:])
-    numbers = SlotNumbers(
+    numbers = SegmentNumbers(
         p,
         ca.vertcat(*values[1:]),
         place,
@@ -223,8 +223,8 @@ def _kernel(
     return Kernel(members, own[:, varies], partial(_told, model, numbers, row))
 
 
-def _told(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:
-    """(x, lam, row, p) -> a slot's Lagrangian and its derivatives in one vector.
+def _told(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Function:
+    """(x, lam, row, p) -> a segment's Lagrangian and its derivatives in one vector.
 
     Of x, the states of both nodes, and lam [N], the force on the end's holder; also where that is
     free, for its derivative is the advance. In order: value; by lam: advance [m]; in space the
@@ -238,23 +238,23 @@ def _told(model: CableModel, numbers: SlotNumbers, row: ca.SX) -> ca.Function:
     return ca.Function("kernel", arguments, ca.cse([ca.densify(ca.vertcat(*found))]))
 
 
-def _in_plane(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SlotNumbers) -> list[ca.SX]:
+def _in_plane(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
     position = ca.SX.zeros(0) if model.end == "free" else lam
     multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
     arguments = [x, multipliers, numbers.p, numbers.rest, numbers.place, numbers.deviation]
-    both: Any = functions_of(model).slot_by_share(
+    both: Any = functions_of(model).segment_by_share(
         *arguments, numbers.shares
     )  # CasADi's stubs: one result
     value, advance = both
     if model.end == "free":
-        # lam is zero there; its derivative is the way from slot to slot all the same.
+        # lam is zero there; its derivative is the way from segment to segment all the same.
         value += ca.dot(lam, advance)
     hessian, gradient = ca.hessian(value, ca.vertcat(x, lam))
     bends, borders = _triangle(hessian[:2, :2]), _rows(hessian[:2, 2:])
     return [value, gradient[2:], gradient[:2], bends, borders, _triangle(hessian[2:, 2:])]
 
 
-def _in_space(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SlotNumbers) -> list[ca.SX]:
+def _in_space(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
     """Derivatives are by increments about the world's axes."""
     found = lagrangian_of(model).in_frame(x, lam, numbers).derivatives()
     found = found.about(found.turn, found.turn)
@@ -337,7 +337,7 @@ def _kernel_text(name: str, kernel: Kernel) -> str:
     targets = [f"out[{i}] =" for i in range(function.nnz_out(0))]
     head = f"static void {name}("
     return f"""\
-/* Slots {first} to {last - 1}. */
+/* Segments {first} to {last - 1}. */
 {head}const double *x, const double *lam, const double *row,
 {" " * len(head)}const double *table, double *restrict out)
 {{
@@ -356,7 +356,7 @@ def _ends_text(function: ca.Function) -> str:
 static void add_ends(point_t *q, const double *table)
 {{
     const double x[2] = {{q->x[0], q->x[NODE(1)]}};
-    double *const first = q->slot, *const last = q->slot + SLOT * (NODE(1) - 1);
+    double *const first = q->segment, *const last = q->segment + SEGMENT * (NODE(1) - 1);
 {_statements(function, ("x", "table"), targets)}
     (void)x, (void)table;
 }}

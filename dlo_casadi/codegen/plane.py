@@ -13,7 +13,7 @@ from dlo_casadi.model.lagrangian import lagrangian_of
 
 FloatArray = NDArray[np.floating]
 
-# Doubles of a workspace per node, as in the template: arrays, the border, slots of two points.
+# Doubles of a workspace per node, as in the template: arrays, the border, segments of two points.
 _NUMBERS = 12 + 2 + 2 * 15
 # Newton steps for a part of a path.
 TRY_STEPS = 13
@@ -94,7 +94,7 @@ def values(model: CableModel, p: FloatArray, meshes: dict[str, Kernels]) -> dict
     count, gives = chain.n_nodes, [c > 0 for c in clamp_compliances(model, p)]
     return {
         "WORKSPACE": str(_NUMBERS * (count + 1)),
-        "ELEMENTS": str(chain.n_slots),
+        "ELEMENTS": str(chain.n_segments),
         "FIRST": str(chain.layout.advancing[0]),
         "LOW": str(int(model.start == "clamped" and not gives[0])),
         "HIGH": str(count - int(model.end == "clamped" and not gives[1])),

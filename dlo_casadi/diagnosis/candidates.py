@@ -132,6 +132,6 @@ def candidates_of(
         camera=any(item.pose.camera_center is not None for item in problem.history),
         readings=tuple({name for item in problem.history for name in item.reactions}),
         directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
-        largest_bend=float(problem.sweep.bends(shapes, fit.p, fit.rest).max()),
+        largest_bend=float(problem.equilibria.bends(shapes, fit.p, fit.rest).max()),
     )
     return candidates(fit.model, setup, exclude)

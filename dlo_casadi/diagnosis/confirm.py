@@ -9,9 +9,9 @@ from functools import partial
 
 import numpy as np
 
-from dlo_casadi.diagnosis.afresh import Start, fit_afresh, origins_of, start_afresh
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.from_data import Start, fit_from_data, origins_of, start_from_data
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
@@ -69,7 +69,7 @@ def confirm(base: Fit, screened: Screened) -> Confirmed | None:
     return None if fit is None else Confirmed.of(screened, base, fit)
 
 
-def screened_afresh(
+def screened_from_data(
     base: Fit, listed: Sequence[Candidate], executor: Executor
 ) -> list[tuple[Screened, Start]]:
     """Candidates of a base that is astray, started from the measured shapes, best first.
@@ -79,15 +79,15 @@ def screened_afresh(
     nothing is listed.
     """
     cable, origins = base.model.cable, origins_of(base)
-    without = start_afresh(base, origins, None)
+    without = start_from_data(base, origins, None)
     containing = [x for x in listed if any(x.contains(other, cable) for other in listed)]
     simple = [x for x in listed if x not in containing]
-    found = map_in_order(executor, partial(start_afresh, base, origins), simple)
+    found = map_in_order(executor, partial(start_from_data, base, origins), simple)
     begun = list(zip(simple, found, strict=True))
     for candidate in containing:
         inside = [(x, start) for x, start in begun if start and candidate.contains(x, cable)]
         smaller = min(inside, key=lambda pair: pair[1].guess.objective, default=None)
-        begun.append((candidate, start_afresh(base, origins, candidate, smaller)))
+        begun.append((candidate, start_from_data(base, origins, candidate, smaller)))
     out = []
     for candidate, start in begun:
         if start is not None and without is not None:
@@ -97,11 +97,11 @@ def screened_afresh(
     return sorted(out, key=lambda pair: -pair[0].score)
 
 
-def confirm_afresh(base: Fit, begun: tuple[Screened, Start]) -> Confirmed | None:
+def confirm_from_data(base: Fit, begun: tuple[Screened, Start]) -> Confirmed | None:
     """Fit with a candidate added, from where it was started; None if that is no equilibrium."""
     screened, start = begun
     try:
-        fit = fit_afresh(base, start)
+        fit = fit_from_data(base, start)
         return None if fit is None else Confirmed.of(screened, base, fit)
     except EstimationError:
         return None

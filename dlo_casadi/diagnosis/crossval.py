@@ -108,7 +108,7 @@ def cross_validate(
 ) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
-    All folds are predicted in one sweep, some 6 ms each. Only where a state is carried is each a
+    All folds are solved together, some 6 ms each. Only where a state is carried is each a
     task of its own; it runs in this process unless an executor is given.
 
     Parameters
@@ -179,29 +179,29 @@ def _predicted(
     fit: Fit, shapes: Shapes, thetas: list[FloatArray], executor: Executor
 ) -> list[Observed | None]:
     """What each fitted pose looks like at its own unknowns, from declared end conditions."""
-    problem, sweep = fit.problem, fit.problem.sweep
+    problem, equilibria = fit.problem, fit.problem.equilibria
     unknowns, model = problem.unknowns, fit.model
     plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
     if model.has_state:
         folds = map_in_order(executor, partial(_predict_all, fit, plain), thetas)
         return [seen[j] for j, seen in zip(problem.used, folds, strict=True)]
-    p = np.repeat(fit.p[None], sweep.m, axis=0)
-    rest = np.repeat(fit.rest[None], sweep.m, axis=0)
+    p = np.repeat(fit.p[None], equilibria.m, axis=0)
+    rest = np.repeat(fit.rest[None], equilibria.m, axis=0)
     for j, theta in zip(problem.used, thetas, strict=True):
         p[j], rest[j] = unknowns.p(theta), unknowns.rest(theta)
-    solved, converged = sweep.solve(plain, p, rest)
-    seen = sweep.seen(solved, p, rest)
+    solved, converged = equilibria.solve(plain, p, rest)
+    seen = equilibria.seen(solved, p, rest)
     return [seen[j] if converged[j] else None for j in problem.used]
 
 
 def _predict_all(fit: Fit, plain: Shapes, theta: FloatArray) -> list[Observed | None]:
     """All poses in order at one value of the unknowns, a state carried along."""
-    sweep, unknowns = fit.problem.sweep, fit.problem.unknowns
+    equilibria, unknowns = fit.problem.equilibria, fit.problem.unknowns
     p, rest = unknowns.p(theta), unknowns.rest(theta)
-    solved, converged = sweep.solve(plain, p, rest)
+    solved, converged = equilibria.solve(plain, p, rest)
     if not converged.all():
-        return [None] * sweep.m
-    return list(sweep.seen(solved, p, rest))
+        return [None] * equilibria.m
+    return list(equilibria.seen(solved, p, rest))
 
 
 def _stretches(fit: Fit) -> CrossValidation:
@@ -209,16 +209,16 @@ def _stretches(fit: Fit) -> CrossValidation:
     problem, lin = fit.problem, fit.linearization
     j = problem.used[0]
     item = problem.measured[j]
-    points = np.argsort(fit.point.feet[0], kind="stable")  # a stretch of all photographs
+    points = np.argsort(fit.point.projections[0], kind="stable")  # a stretch of all photographs
     joint = np.concatenate([lin.by_theta[0], lin.by_deviation[0]], axis=1)
     size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
     prior = np.zeros((size + n_dev, size + n_dev))
     prior[:size, :size] = problem.precision
     prior[size:, size:] = np.diag(1 / problem.deviation_std**2)
-    own = fit.point.shapes.deviation[j, problem.sweep.used_deviations]
+    own = fit.point.shapes.deviation[j, problem.equilibria.used_deviations]
     pull = np.concatenate([fit.point.theta - problem.mean, own])
     errors: list[tuple[FloatArray, FloatArray] | None] = []
-    sweep = problem.sweep
+    equilibria = problem.equilibria
     for left_out in np.array_split(points, min(STRETCHES, len(points))):
         kept = np.ones(item.n_residuals, dtype=bool)
         kept[item.on_points] = ~np.isin(item.point_of, left_out)
@@ -231,10 +231,10 @@ def _stretches(fit: Fit) -> CrossValidation:
         shapes = fit.point.shapes
         plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
         p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
-        solved, converged = sweep.solve(plain, p, rest)
+        solved, converged = equilibria.solve(plain, p, rest)
         if not converged.all():
             errors.append(None)
             continue
-        curve = sweep.seen(solved, p, rest)[j].curve
+        curve = equilibria.seen(solved, p, rest)[j].curve
         errors.append((item.misses(curve)[left_out], np.zeros(0)))
     return _validation(errors)

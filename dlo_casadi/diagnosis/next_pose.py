@@ -130,7 +130,7 @@ def _separation(fit: Fit, end: FloatArray, curves: tuple[NodeCurve, NodeCurve]) 
     problem = fit.problem
     ends = np.array([problem.measured[j].pose.end for j in problem.used])
     k = int(((ends - end) ** 2).sum(axis=1).argmin())
-    s, item = fit.point.feet[k], problem.measured[problem.used[k]]
+    s, item = fit.point.projections[k], problem.measured[problem.used[k]]
     gap = item.components(curves[0], s, (curves[0].at(s) - curves[1].at(s))[..., None])
     return float(np.linalg.norm(item.whitening(fit.noise, s) @ gap))
 
@@ -139,4 +139,4 @@ def _rest_now(fit: Fit) -> FloatArray:
     """Rest curvature after the session's last pose."""
     if not fit.model.has_state:
         return fit.rest
-    return fit.problem.sweep.rest_after_last(fit.point.shapes, fit.p, fit.rest)
+    return fit.problem.equilibria.rest_after_last(fit.point.shapes, fit.p, fit.rest)

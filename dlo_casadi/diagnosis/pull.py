@@ -189,7 +189,7 @@ class _Search:
 
     def _problem(self, unknowns: Unknowns) -> BatchProblem:
         problem = self.base.problem.of(unknowns, scatter=pull_scatter(self.base))
-        problem.share_metric(self.base.problem)
+        problem.share_weights(self.base.problem)
         return problem
 
 

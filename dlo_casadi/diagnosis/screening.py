@@ -27,7 +27,7 @@ from scipy.special import chdtrc, fdtrc
 
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import StateEffect
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
 from dlo_casadi.estimation.linearization import Linearization, Point
 from dlo_casadi.estimation.result import Fit
@@ -90,7 +90,7 @@ class _Moving:
         model = extended(fit, candidates)
         values, rest_free = fit.values_in(model), fit.problem.unknowns.rest_free
         problem = fit.problem.of(Unknowns(model, fit.free_in(model), values, rest_free))
-        problem.share_metric(fit.problem)
+        problem.share_weights(fit.problem)
         names = tuple(name for candidate in candidates for name in candidate.screened)
         return cls(problem, carried_shapes(problem, fit), names)
 
@@ -103,20 +103,22 @@ class _Moving:
         columns = [unknowns.names.index(name) for name in self.names]
         slopes = unknowns.slopes(theta)[:, columns]
         still = np.zeros((len(rest), len(columns)))
-        shapes = with_springs(problem.sweep, self.shapes, p, rest)
-        along = problem.sweep.directions(shapes, p, rest, slopes, still)
-        seen = problem.sweep.observe(shapes, p, rest, along)
+        shapes = with_springs(problem.equilibria, self.shapes, p, rest)
+        along = problem.equilibria.directions(shapes, p, rest, slopes, still)
+        seen = problem.equilibria.observe(shapes, p, rest, along)
         out: list[FloatArray] = []
-        for j, s in zip(problem.used, fit.point.feet, strict=True):
+        for j, s in zip(problem.used, fit.point.projections, strict=True):
             now, change = seen.pose(j, unknowns.model.cable.length)
             _, moved = problem.measured[j].linearized(now, s, change)
             out.append(problem.whitening(j) @ moved[:, : len(columns)])
         return out
 
 
-def with_springs(sweep: Sweep, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Shapes:
+def with_springs(
+    equilibria: BatchEquilibrium, shapes: Shapes, p: FloatArray, rest: FloatArray
+) -> Shapes:
     """Shapes in which springs that do not pull yet are where they hang on the cable."""
-    return sweep.solve(shapes, p, rest)[0] if sweep.model.n_springs else shapes
+    return equilibria.solve(shapes, p, rest)[0] if equilibria.model.n_springs else shapes
 
 
 def _at(scan: Mapping[str, float], model: CableModel, fit: Fit) -> FloatArray:
@@ -208,10 +210,10 @@ class Screen:
         free = self.fit.free_in(self.model)
         unknowns = Unknowns(self.model, free, p, problem.unknowns.rest_free)
         larger = problem.of(unknowns)
-        larger.share_metric(problem)
+        larger.share_weights(problem)
         theta = unknowns.pack(p, self.fit.coefficients)
         shapes = carried_shapes(larger, self.fit)
-        shapes = with_springs(larger.sweep, shapes, p, unknowns.rest(theta))
+        shapes = with_springs(larger.equilibria, shapes, p, unknowns.rest(theta))
         point = replace(self.fit.point, theta=theta, shapes=shapes)
         return larger, point, larger.linearize(point)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.causes import refit_from
-from dlo_casadi.diagnosis.confirm import Confirmed, confirm, confirm_afresh, screened_afresh
+from dlo_casadi.diagnosis.confirm import Confirmed, confirm, confirm_from_data, screened_from_data
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.pull import Pull, estimate_pull
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
@@ -146,7 +146,7 @@ class Search:
             astray = current.noise.source == "misfit"
             tried: list[Confirmed | None] = []
             if astray and pull is None:
-                screened, tried = self._afresh(current)
+                screened, tried = self._from_data(current)
             else:
                 screened = self.first if k == 0 else self._screened(current)
             p_values = {
@@ -229,16 +229,16 @@ class Search:
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         return list(map_in_order(self.executor, partial(confirm, current), worthy))
 
-    def _afresh(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None]]:
+    def _from_data(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None]]:
         """Fits from the measured shapes of the candidates that come nearest to them.
 
         Beside a misfit scores are no order, and a refit leads where the declared model has gone.
         """
         listed = candidates_of(current, self.center, self.exclude)
-        begun = screened_afresh(current, listed, self.executor)
+        begun = screened_from_data(current, listed, self.executor)
         least = min((start.guess.objective for _, start in begun), default=0.0)
         near = [pair for pair in begun if pair[1].guess.objective <= NEAREST * least]
-        refit = partial(confirm_afresh, current)
+        refit = partial(confirm_from_data, current)
         tried = list(map_in_order(self.executor, refit, near[:REFITTED]))
         return [item for item, _ in begun], tried
 

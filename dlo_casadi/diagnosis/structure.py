@@ -100,7 +100,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     model = fit.model
     coefficients, own, arms = [], [], []
     inner = normal.inner or [NO_DEVIATION] * len(problem.used)
-    for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
+    for k, (j, s) in enumerate(zip(problem.used, fit.point.projections, strict=True)):
         modes = smooth_modes(s, model.cable.length, SLOW_MODES, model.end == "free")
         seen = problem.measured[j].slow_rows(modes)
         basis, _ = np.linalg.qr(problem.whitening(j) @ seen)
@@ -171,7 +171,7 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
     information: FloatArray = np.zeros((size, size))
     cross: FloatArray = np.zeros((size, len(fit.point.theta)))
     slope: FloatArray = np.zeros(size)
-    for k, (j, s) in enumerate(zip(problem.used, fit.point.feet, strict=True)):
+    for k, (j, s) in enumerate(zip(problem.used, fit.point.projections, strict=True)):
         item = problem.measured[j]
         x = item.points / fit.model.cable.length
         terms = np.column_stack([x, *(x[:, a] * x[:, b] for a, b in pairs)])

@@ -20,9 +20,9 @@ from dlo_casadi.effects.effect import (
     PointForceAt,
     PointLoad,
     SectionLaw,
-    Sight,
     SpringAt,
     StateEffect,
+    Viewpoint,
 )
 from dlo_casadi.effects.end_offset import EndOffset
 from dlo_casadi.effects.end_spring import EndSpring, StartSpring
@@ -123,7 +123,6 @@ __all__ = [
     "SensorBias",
     "Setup",
     "SideLoad",
-    "Sight",
     "SpringAt",
     "StandoffError",
     "StartSpring",
@@ -132,5 +131,6 @@ __all__ = [
     "StiffnessGradient",
     "Tether",
     "UnknownPull",
+    "Viewpoint",
     "known_effect",
 ]

@@ -7,7 +7,7 @@ from typing import ClassVar
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable
-from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight, vector
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint, vector
 from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.rod.node import rotated, rotation
 
@@ -51,7 +51,7 @@ class CameraFrame(MeasurementEffect):
             ),
         )
 
-    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Turn about the start fixture, then shift."""
-        turned = rotated(rotation(vector(params, "rotation_")), point - sight.start)
-        return sight.start + turned + vector(params, "translation_")
+        turned = rotated(rotation(vector(params, "rotation_")), point - viewpoint.start)
+        return viewpoint.start + turned + vector(params, "translation_")

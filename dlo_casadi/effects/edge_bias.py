@@ -7,7 +7,7 @@ from typing import ClassVar
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable
-from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
@@ -56,7 +56,7 @@ class EdgeBias(MeasurementEffect):
         std = PIXELS * (setup.pixel or 0.0)
         return {q.name: std for q in self.parameters(setup.cable)} if std else {}
 
-    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Move the point along the cable's normal."""
         offset = sum(
             (

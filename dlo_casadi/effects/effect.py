@@ -1,6 +1,6 @@
-"""The contract of an effect and its six slots.
+"""The contract of an effect and its six kinds.
 
-An effect declares parameters and fills one slot of the model. It sees the curve, never the
+An effect declares parameters and fills one kind of the model. It sees the curve, never the
 solver's coordinates; it creates no symbol, keeps no state and calls no solver. What else concerns
 it is its own: where it applies, where it is looked for, what it may be taken for, how it is told.
 All of that has defaults, so that most effects declare `name`, `parameters` and their law.
@@ -68,7 +68,7 @@ class SpringAt:
 
 
 @dataclass(frozen=True)
-class Sight:
+class Viewpoint:
     """From where the points of a pose are measured: symbols of one pose.
 
     Parameters
@@ -88,7 +88,7 @@ class Sight:
 
 @dataclass(frozen=True)
 class Effect:
-    """Something that acts on a cable. Subclasses fill the slot that gives them their base.
+    """Something that acts on a cable. Subclasses fill the kind that gives them their base.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class Effect:
     """
 
     name: ClassVar[str]
-    slot: ClassVar[str]
+    kind: ClassVar[str]
     # Own parameters that lie within a declared tolerance, by its name there: until more is needed
     # the effect is a nuisance of every model that it applies to.
     tolerances: ClassVar[Mapping[str, str]] = {}
@@ -178,7 +178,7 @@ class Effect:
 
 
 class SectionLaw(Effect):
-    """Slot `section`: how much the section resists. Section laws multiply.
+    """Kind `section`: how much the section resists. Section laws multiply.
 
         W = along (of_bend k^T B k + GJ tau^2) / 2                      [N]
 
@@ -186,7 +186,7 @@ class SectionLaw(Effect):
     both more, `along`; what a bend does to the section, `of_bend`, acts on bending alone.
     """
 
-    slot: ClassVar[str] = "section"
+    kind: ClassVar[str] = "section"
     # Whether the section bends alike about all axes.
     isotropic: ClassVar[bool] = True
 
@@ -219,9 +219,9 @@ class SectionLaw(Effect):
 
 
 class Kinematics(Effect):
-    """Slot `kinematics`: stretch and length."""
+    """Kind `kinematics`: stretch and length."""
 
-    slot: ClassVar[str] = "kinematics"
+    kind: ClassVar[str] = "kinematics"
     extensible: ClassVar[bool] = False
 
     def stretch(self, cable: Cable, params: Params) -> ca.SX | float:
@@ -234,9 +234,9 @@ class Kinematics(Effect):
 
 
 class Load(Effect):
-    """Slot `load`: forces with a potential. Loads add; all share one gravity."""
+    """Kind `load`: forces with a potential. Loads add; all share one gravity."""
 
-    slot: ClassVar[str] = "load"
+    kind: ClassVar[str] = "load"
     # Whether it is a weight that the cable carries beside its own.
     carried: ClassVar[bool] = False
     # Number of `springs`; without any the forces stay the same whatever the shape.
@@ -319,9 +319,9 @@ class PointLoad(Load):
 
 
 class BoundaryEffect(Effect):
-    """Slot `boundary`: how the ends are held."""
+    """Kind `boundary`: how the ends are held."""
 
-    slot: ClassVar[str] = "boundary"
+    kind: ClassVar[str] = "boundary"
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Change the end conditions. Changes are applied in the order of the model's effects."""
@@ -340,11 +340,11 @@ class BoundaryEffect(Effect):
 
 
 class MeasurementEffect(Effect):
-    """Slot `measurement`: from true points of the cable, and true forces, to measured ones."""
+    """Kind `measurement`: from true points of the cable, and true forces, to measured ones."""
 
-    slot: ClassVar[str] = "measurement"
+    kind: ClassVar[str] = "measurement"
 
-    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Where the camera believes the true point (dimension,) [m] to be. Maps apply in order.
 
         Parameters
@@ -361,9 +361,9 @@ class MeasurementEffect(Effect):
 
 
 class StateEffect(Effect):
-    """Slot `state`: what a pose leaves behind in the rest curvature."""
+    """Kind `state`: what a pose leaves behind in the rest curvature."""
 
-    slot: ClassVar[str] = "state"
+    kind: ClassVar[str] = "state"
 
     def next_rest(self, rest: ca.SX, strain: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Rest strain [1/m] of a cell after a pose of this strain has been held.

@@ -8,7 +8,7 @@ from typing import Self
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable
-from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
@@ -53,7 +53,7 @@ class ImageDistortion(MeasurementEffect):
         """About the middle of the photographs."""
         return cls(center=setup.center or (0.0, 0.0))
 
-    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Move the point along its radius."""
         arm = point - ca.DM(self.center)
         return ca.DM(self.center) + (1 + params["coefficient"] * ca.sumsqr(arm)) * arm

@@ -7,7 +7,7 @@ from typing import ClassVar
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable
-from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 from dlo_casadi.effects.parameter import Parameter
 
 
@@ -30,6 +30,6 @@ class ImageScale(MeasurementEffect):
         """Declare the factor."""
         return (Parameter("factor", nominal=1.0, scale=0.002, lower=0.7, upper=1.4),)
 
-    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Scale about the start fixture."""
-        return sight.start + params["factor"] * (point - sight.start)
+        return viewpoint.start + params["factor"] * (point - viewpoint.start)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable
-from dlo_casadi.effects.effect import MeasurementEffect, Params, Sight
+from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
@@ -56,7 +56,9 @@ class StandoffError(MeasurementEffect):
             "Try: measurement.camera, or image_scale"
         )
 
-    def observe(self, point: ca.SX, frame: ca.SX, sight: Sight, params: Params) -> ca.SX:
+    def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Follow the ray through the point to the declared plane."""
         d = params["distance"]
-        return point + d * (sight.nearness * point - sight.camera) / (1 - d * sight.nearness)
+        return point + d * (viewpoint.nearness * point - viewpoint.camera) / (
+            1 - d * viewpoint.nearness
+        )

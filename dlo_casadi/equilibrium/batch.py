@@ -18,13 +18,13 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.descent import descend
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Assembly, CurveSlopes, Directions, Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, CurveSlopes, Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 
 FloatArray = NDArray[np.floating]
 
-# Newton's method in a sweep: longest step of a node, and how far nodes may move from where it
+# Newton's method for many poses: longest step of a node, and how far nodes may move from where it
 # started [rad].
 LONGEST_STEP = 0.5
 REACH = 1.5
@@ -57,7 +57,7 @@ class Observations:
         )
 
 
-class Sweep:
+class BatchEquilibrium:
     """A model evaluated over m poses at once.
 
     Parameters
@@ -98,13 +98,13 @@ class Sweep:
 
     def _stays(self, shapes: Shapes, p: FloatArray, rests: FloatArray) -> bool:
         """Whether every pose leaves the rest curvature that it finds."""
-        after = self.assembly.state_after(shapes, Given.of(p, rests, self._ends))[0]
+        after = self.assembly.state_after(shapes, Inputs.of(p, rests, self._ends))[0]
         return bool(np.all(after == rests))
 
     def _after(self, j: int, shapes: Shapes, p: FloatArray, rests: FloatArray) -> FloatArray:
         """Rest curvature (1, n_rests) after pose j."""
         here = [j]
-        given = Given.of(p, rests[here], self._ends[here])
+        given = Inputs.of(p, rests[here], self._ends[here])
         return self.assembly.state_after(shapes.subset(here), given)[0]
 
     def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
@@ -117,8 +117,8 @@ class Sweep:
         bends = self.assembly.strain(shapes, given) - given.rest
         return np.asarray(np.linalg.norm(self.assembly.chain.curvatures(bends), axis=1))
 
-    def _given(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Given:
-        return Given.of(p, self.rests(shapes, p, rest), self._ends)
+    def _given(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Inputs:
+        return Inputs.of(p, self.rests(shapes, p, rest), self._ends)
 
     # ---- equilibria ------------------------------------------------------------------------------
 
@@ -228,7 +228,7 @@ class Sweep:
     def _linearized(
         self,
         here: Shapes,
-        given: Given,
+        given: Inputs,
         active: NDArray[np.intp],
         fresh: NDArray[np.bool_],
         matrix: BandMatrix | None,
@@ -247,7 +247,7 @@ class Sweep:
         return force, matrix
 
     def _newton(
-        self, here: Shapes, given: Given, force: Vector, matrix: BandMatrix, coupled: bool
+        self, here: Shapes, given: Inputs, force: Vector, matrix: BandMatrix, coupled: bool
     ) -> Vector:
         """Newton step of one column; not finite where the shape is not."""
         finite = np.flatnonzero(np.isfinite(matrix.diagonal).all(axis=(1, 2, 3)))
@@ -263,7 +263,7 @@ class Sweep:
                 step.x[finite], step.y[finite] = found.x, found.y
         return self._pass_on(here, given, matrix, step) if coupled else step
 
-    def _pass_on(self, here: Shapes, given: Given, matrix: BandMatrix, step: Vector) -> Vector:
+    def _pass_on(self, here: Shapes, given: Inputs, matrix: BandMatrix, step: Vector) -> Vector:
         """Newton step with the change of rest curvature handed from pose to pose."""
         a, n_p = self.assembly, given.p.shape[1]
         change: FloatArray = np.zeros((1, given.rest.shape[1], 1))
@@ -293,7 +293,7 @@ class Sweep:
         rest: FloatArray,
         slopes: FloatArray,
         rest_slopes: FloatArray,
-    ) -> Directions:
+    ) -> Tangents:
         """How the equilibria move with the unknowns and with each pose's own deviations.
 
         By the implicit function theorem: -K^-1 d(imbalance).
@@ -307,7 +307,7 @@ class Sweep:
 
         Returns
         -------
-        Directions
+        Tangents
             Columns: the unknowns, then the model's deviations.
         """
         given = self._given(shapes, p, rest)
@@ -334,7 +334,7 @@ class Sweep:
 
     def by_rest(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, modes: FloatArray
-    ) -> Directions:
+    ) -> Tangents:
         """How each equilibrium moves with its own rest curvature along modes (n_cells, q)."""
         given = self._given(shapes, p, rest)
         _, _, matrix = self.assembly.balance(shapes, given)
@@ -343,8 +343,8 @@ class Sweep:
         return self._solved(shapes, given, matrix, _still(self.assembly, self.m, along, none))
 
     def _solved(
-        self, shapes: Shapes, given: Given, matrix: BandMatrix, still: Directions
-    ) -> Directions:
+        self, shapes: Shapes, given: Inputs, matrix: BandMatrix, still: Tangents
+    ) -> Tangents:
         load = self.assembly.imbalance_by(shapes, given, still)
         found = matrix.factor().solve(load)
         return replace(still, x=-found.x, lam=-found.y, tangent=matrix)
@@ -352,17 +352,17 @@ class Sweep:
     def _carried(
         self,
         shapes: Shapes,
-        given: Given,
+        given: Inputs,
         matrix: BandMatrix,
-        along: Directions,
+        along: Tangents,
         after: tuple[FloatArray, ...],
-    ) -> Directions:
+    ) -> Tangents:
         """`directions` in order: a pose finds the rest curvature that the one before has left."""
         x, lam, rest = along.x.copy(), along.lam.copy(), along.rest.copy()
         size = rest.shape[2] - len(self.used_deviations)
         for j in range(self.m):
             one = np.array([j])
-            now = Directions(x[one], lam[one], along.p[one], rest[one], along.deviation[one])
+            now = Tangents(x[one], lam[one], along.p[one], rest[one], along.deviation[one])
             now = self._solved(shapes.subset(one), given.subset(one), matrix.subset(one), now)
             x[j], lam[j] = now.x[0], now.lam[0]
             if j + 1 < self.m:
@@ -373,7 +373,7 @@ class Sweep:
         return replace(along, x=x, lam=lam, rest=rest)
 
     def observe(
-        self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Directions
+        self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Tangents
     ) -> Observations:
         """Measured curves and readings, and their derivatives along directions."""
         given = self._given(shapes, p, rest)
@@ -406,10 +406,10 @@ class Sweep:
         return np.asarray((negative == self.model.n_multipliers) & free)
 
 
-def _still(a: Assembly, m: int, rest: FloatArray, p: FloatArray) -> Directions:
+def _still(a: Assembly, m: int, rest: FloatArray, p: FloatArray) -> Tangents:
     """Directions along which nodes, multipliers and deviations stay."""
     q = rest.shape[2]
-    return Directions(
+    return Tangents(
         np.zeros((m, a.n, a.b, q)),
         np.zeros((m, a.k, q)),
         p,

@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import EDGE, displacements, spread_across
 from dlo_casadi.equilibrium.tipping import Tipping, sides_of, tipping_of
 from dlo_casadi.errors import DloError, EquilibriumError, counted
-from dlo_casadi.model.assembly import Given, assembly_of
+from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -201,7 +201,7 @@ def _curve(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, eq: Equilibrium
 ) -> CableCurve:
     """The curve as the session's camera would measure it."""
-    z = assembly_of(model).curve(eq.shapes, Given.of(p, rest, pose.vector[None]))[0]
+    z = assembly_of(model).curve(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
     return CableCurve.of(model.cable.length, z)
 
 

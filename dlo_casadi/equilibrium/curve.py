@@ -114,10 +114,10 @@ class NodeCurve:
             out += h * (w[:, 2] * slopes[e, self.d :] + w[:, 3] * slopes[e + 1, self.d :])
         return np.asarray(out)
 
-    def feet(self, points: FloatArray, guess: FloatArray) -> FloatArray:
-        """Arc lengths (K,) [m] of the points' feet, by Newton steps from a guess.
+    def projections(self, points: FloatArray, guess: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] of the points' projections, by Newton steps from a guess.
 
-        Solves t . (x - r(s)) = 0; a foot stays within [0, L].
+        Solves t . (x - r(s)) = 0; a projection stays within [0, L].
         """
         s = guess.copy()
         limit = 0.5 * self.length / self.n
@@ -140,7 +140,7 @@ class NodeCurve:
         line = self.at(grid)
         # Square distances but for those of the points from the origin.
         square = (line**2).sum(axis=1) - 2 * points @ line.T
-        return self.feet(points, grid[square.argmin(axis=1)])
+        return self.projections(points, grid[square.argmin(axis=1)])
 
     def normals(self, s: FloatArray) -> FloatArray:
         """Unit normals (K, d - 1, d): in the plane to the left of the direction of travel.

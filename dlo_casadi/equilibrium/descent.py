@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.model.assembly import Assembly, Given, Shapes
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
 
 FloatArray = NDArray[np.floating]
@@ -62,14 +62,14 @@ class Minima:
     iterations: NDArray[np.intp]
 
 
-def descend(assembly: Assembly, shapes: Shapes, given: Given, max_iterations: int = 80) -> Minima:
+def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
     """Minimise the energy of each of m shapes under its end conditions.
 
     Parameters
     ----------
     shapes : Shapes
         First guesses; deviations are kept.
-    given : Given
+    given : Inputs
         What each of them depends on.
     """
     m = len(shapes.x)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.pose import SIGNS, Branch
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
 
@@ -150,7 +150,7 @@ def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
 def equilibria_of(
     model: CableModel,
     shapes: Shapes,
-    given: Given,
+    given: Inputs,
     *,
     statuses: Sequence[Status],
     iterations: NDArray[np.intp],
@@ -161,7 +161,7 @@ def equilibria_of(
     Parameters
     ----------
     shapes : Shapes
-    given : Given
+    given : Inputs
     statuses : sequence of Status
     iterations : (m,) int
     bound_multipliers : (m, n_nodes - 1) [N m], optional

@@ -1,6 +1,6 @@
 """One equilibrium by IPOPT: min V(phi) s.t. the end conditions and the bounds of the joints.
 
-The same functions of slots as everywhere, stated as one problem of the whole pose.
+The same functions of segments as everywhere, stated as one problem of the whole pose.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dlo_casadi.equilibrium.equilibrium import (
     equilibria_of,
 )
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -106,7 +106,7 @@ def by_ipopt(
     chain = model.chain
     solver = _solver(id(model), _Held(model))
     deviation = np.zeros(len(model.deviation_names))
-    given = Given.of(p, rest, pose.vector[None])
+    given = Inputs.of(p, rest, pose.vector[None])
     x0 = np.concatenate([phi, np.zeros(solver.size1_in("x0") - len(phi))])
     bounds = np.zeros(model.n_multipliers + chain.n_nodes - 1)
     bounds[model.n_multipliers :] = JOINT_BOUND
@@ -144,7 +144,7 @@ class _Balance:
 
 
 def _balanced(
-    model: CableModel, shapes: Shapes, bound_multipliers: FloatArray, given: Given
+    model: CableModel, shapes: Shapes, bound_multipliers: FloatArray, given: Inputs
 ) -> _Balance:
     """Newton's method from the potential's minimum, whose bows are stiff under compression too.
 
@@ -197,7 +197,7 @@ def _bordered(
     held: NDArray[np.intp],
     bound: FloatArray,
     pulls: FloatArray,
-    given: Given,
+    given: Inputs,
 ) -> tuple[Vector, BandMatrix]:
     """Imbalance and tangent with the joints that are held as further conditions."""
     _, force, matrix = assembly_of(model).balance(shapes, given)

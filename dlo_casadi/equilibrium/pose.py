@@ -99,7 +99,7 @@ class Pose:
 
     @property
     def vector(self) -> FloatArray:
-        """The model's argument `pose`: the ends, then what `effects.Sight` says of the camera.
+        """The model's argument `pose`: the ends, then what `effects.Viewpoint` says of the camera.
 
         Its centre (x, y, z) enters as (x, y, 1) / z: zeros for none, which sees from infinity.
         """

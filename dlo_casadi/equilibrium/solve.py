@@ -21,7 +21,7 @@ from dlo_casadi.equilibrium.guesses import first_nodes
 from dlo_casadi.equilibrium.ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import SIGNS, Pose
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import COARSE_MESH, CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 
@@ -263,7 +263,7 @@ def _descended(
     shapes: Shapes,
 ) -> list[list[Equilibrium]]:
     """Equilibria of each pose to which the energy descends from shapes, `of` which pose each."""
-    given = Given.of(p, rest, np.array([poses[j].vector for j in of]))
+    given = Inputs.of(p, rest, np.array([poses[j].vector for j in of]))
     minima = descend(assembly_of(model), shapes, given)
     inside = np.ones(len(of), dtype=bool)
     if not model.in_space:
@@ -301,7 +301,7 @@ def _likely(
         means.append((high - low) / np.diff(coarse.chain.cells, axis=1).ravel())
     own = np.concatenate(means)
     of, shapes = _first(coarse, p, own, poses, [None] * len(poses))
-    given = Given.of(p, own, np.array([poses[j].vector for j in of]))
+    given = Inputs.of(p, own, np.array([poses[j].vector for j in of]))
     found = descend(assembly_of(coarse), shapes, given)
     twists = _twists(
         coarse, assembly_of(coarse).strain(found.shapes, given)[:, : coarse.chain.n_cells]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Pose
@@ -91,11 +91,11 @@ def displacements(
     the fixtures' scatter and the rest curvature of each hanging's own, carried to the shape by the
     equilibrium; what repeats of one pose differ by, the same all along.
     """
-    sweep = Sweep(model, [pose])
+    equilibria = BatchEquilibrium(model, [pose])
     shapes, size = found.shapes, len(uncertainty.names)
     by_p, by_rest = uncertainty.unknowns_in(model)
-    along = sweep.directions(shapes, p, rest, by_p, by_rest)
-    seen = sweep.observe(shapes, p, rest, along)
+    along = equilibria.directions(shapes, p, rest, by_p, by_rest)
+    seen = equilibria.observe(shapes, p, rest, along)
     curve = NodeCurve.of(model.cable.length, seen.z[0])
     way = curve.moved(s, seen.slopes[0])
     moved: list[FloatArray] = [
@@ -105,7 +105,7 @@ def displacements(
     ]
     if uncertainty.rest_scatter.std > 0:
         modes = uncertainty.rest_modes_in(model)
-        hanging = sweep.observe(shapes, p, rest, sweep.by_rest(shapes, p, rest, modes))
+        hanging = equilibria.observe(shapes, p, rest, equilibria.by_rest(shapes, p, rest, modes))
         moved.append(curve.moved(s, hanging.slopes[0]))
     return curve, np.concatenate(moved, axis=2)
 

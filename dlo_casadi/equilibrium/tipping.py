@@ -11,7 +11,7 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium, tipping, tipping_lev
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import ways_of
 from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.thresholds import EITHER
 
@@ -68,7 +68,7 @@ def tipping_of(
     steps[0][:n], steps[1][:n] = by_p.T, by_rest.T
     steps[2][n : n + m], steps[1][n + m :] = by_deviation.T, own.T
     ways = [_SHARE * np.concatenate([step, -step]) for step in steps]
-    given = Given.of(p + ways[0], rest + ways[1], np.tile(pose.vector, (2 * count, 1)))
+    given = Inputs.of(p + ways[0], rest + ways[1], np.tile(pose.vector, (2 * count, 1)))
     slopes = []
     for found in (eq, other):
         x = np.broadcast_to(found.x, (2 * count, *found.x.shape))

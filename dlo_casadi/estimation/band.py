@@ -11,7 +11,7 @@ from dlo_casadi.thresholds import DIFFERENT
 def uncertainty_of(fit: Fit) -> Uncertainty:
     """What a fit has found."""
     names, covariance = fit.named_covariance
-    used = [fit.model.deviation_names[k] for k in fit.problem.sweep.used_deviations]
+    used = [fit.model.deviation_names[k] for k in fit.problem.equilibria.used_deviations]
     scatter = dict(zip(used, map(float, fit.problem.deviation_std), strict=True))
     return Uncertainty(names, covariance, scatter, fit.problem.rest_scatter, _hanging(fit))
 

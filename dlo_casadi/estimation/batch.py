@@ -9,9 +9,9 @@
 
 What is measured enters through R_j, the triangular factor of the whitened residuals' Jacobian by
 the numbers z of the curve and of readings (of lines: whitening x normals x Hermite
-interpolation): |R_j z - b_j|^2 equals the sum of squares up to a constant. Feet
-and normals are brought up to date between solves, until they stand still; at a foot the normal
-distance is stationary in s, so that the fixed point is that of the consistent problem.
+interpolation): |R_j z - b_j|^2 equals the sum of squares up to a constant. Projections and normals
+are brought up to date between solves, until they stand still; at a projection the normal distance
+is stationary in s, so that the fixed point is that of the consistent problem.
 
 It has the same minimum as `gauss_newton`, by another route: nothing is eliminated, and the
 Hessian is exact.
@@ -49,7 +49,7 @@ class BatchSolution:
     ----------
     point : Point
     solves, iterations : int
-        IPOPT runs (feet updates) and their iterations in all.
+        IPOPT runs (projections updates) and their iterations in all.
     residual : float
         Largest violation of a constraint in scaled units at the end.
     """
@@ -89,9 +89,10 @@ def solve_batch(problem: BatchProblem, start: Point, max_solves: int = 4) -> Bat
                 "  Try: more poses, or estimation.robust: true if some points are far off."
             )
         theta, shapes = nlp.unpack(vector, point.shapes)
-        moved = problem.evaluate(theta, shapes, point.feet)
+        moved = problem.evaluate(theta, shapes, point.projections)
         shift = max(
-            float(np.abs(new - old).max()) for new, old in zip(moved.feet, point.feet, strict=True)
+            float(np.abs(new - old).max())
+            for new, old in zip(moved.projections, point.projections, strict=True)
         )
         point = moved
         if shift < FEET_TOLERANCE * problem.noise.std or solves == max_solves:
@@ -104,7 +105,7 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
     count, size = _n_rows(problem), problem.observed_size
     unit = np.eye(size)
     out: list[tuple[FloatArray, FloatArray]] = []
-    for j, s in zip(problem.used, point.feet, strict=True):
+    for j, s in zip(problem.used, point.projections, strict=True):
         curve, readings = seen[j].curve.numbers, seen[j].readings
         each = ObservedChange(unit[: curve.size].reshape((*curve.shape, size)), unit[curve.size :])
         item, white = problem.measured[j], problem.whitening(j)
@@ -137,9 +138,9 @@ class _BatchNlp:
     def __init__(self, problem: BatchProblem, p: FloatArray) -> None:
         self.problem = problem
         unknowns, model = problem.unknowns, problem.unknowns.model
-        self.poses = list(range(problem.sweep.m)) if model.has_state else list(problem.used)
-        self.n_x, self.n_lam = problem.sweep.assembly.n, model.n_border
-        self.columns = problem.sweep.used_deviations
+        self.poses = list(range(problem.equilibria.m)) if model.has_state else list(problem.used)
+        self.n_x, self.n_lam = problem.equilibria.assembly.n, model.n_border
+        self.columns = problem.equilibria.used_deviations
         self.n_dev = len(self.columns)
         self.n_rest = model.chain.n_rests if model.has_state else 0
         self.stride = self.n_x + self.n_lam + self.n_dev + self.n_rest
@@ -319,9 +320,9 @@ class _BatchNlp:
     def solve(
         self, point: Point, rows: tuple[FloatArray, ...], targets: tuple[FloatArray, ...]
     ) -> tuple[FloatArray, dict[str, Any], float]:
-        """One IPOPT run with frozen feet."""
+        """One IPOPT run with frozen projections."""
         problem = self.problem
-        rests = problem.sweep.rests(
+        rests = problem.equilibria.rests(
             point.shapes, problem.unknowns.p(point.theta), problem.unknowns.rest(point.theta)
         )
         own = []

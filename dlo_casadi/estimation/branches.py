@@ -19,7 +19,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.hyperparameters import SETTLED_MODES, refine
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.thresholds import BIC_APART
 
@@ -94,7 +94,7 @@ def _slope(
     p, rest = (base + step for base, step in zip(given, steps, strict=True))
     m, q = len(p), len(p) // 2
     shapes = Shapes.declared(np.repeat(eq.x[None], m, 0), np.repeat(eq.multipliers[None], m, 0))
-    total = assembly_of(model).balance(shapes, Given(p, rest, np.repeat(pose.vector[None], m, 0)))[
+    total = assembly_of(model).balance(shapes, Inputs(p, rest, np.repeat(pose.vector[None], m, 0)))[
         0
     ]
     return np.asarray((total[:q] - total[q:]) / (2 * _STEP))
@@ -148,7 +148,7 @@ def _refitted(fit: Fit, gaps: Sequence[EnergyGap]) -> Fit:
         aim = -BELOW * gap.std - gap.value
         told.append((row, float(row @ fit.point.theta) + aim / (KEPT * gap.std)))
     unknowns = replace(problem.unknowns, told=tuple(told))
-    knowing = problem.of(unknowns, sweep=problem.sweep)
+    knowing = problem.of(unknowns, equilibria=problem.equilibria)
     found, point, _ = refine(
         knowing,
         knowing.taken_over(fit.point),
@@ -156,5 +156,5 @@ def _refitted(fit: Fit, gaps: Sequence[EnergyGap]) -> Fit:
         rounds=2,
         modes=SETTLED_MODES,
     )
-    plain = found.of(problem.unknowns, sweep=problem.sweep)
+    plain = found.of(problem.unknowns, equilibria=problem.equilibria)
     return Fit(plain, plain.taken_over(point), converged=True)

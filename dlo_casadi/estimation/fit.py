@@ -22,7 +22,7 @@ from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.starting_points import DECADES, ROLLS, starting_points
-from dlo_casadi.estimation.transfer import carried_feet, carried_shapes
+from dlo_casadi.estimation.transfer import carried_projections, carried_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.rest_curvature import RestScatter
@@ -305,12 +305,14 @@ def _continue(
     unknowns = replace(unknowns, fixed=p)
     theta = unknowns.pack(p, start.coefficients)
     problem = start.problem.of(unknowns, measured)
-    shapes, solved = problem.sweep.solve(carried_shapes(problem, start), p, unknowns.rest(theta))
+    shapes, solved = problem.equilibria.solve(
+        carried_shapes(problem, start), p, unknowns.rest(theta)
+    )
     if not solved.all():
         raise EstimationError("the shapes of the first fit are no equilibria of the second model")
-    feet = carried_feet(problem, start)
-    problem.share_metric(start.problem)
-    point = problem.evaluate(theta, shapes, feet)
+    projections = carried_projections(problem, start)
+    problem.share_weights(start.problem)
+    point = problem.evaluate(theta, shapes, projections)
     point, converged = problem.descend(point, max_iterations)
     return Fit(problem, point, converged)
 

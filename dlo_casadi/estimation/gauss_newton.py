@@ -5,10 +5,10 @@
         + 1/2 (theta - mean)^T P (theta - mean)
     subject to every pose being an equilibrium
 
-with the residuals e_j of the pose's sensors, of a line N_j (x_j - r_j(s_j)). The feet s_j of its
-points move with the curve; at a foot the normal distance does not change to first order with s,
-so that the Jacobian at fixed feet is the exact one. The deviations of a pose are eliminated by a
-Schur complement.
+with the residuals e_j of the pose's sensors, of a line N_j (x_j - r_j(s_j)). The projections s_j of
+its points move with the curve; there the normal distance does not change to first order with s, so
+that the Jacobian at fixed projections is the exact one. A Schur complement eliminates the
+deviations of a pose.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.equilibrium.spread import modes_in
 from dlo_casadi.estimation.linearization import Linearization, Normal, Point, Values
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.assembly import Directions, Shapes
+from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.rest_curvature import MODES, RestScatter
 from dlo_casadi.model.tolerances import Tolerances
@@ -69,7 +69,7 @@ class BatchProblem:
         Standard deviations of a pose's own deviations; the tolerances by default.
     rest_scatter : RestScatter
         Rest curvature of each hanging's own; none by default.
-    sweep : Sweep, optional
+    equilibria : BatchEquilibrium, optional
         Reused when only noise or priors have changed.
     """
 
@@ -82,7 +82,7 @@ class BatchProblem:
         roughness_std: float = 1.0,
         scatter: FloatArray | None = None,
         rest_scatter: RestScatter = NO_REST_SCATTER,
-        sweep: Sweep | None = None,
+        equilibria: BatchEquilibrium | None = None,
     ) -> None:
         self.unknowns = unknowns
         self.history = tuple(measured)
@@ -97,12 +97,14 @@ class BatchProblem:
         self.noise = noise
         self.tolerances = tolerances
         self.roughness_std = roughness_std
-        self.sweep = sweep or Sweep(unknowns.model, [item.pose for item in self.measured])
+        self.equilibria = equilibria or BatchEquilibrium(
+            unknowns.model, [item.pose for item in self.measured]
+        )
         self.precision = unknowns.prior_precision(roughness_std)
         self.mean = unknowns.prior_mean(self.precision)
         self.scatter = tolerances.deviation(unknowns.model.node) if scatter is None else scatter
         self.rest_scatter = rest_scatter
-        self.deviation_std = self.scatter[self.sweep.used_deviations]
+        self.deviation_std = self.scatter[self.equilibria.used_deviations]
         self._whitening: dict[int, FloatArray] = {}
 
     @property
@@ -117,7 +119,7 @@ class BatchProblem:
 
     def observed(self, theta: FloatArray, shapes: Shapes) -> list[Observed]:
         """All poses as the sensors see them."""
-        return self.sweep.seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
+        return self.equilibria.seen(shapes, self.unknowns.p(theta), self.unknowns.rest(theta))
 
     @property
     def observed_size(self) -> int:
@@ -130,19 +132,19 @@ class BatchProblem:
         """Whitening matrix (R_j, R_j) of pose j, as of the last `refresh`."""
         return self._whitening[j]
 
-    def refresh(self, theta: FloatArray, shapes: Shapes, feet: Sequence[FloatArray]) -> None:
-        """Take the metric of the residuals at these unknowns, equilibria and feet.
+    def refresh(self, theta: FloatArray, shapes: Shapes, projections: Sequence[FloatArray]) -> None:
+        """Take the weights of the residuals at these unknowns, equilibria and projections.
 
         The covariance of pose j is that of its noise plus E_j E_j^T, where E_j is what a standard
         deviation of each mode of its own rest curvature does to the residuals.
         """
         self._whitening = {
             j: self.measured[j].whitening(self.noise, s)
-            for j, s in zip(self.used, feet, strict=True)
+            for j, s in zip(self.used, projections, strict=True)
         }
         if self.rest_scatter.std == 0:
             return
-        moved = self.moved_by_rest(theta, shapes, feet)
+        moved = self.moved_by_rest(theta, shapes, projections)
         for j, way in zip(self.used, moved, strict=True):
             sizes = np.tile(self.rest_scatter.sizes, way.shape[1] // MODES)
             seen = self._whitening[j] @ (way * sizes)
@@ -150,60 +152,60 @@ class BatchProblem:
             self._whitening[j] = solve_triangular(factor, self._whitening[j], lower=True)
 
     def moved_by_rest(
-        self, theta: FloatArray, shapes: Shapes, feet: Sequence[FloatArray]
+        self, theta: FloatArray, shapes: Shapes, projections: Sequence[FloatArray]
     ) -> list[FloatArray]:
         """Change (R_j, axes MODES) of the fitted residuals by rest curvatures of the poses' own."""
         p, rest = self.unknowns.p(theta), self.unknowns.rest(theta)
-        along = self.sweep.by_rest(shapes, p, rest, modes_in(self.unknowns.model))
-        seen = self.sweep.observe(shapes, p, rest, along)
+        along = self.equilibria.by_rest(shapes, p, rest, modes_in(self.unknowns.model))
+        seen = self.equilibria.observe(shapes, p, rest, along)
         out = []
-        for j, s in zip(self.used, feet, strict=True):
+        for j, s in zip(self.used, projections, strict=True):
             now, change = seen.pose(j, self.unknowns.model.cable.length)
             out.append(self.measured[j].linearized(now, s, change)[1])
         return out
 
     @property
-    def has_metric(self) -> bool:
-        """Whether the metric of the residuals has been taken."""
+    def has_weights(self) -> bool:
+        """Whether the weights of the residuals have been taken."""
         return bool(self._whitening)
 
-    def share_metric(self, other: BatchProblem) -> None:
-        """Take over the metric of a problem with the same fitted poses: objectives compare then."""
+    def share_weights(self, other: BatchProblem) -> None:
+        """Take over the weights of a problem of the same fitted poses: objectives compare then."""
         self._whitening = {
             mine: other._whitening[theirs]
             for mine, theirs in zip(self.used, other.used, strict=True)
         }
 
     def taken_over(self, near: Point) -> Point:
-        """Return a point of a problem that weighs otherwise in this one, with the metric there."""
-        self.refresh(near.theta, near.shapes, near.feet)
-        return self.evaluate(near.theta, near.shapes, near.feet)
+        """Return a point of a problem that weighs otherwise in this one, with the weights there."""
+        self.refresh(near.theta, near.shapes, near.projections)
+        return self.evaluate(near.theta, near.shapes, near.projections)
 
-    def located(self, seen: list[Observed], feet: list[FloatArray]) -> list[FloatArray]:
+    def located(self, seen: list[Observed], projections: list[FloatArray]) -> list[FloatArray]:
         """Arc lengths (K_j,) [m] at which the fitted poses' points are compared, near those given.
 
         `seen` are all poses.
         """
-        places = zip(self.used, feet, strict=True)
+        places = zip(self.used, projections, strict=True)
         return [self.measured[j].located(seen[j], guess) for j, guess in places]
 
-    def evaluate(self, theta: FloatArray, shapes: Shapes, feet: list[FloatArray]) -> Point:
+    def evaluate(self, theta: FloatArray, shapes: Shapes, projections: list[FloatArray]) -> Point:
         """Objective at given unknowns and equilibria."""
         seen = self.observed(theta, shapes)
-        moved = self.located(seen, feet)
+        moved = self.located(seen, projections)
         residuals: list[FloatArray] = [
             self.whitening(j) @ self.measured[j].residual(seen[j], s)
             for j, s in zip(self.used, moved, strict=True)
         ]
         data = float(sum(white @ white for white in residuals))
         gap = theta - self.mean
-        used = shapes.deviation[np.ix_(self.used, self.sweep.used_deviations)]
+        used = shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
         prior = float(gap @ self.precision @ gap + ((used / self.deviation_std) ** 2).sum())
         return Point(theta, shapes, moved, (data + prior) / 2, data, residuals)
 
     def linearize(self, point: Point) -> Linearization:
         """Whitened residuals and their exact first derivatives."""
-        along = self.sweep.directions(
+        along = self.equilibria.directions(
             point.shapes,
             self.unknowns.p(point.theta),
             self.unknowns.rest(point.theta),
@@ -213,7 +215,7 @@ class BatchProblem:
         return self.linearize_along(point, along)
 
     def linearize_along(
-        self, point: Values, along: Directions, correction: Vector | None = None
+        self, point: Values, along: Tangents, correction: Vector | None = None
     ) -> Linearization:
         """Residuals and derivatives for given derivatives of the shapes and parameters.
 
@@ -225,10 +227,10 @@ class BatchProblem:
         """
         p, rest = self.unknowns.p(point.theta), self.unknowns.rest(point.theta)
         ways = along if correction is None else along.and_step(correction)
-        seen = self.sweep.observe(point.shapes, p, rest, ways)
+        seen = self.equilibria.observe(point.shapes, p, rest, ways)
         out = Linearization([], [], [], [], [], along)
         size, length = self.unknowns.size, self.unknowns.model.cable.length
-        for j, s in zip(self.used, point.feet, strict=True):
+        for j, s in zip(self.used, point.projections, strict=True):
             (now, change), item = seen.pose(j, length), self.measured[j]
             white = self.whitening(j)
             d, directions = item.linearized(now, s, change)
@@ -249,7 +251,7 @@ class BatchProblem:
         gradient = self.precision @ gap
         inner: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         precision = np.diag(1 / self.deviation_std**2)
-        columns = self.sweep.used_deviations
+        columns = self.equilibria.used_deviations
         for k, j in enumerate(self.used):
             e, a, b = lin.residuals[k], lin.by_theta[k], lin.by_deviation[k]
             hessian += a.T @ a
@@ -275,7 +277,7 @@ class BatchProblem:
         if np.any(new < lower) or np.any(new > upper):
             step = _bounded_step(matrix, normal.gradient, lower - point.theta, upper - point.theta)
         deviation = point.shapes.deviation.copy()
-        columns = self.sweep.used_deviations
+        columns = self.equilibria.used_deviations
         for j, (block, cross, slope) in zip(self.used, normal.inner, strict=False):
             deviation[j, columns] -= np.linalg.solve(block, cross @ step + slope)
         return step, deviation
@@ -367,17 +369,17 @@ class BatchProblem:
         change = self.shape_step(lin.shapes, step, deviation - point.shapes.deviation)
         if float(np.abs(change.x).max()) > LONGEST_MOVE:
             return None
-        guess = replace(self.sweep.moved(point.shapes, change), deviation=deviation)
-        shapes, converged = self.sweep.settled(
+        guess = replace(self.equilibria.moved(point.shapes, change), deviation=deviation)
+        shapes, converged = self.equilibria.settled(
             guess, self.unknowns.p(theta), self.unknowns.rest(theta), reach=1.0
         )
         if not converged.all():
             return None
-        return self.evaluate(theta, shapes, point.feet)
+        return self.evaluate(theta, shapes, point.projections)
 
-    def shape_step(self, along: Directions, step: FloatArray, deviation: FloatArray) -> Vector:
+    def shape_step(self, along: Tangents, step: FloatArray, deviation: FloatArray) -> Vector:
         """How the shapes move with a step of theta and of the deviations, one column."""
-        own = deviation[:, self.sweep.used_deviations]
+        own = deviation[:, self.equilibria.used_deviations]
         both = np.concatenate([np.broadcast_to(step, (len(own), len(step))), own], axis=1)
         return Vector(along.x @ both[:, None, :, None], along.lam @ both[:, :, None])
 
@@ -394,7 +396,7 @@ class BatchProblem:
         unknowns: Unknowns,
         measured: Sequence[MeasuredPose] | None = None,
         scatter: FloatArray | None = None,
-        sweep: Sweep | None = None,
+        equilibria: BatchEquilibrium | None = None,
     ) -> BatchProblem:
         """Return a problem with the same noise, roughness and scatter, unless it is given here."""
         return BatchProblem(
@@ -405,7 +407,7 @@ class BatchProblem:
             self.roughness_std,
             self.scatter if scatter is None else scatter,
             self.rest_scatter,
-            sweep,
+            equilibria,
         )
 
     def changed(
@@ -424,7 +426,7 @@ class BatchProblem:
             roughness_std,
             scatter,
             rest_scatter,
-            self.sweep,
+            self.equilibria,
         )
 
 

@@ -226,11 +226,11 @@ def rest_scatter_of(
     if different_poses(problem.history, problem.unknowns.model.cable.length) < DIFFERENT:
         return ScatterEstimate(RestScatter(), 1.0, 1.0)
     size, std = problem.unknowns.size, problem.deviation_std
-    moved = problem.moved_by_rest(point.theta, point.shapes, point.feet)
+    moved = problem.moved_by_rest(point.theta, point.shapes, point.projections)
     kept = range(0, len(problem.used), -(-len(problem.used) // MOST_POSES))
     samples = []
     for k in kept:
-        white = problem.measured[problem.used[k]].whitening(noise, point.feet[k])
+        white = problem.measured[problem.used[k]].whitening(noise, point.projections[k])
         by = white @ lin.raw_directions[k]
         samples.append(
             ScatterSample(white @ lin.raw[k], white @ moved[k], by[:, size:] * std, by[:, :size])
@@ -240,7 +240,7 @@ def rest_scatter_of(
     shapes = shapes - shapes[:, :1]
     gap = shapes[:, None] - shapes[None]
     distances = np.sqrt((gap**2).sum(axis=3).mean(axis=2))
-    sparse = max(len(s) for s in point.feet) <= MODES
+    sparse = max(len(s) for s in point.projections) <= MODES
     return estimate_rest_scatter(RestLikelihood(samples, distances), sparse=sparse)
 
 
@@ -276,12 +276,12 @@ def _noise_samples(
     bases, left_over = [], []
     rest = None
     if problem.rest_scatter.std > 0:
-        rest = problem.moved_by_rest(point.theta, point.shapes, point.feet)
+        rest = problem.moved_by_rest(point.theta, point.shapes, point.projections)
     kept = [problem.measured[j].on_points for j in problem.used]
     raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
     ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]
     scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in ways], axis=0)
-    for k, (j, s) in enumerate(zip(problem.used, point.feet, strict=True)):
+    for k, (j, s) in enumerate(zip(problem.used, point.projections, strict=True)):
         directions = ways[k]
         own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
         sines = smooth_modes(s, length, modes, model.end == "free")
@@ -298,9 +298,19 @@ def _noise_samples(
     left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
     blocks = np.split(left[:, values > 1e-6], np.cumsum([len(raw) for raw in raws])[:-1])
     samples = []
-    for j, raw, s, own, block in zip(problem.used, raws, point.feet, bases, blocks, strict=True):
+    for j, raw, s, own, block in zip(
+        problem.used, raws, point.projections, bases, blocks, strict=True
+    ):
         samples += [
-            NoiseSample(raw[rows], s[points], x.weight, own[rows], block[rows], x.grain, x.count)
+            NoiseSample(
+                raw[rows],
+                s[points],
+                x.weight,
+                own[rows],
+                block[rows],
+                x.correlation_length,
+                x.count,
+            )
             for x, points, rows in problem.measured[j].slices
         ]
     return samples
@@ -331,7 +341,7 @@ def scatter_of(problem: BatchProblem, point: Point, lin: Linearization) -> Float
     were intervals: of ten random cables in space five lay more than two standard deviations off,
     one 4.6; with the tolerance none of these and nine more, at most 1.85.
     """
-    columns = problem.sweep.used_deviations
+    columns = problem.equilibria.used_deviations
     if not columns or len(problem.used) == 1:
         return problem.scatter
     normal = problem.normal_equations(point, lin)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.model.assembly import Directions, Shapes
+from dlo_casadi.model.assembly import Shapes, Tangents
 
 FloatArray = NDArray[np.floating]
 
@@ -20,13 +20,13 @@ class Values:
     ----------
     theta : (size,)
     shapes : Shapes
-    feet : list of (K_j,) [m]
+    projections : list of (K_j,) [m]
         Arc lengths at which the fitted poses' points are compared.
     """
 
     theta: FloatArray
     shapes: Shapes
-    feet: list[FloatArray]
+    projections: list[FloatArray]
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Linearization:
         Residuals, not whitened.
     raw_directions : list of (R_j, size + n_deviations)
         Their derivatives, not whitened.
-    shapes : Directions
+    shapes : Tangents
         Derivatives of the equilibria, by the unknowns and by each pose's deviations.
     """
 
@@ -72,7 +72,7 @@ class Linearization:
     by_deviation: list[FloatArray]
     raw: list[FloatArray]
     raw_directions: list[FloatArray]
-    shapes: Directions
+    shapes: Tangents
 
 
 @dataclass(frozen=True)

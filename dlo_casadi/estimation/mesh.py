@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.hyperparameters import SMOOTH_MODES
@@ -22,20 +22,20 @@ FINEST_MESH = 160
 SEARCH_MESH = 80
 
 
-def on_mesh(fit: Fit, n: int) -> tuple[Sweep, Shapes, FloatArray, bool]:
+def on_mesh(fit: Fit, n: int) -> tuple[BatchEquilibrium, Shapes, FloatArray, bool]:
     """Equilibria of the fitted parameters on a mesh of n elements.
 
     Returns
     -------
-    Sweep, Shapes, (n_rests,), bool
+    BatchEquilibrium, Shapes, (n_rests,), bool
         The finer model's poses, their shapes, the rest curvature, and whether they converged.
     """
     model = fit.model.with_mesh(n)
-    sweep = Sweep(model, [item.pose for item in fit.problem.measured])
+    equilibria = BatchEquilibrium(model, [item.pose for item in fit.problem.measured])
     rest = model.rest_basis @ fit.coefficients
     shapes = on_other_mesh(fit.point.shapes, fit.model, model)
-    solved, converged = sweep.solve(shapes, fit.p, rest)
-    return sweep, solved, rest, bool(converged.all())
+    solved, converged = equilibria.solve(shapes, fit.p, rest)
+    return equilibria, solved, rest, bool(converged.all())
 
 
 def discretization_error(fit: Fit) -> float:
@@ -49,14 +49,14 @@ def discretization_error(fit: Fit) -> float:
     EstimationError
         If the fitted parameters have no equilibria on the finer mesh nearby.
     """
-    sweep, shapes, rest, ok = on_mesh(fit, 2 * fit.model.n)
+    equilibria, shapes, rest, ok = on_mesh(fit, 2 * fit.model.n)
     if not ok:
         raise EstimationError(
             "the fitted shapes are no equilibria on a mesh of "
             f"{counted(2 * fit.model.n, 'element')}: the mesh of {fit.model.n} is far too coarse.\n"
             "  Try: model.n larger."
         )
-    fine = sweep.seen(shapes, fit.p, rest)
+    fine = equilibria.seen(shapes, fit.p, rest)
     coarse = fit.problem.observed(fit.point.theta, fit.point.shapes)
     places = np.linspace(0.0, fit.model.cable.length, 101)
     worst = 0.0

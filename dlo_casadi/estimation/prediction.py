@@ -16,7 +16,7 @@ from dlo_casadi.equilibrium.pose import Pose, PoseBranch
 from dlo_casadi.equilibrium.solve import continued, solve_equilibria, ways_of
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
@@ -129,7 +129,7 @@ def predict_poses(
             continue
         last = pose, found.equilibrium.x
         if model.has_state:
-            held = Given.of(p, rest, pose.vector[None])
+            held = Inputs.of(p, rest, pose.vector[None])
             rest = assembly_of(model).state_after(found.equilibrium.shapes, held)[0][0]
     return out
 
@@ -146,7 +146,7 @@ def _seen(
         return []
     x, lam = zip(*((eq.x, eq.multipliers) for eq in equilibria), strict=True)
     shapes = Shapes.declared(np.array(x), np.array(lam))
-    given = Given.of(p, rest, np.array([pose.vector for pose in poses]))
+    given = Inputs.of(p, rest, np.array([pose.vector for pose in poses]))
     length, assembly = model.cable.length, assembly_of(model)
     curves, readings = assembly.curve(shapes, given), assembly.readings(shapes, given)
     return [

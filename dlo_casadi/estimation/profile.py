@@ -51,7 +51,7 @@ def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
 
     (t + b)^2 times the excess of the residual over the noise, with Student's t of 95 % for what the
     sizes of noise and scatter are estimated from, 1.96 where they are declared; b, for a declared
-    noise, is the length in its metric of a systematic error of SYSTEMATIC_SHARE in all points.
+    noise, is the length in its weights of a systematic error of SYSTEMATIC_SHARE in all points.
     """
     square = 0.0
     for j in fit.problem.used:
@@ -189,14 +189,14 @@ class _Profile:
         fit, k = self.fit, self._k
         base = 2 * fit.point.objective - fit.problem.unknowns.own_prior(fit.point.theta, k)
         unknowns = self._held(place)
-        problem = fit.problem.of(unknowns, sweep=fit.problem.sweep)
-        problem.share_metric(fit.problem)
+        problem = fit.problem.of(unknowns, equilibria=fit.problem.equilibria)
+        problem.share_weights(fit.problem)
         for theta in (self._along(place, near), near.point.theta):
-            shapes, converged = problem.sweep.solve(
+            shapes, converged = problem.equilibria.solve(
                 near.point.shapes, unknowns.p(theta), unknowns.rest(theta)
             )
             if converged.all():
-                start = problem.evaluate(theta, shapes, near.point.feet)
+                start = problem.evaluate(theta, shapes, near.point.projections)
                 point, _ = problem.descend(start, tolerance=1e-2)
                 return _Refit(place, point, 2 * point.objective - base)
         return None

@@ -103,7 +103,7 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
                 none = np.zeros((len(e), 0))
                 if len(s):
                     weight = sensor.weight[inside[points]]
-                    samples.append(NoiseSample(e, s, weight, none, none, sensor.grain))
+                    samples.append(NoiseSample(e, s, weight, none, none, sensor.correlation_length))
     if not tell_of_noise(samples):
         return noise
     found = estimate_noise(samples, length)

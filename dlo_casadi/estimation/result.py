@@ -259,7 +259,7 @@ class Fit:
     @cached_property
     def _moved_by_rest(self) -> list[FloatArray]:
         point = self.point
-        return self.problem.moved_by_rest(point.theta, point.shapes, point.feet)
+        return self.problem.moved_by_rest(point.theta, point.shapes, point.projections)
 
     @property
     def _on_points(self) -> list[NDArray[np.bool_]]:
@@ -360,7 +360,7 @@ class Fit:
     @cached_property
     def stable(self) -> NDArray[np.bool_]:
         """Whether each pose is a stable equilibrium at the fitted parameters."""
-        return self.problem.sweep.stable(self.point.shapes, self.p, self.rest)
+        return self.problem.equilibria.stable(self.point.shapes, self.p, self.rest)
 
     @cached_property
     def log_evidence(self) -> float:

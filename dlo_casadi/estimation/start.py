@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.chords import line_nodes
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
 from dlo_casadi.equilibrium.guesses import first_nodes
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
 from dlo_casadi.estimation.linearization import Point, Values
-from dlo_casadi.model.assembly import Directions, Shapes
+from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import Vector
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -59,9 +59,11 @@ def measured_shapes(
     model, used = problem.unknowns.model, problem.used
     chain = model.chain
     # Without forces an element does not know its inner unknowns.
-    sweep = problem.sweep
+    equilibria = problem.equilibria
     if chain.kind.n_inner:
-        sweep = Sweep(model.with_mesh(chain.n, chain.kind.plain), problem.sweep.poses)
+        equilibria = BatchEquilibrium(
+            model.with_mesh(chain.n, chain.kind.plain), problem.equilibria.poses
+        )
     flat = np.zeros(chain.n_rests)
     predicted = np.array(
         [first_nodes(model, model.nominal, flat, item.pose)[0] for item in problem.measured]
@@ -72,15 +74,15 @@ def measured_shapes(
         pose = item.pose.rolled(roll)
         pose = pose if turns is None else replace(pose, turns=float(turns[j]))
         along[j] = line_nodes(item.points, pose, chain, item.places(chain.length))
-    shapes, feet, cost = _kinematics(problem, sweep, along, roll)
+    shapes, projections, cost = _kinematics(problem, equilibria, along, roll)
     alone = [k for k, j in enumerate(used) if not problem.measured[j].has_line]
     if alone:
         # One photograph shows a bend towards it and one away from it alike.
-        others, places, costs = _kinematics(problem, sweep, predicted, roll)
+        others, places, costs = _kinematics(problem, equilibria, predicted, roll)
         for k in alone:
             if costs[k] < cost[k]:
-                shapes.x[used[k]], feet[k] = others.x[used[k]], places[k]
-    return shapes, feet
+                shapes.x[used[k]], projections[k] = others.x[used[k]], places[k]
+    return shapes, projections
 
 
 def turned_either_way(
@@ -108,10 +110,10 @@ def turned_either_way(
     others, places = measured_shapes(problem, roll, -np.sign(twist) / 2)
     least = first.objective
     for j in order:
-        rows, feet = guess.shapes.x.copy(), list(guess.feet)
+        rows, projections = guess.shapes.x.copy(), list(guess.projections)
         k = problem.used.index(j)
-        rows[j], feet[k] = others.x[j], places[k]
-        other = replace(guess, shapes=replace(guess.shapes, x=rows), feet=feet)
+        rows[j], projections[k] = others.x[j], places[k]
+        other = replace(guess, shapes=replace(guess.shapes, x=rows), projections=projections)
         tried = all_at_once(problem, other, held, LOOK)
         if tried is not None and tried.objective < least:
             guess, least = other, tried.objective
@@ -119,43 +121,43 @@ def turned_either_way(
 
 
 def _kinematics(
-    problem: BatchProblem, sweep: Sweep, x: FloatArray, roll: float
+    problem: BatchProblem, equilibria: BatchEquilibrium, x: FloatArray, roll: float
 ) -> tuple[Shapes, list[FloatArray], list[float]]:
     """Shapes from nodes x on, arc lengths of the points, and what is left of each (used,) [m^2]."""
     model, used = problem.unknowns.model, problem.used
     lines = [item.traced if item.has_line else item for item in (problem.measured[j] for j in used)]
-    shapes = problem.sweep.start_shapes(x)
-    each, flat = _each_node(sweep), np.zeros(model.chain.n_rests)
-    feet = [item.places(model.chain.length) for item in lines]
+    shapes = problem.equilibria.start_shapes(x)
+    each, flat = _each_node(equilibria), np.zeros(model.chain.n_rests)
+    projections = [item.places(model.chain.length) for item in lines]
     cost = [np.inf for _ in used]
     steps = _KINEMATIC_STEPS if all(x.has_line for x in lines) else _STEPS_WITHOUT_DEPTH
     for iteration in range(steps + 1):
-        seen = sweep.observe(shapes, problem.unknowns.fixed, flat, each)
+        seen = equilibria.observe(shapes, problem.unknowns.fixed, flat, each)
         for k, (j, item) in enumerate(zip(used, lines, strict=True)):
             now, change = seen.pose(j, model.cable.length)
             if iteration > 1:
-                feet[k] = item.located(now, feet[k])
+                projections[k] = item.located(now, projections[k])
             elif not item.has_line:
-                feet[k] = item.nearest(now.curve)
+                projections[k] = item.nearest(now.curve)
             if iteration == steps and item is not problem.measured[j]:
-                feet[k] = problem.measured[j].nearest(now.curve)
+                projections[k] = problem.measured[j].nearest(now.curve)
                 continue
             rolled = replace(item, pose=item.pose.rolled(roll))
-            step, cost[k] = _kinematic_step(rolled, model, now, change, shapes.x[j], feet[k])
+            step, cost[k] = _kinematic_step(rolled, model, now, change, shapes.x[j], projections[k])
             if iteration < steps:
                 shapes.x[j] = model.node.moved(shapes.x[j], step)
-    return shapes, feet, cost
+    return shapes, projections, cost
 
 
-def _each_node(sweep: Sweep) -> Directions:
+def _each_node(equilibria: BatchEquilibrium) -> Tangents:
     """Every node moved on its own."""
-    a, m = sweep.assembly, sweep.m
+    a, m = equilibria.assembly, equilibria.m
     q = a.n * a.b
     x = np.broadcast_to(np.eye(q).reshape((a.n, a.b, q)), (m, a.n, a.b, q))
-    model = sweep.model
+    model = equilibria.model
     counts = (a.k, len(model.parameters), model.chain.n_rests, len(model.deviation_names))
     lam, p, rest, deviation = (np.zeros((m, count, q)) for count in counts)
-    return Directions(x, lam, p, rest, deviation)
+    return Tangents(x, lam, p, rest, deviation)
 
 
 def _kinematic_step(
@@ -225,7 +227,7 @@ class _Step:
     theta : (size,)
     shapes : Vector
     deviation : (m, n_deviations)
-    feet : list of (K_j,) [m]
+    projections : list of (K_j,) [m]
         Of the shapes as they are.
     """
 
@@ -233,7 +235,7 @@ class _Step:
     theta: FloatArray
     shapes: Vector
     deviation: FloatArray
-    feet: list[FloatArray]
+    projections: list[FloatArray]
 
 
 def all_at_once(
@@ -264,7 +266,7 @@ def all_at_once(
                 return None
             share *= PART
         else:
-            last = replace(guess, objective=step.objective, feet=step.feet), step
+            last = replace(guess, objective=step.objective, projections=step.projections), step
             share = min(1.0, LONGEST / max(float(np.abs(step.shapes.x).max()), SETTLED))
         if share * float(np.abs(last[1].shapes.x).max()) < SETTLED:
             break
@@ -276,26 +278,26 @@ def _moved(problem: BatchProblem, guess: Guess, step: _Step, share: float) -> Gu
     """A share of a step; multipliers, unknown at first, take the whole of theirs."""
     deviation = guess.shapes.deviation + share * step.deviation
     change = Vector(share * step.shapes.x, step.shapes.y)
-    shapes = replace(problem.sweep.moved(guess.shapes, change), deviation=deviation)
-    return Guess(guess.theta + share * step.theta, shapes, guess.feet)
+    shapes = replace(problem.equilibria.moved(guess.shapes, change), deviation=deviation)
+    return Guess(guess.theta + share * step.theta, shapes, guess.projections)
 
 
 def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step | None:
     """Where the linearised balance and residuals lead; None where matrices are singular."""
-    unknowns, sweep = problem.unknowns, problem.sweep
+    unknowns, equilibria = problem.unknowns, problem.equilibria
     theta, shapes = guess.theta, guess.shapes
-    columns, moving = sweep.used_deviations, ~held
+    columns, moving = equilibria.used_deviations, ~held
     own = np.diag(1 / problem.deviation_std**2 + 1e-12)
     p, rest = unknowns.p(theta), unknowns.rest(theta)
     try:
-        along = sweep.directions(shapes, p, rest, unknowns.slopes(theta), unknowns.rest_slopes)
-        force = sweep.imbalance(shapes, p, rest)
+        along = equilibria.directions(shapes, p, rest, unknowns.slopes(theta), unknowns.rest_slopes)
+        force = equilibria.imbalance(shapes, p, rest)
         assert along.tangent is not None
         correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
     except np.linalg.LinAlgError:
         return None
-    feet = problem.located(problem.observed(theta, shapes), guess.feet)
-    ahead = problem.linearize_along(replace(guess, feet=feet), along, correction)
+    projections = problem.located(problem.observed(theta, shapes), guess.projections)
+    ahead = problem.linearize_along(replace(guess, projections=projections), along, correction)
     gap = theta - problem.mean
     hessian, gradient = problem.precision.copy(), problem.precision @ gap
     objective = float(gap @ gradient) / 2
@@ -326,14 +328,14 @@ def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step
     # A sum of squares: below zero the matrices are singular but for rounding, and promise anything.
     if not (0 <= objective < np.inf and np.all(np.isfinite(change.x))):
         return None
-    return _Step(objective, step, change, deviation, feet)
+    return _Step(objective, step, change, deviation, projections)
 
 
 def equilibria_near(problem: BatchProblem, guess: Guess) -> Point | None:
     """Equilibria of all poses near a guess; None if some pose has none there."""
     p, rest = problem.unknowns.p(guess.theta), problem.unknowns.rest(guess.theta)
-    shapes, converged = problem.sweep.settled(guess.shapes, p, rest, max_iterations=40)
+    shapes, converged = problem.equilibria.settled(guess.shapes, p, rest, max_iterations=40)
     if not converged.all():
         return None
-    point = problem.evaluate(guess.theta, shapes, guess.feet)
+    point = problem.evaluate(guess.theta, shapes, guess.projections)
     return point if np.isfinite(point.objective) else None

@@ -70,18 +70,18 @@ def _guesses(
     held = _held(problem)
     guesses: list[Guess] = []
     for roll in rolls:
-        shapes, feet = measured_shapes(problem, roll)
-        if not problem.has_metric:
-            problem.refresh(theta, shapes, feet)
+        shapes, projections = measured_shapes(problem, roll)
+        if not problem.has_weights:
+            problem.refresh(theta, shapes, projections)
         rolled = theta.copy()
         if roll:
             own = names.index(END_ROLL)
             rolled[own] += roll / problem.unknowns.scales[own]
         if either_way:
             still = held | (np.array(names) == END_ROLL)
-            turned = turned_either_way(problem, Guess(rolled, shapes, feet), still, roll)
-            shapes, feet = turned.shapes, turned.feet
-        near = Guess(rolled, shapes, feet)
+            turned = turned_either_way(problem, Guess(rolled, shapes, projections), still, roll)
+            shapes, projections = turned.shapes, turned.projections
+        near = Guess(rolled, shapes, projections)
         guesses += _outwards(problem, near, held, decades, whole=whole)
     return guesses
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
@@ -38,7 +38,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     prediction would choose there, or on that on which the pose was measured.
     """
     used = [item for item in measured if item.readable and not item.held_out]
-    sweep = Sweep(model, [item.pose for item in used])
+    equilibria = BatchEquilibrium(model, [item.pose for item in used])
     rest = np.zeros(model.chain.n_rests)
     n_points = sum(len(item.traced.points) for item in used)
 
@@ -56,10 +56,10 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         start = min(
             shapes,
             grown,
-            key=lambda x: float(np.linalg.norm(sweep.balance(x, at(log_ei), rest)[0].rows)),
+            key=lambda x: float(np.linalg.norm(equilibria.balance(x, at(log_ei), rest)[0].rows)),
         )
-        moved, converged = sweep.solve(start, at(log_ei), rest)
-        if not converged.all() or not sweep.stable(moved, at(log_ei), rest).all():
+        moved, converged = equilibria.solve(start, at(log_ei), rest)
+        if not converged.all() or not equilibria.stable(moved, at(log_ei), rest).all():
             if model.in_space:
                 return shapes, np.inf
             cold = _cold(model, at(log_ei), rest, used)
@@ -68,7 +68,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
             moved = cold
         total = sum(
             float((item.distances(seen.curve) ** 2).sum())
-            for seen, item in zip(sweep.seen(moved, at(log_ei), rest), used, strict=True)
+            for seen, item in zip(equilibria.seen(moved, at(log_ei), rest), used, strict=True)
         )
         return moved, total
 
@@ -77,7 +77,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     first = _cold(model, at(prior), rest, used)
     if first is None:
         straight = np.tile(model.node.identity, (len(used), model.chain.n_nodes, 1))
-        first = sweep.start_shapes(straight)
+        first = equilibria.start_shapes(straight)
     step = np.log(10) / _PER_DECADE
     decades = _DECADES_IN_SPACE if model.in_space else _DECADES
     for direction in (1, -1):

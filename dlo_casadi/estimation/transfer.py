@@ -1,4 +1,4 @@
-"""What one fit has found, for the model and mesh of another: shapes, multipliers, feet."""
+"""What one fit has found, for the model and mesh of another: shapes, multipliers, projections."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def with_border_of(shapes: Shapes, model: CableModel, other: CableModel) -> Shap
     return replace(shapes, lam=lam)
 
 
-def carried_feet(problem: BatchProblem, start: Fit) -> list[FloatArray]:
+def carried_projections(problem: BatchProblem, start: Fit) -> list[FloatArray]:
     """Feet of the problem's fitted poses, by the pose's place in the session."""
-    known = dict(zip(start.problem.fitted, start.point.feet, strict=True))
+    known = dict(zip(start.problem.fitted, start.point.projections, strict=True))
     return [known[k] for k in problem.fitted]

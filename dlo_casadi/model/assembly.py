@@ -1,7 +1,7 @@
 """A model's functions evaluated for many poses at once, and put together into band matrices.
 
-One CasADi function of a slot is mapped over the slots of a pose; its blocks are added up to the
-gradient of the Lagrangian, its Hessian (block-tridiagonal, with the multipliers as border), and
+One CasADi function of a segment is mapped over the segments of a pose; its blocks are added up to
+the gradient of the Lagrangian, its Hessian (block-tridiagonal, with the multipliers as border), and
 the derivatives of both and of the measured curve.
 """
 
@@ -56,7 +56,7 @@ class Shapes:
 
 
 @dataclass(frozen=True)
-class Given:
+class Inputs:
     """What the equilibria of m poses depend on.
 
     `p` (m, n_parameters), `rest` (m, n_rests) [1/m], `poses` (m, n_pose) as declared.
@@ -67,20 +67,20 @@ class Given:
     poses: FloatArray
 
     @classmethod
-    def of(cls, p: FloatArray, rest: FloatArray, poses: FloatArray) -> Given:
+    def of(cls, p: FloatArray, rest: FloatArray, poses: FloatArray) -> Inputs:
         """Parameters and rest curvature of each pose, or the same for all."""
         m = len(poses)
         return cls(
             np.broadcast_to(p, (m, p.shape[-1])), np.broadcast_to(rest, (m, rest.shape[-1])), poses
         )
 
-    def subset(self, index: Any) -> Given:
+    def subset(self, index: Any) -> Inputs:
         """Those of some of the poses."""
-        return Given(self.p[index], self.rest[index], self.poses[index])
+        return Inputs(self.p[index], self.rest[index], self.poses[index])
 
 
 @dataclass(frozen=True)
-class Directions:
+class Tangents:
     """Directions of all that shapes depend on, q of them, of m poses.
 
     `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q),
@@ -95,17 +95,17 @@ class Directions:
     deviation: FloatArray
     tangent: BandMatrix | None = None
 
-    def and_step(self, step: Vector) -> Directions:
+    def and_step(self, step: Vector) -> Tangents:
         """These directions and, last, a step of the shapes alone (one column)."""
         p, rest, deviation = (
             np.pad(part, [(0, 0), (0, 0), (0, 1)]) for part in (self.p, self.rest, self.deviation)
         )
         x = np.concatenate([self.x, step.x], axis=-1)
-        return Directions(x, np.concatenate([self.lam, step.y], axis=-1), p, rest, deviation)
+        return Tangents(x, np.concatenate([self.lam, step.y], axis=-1), p, rest, deviation)
 
 
 class _Mapped:
-    """A CasADi function of a slot (or node), mapped over a pose and called pose by pose.
+    """A CasADi function of a segment (or node), mapped over a pose and called pose by pose.
 
     It reads and writes NumPy's memory: converting to CasADi's matrices costs several times the
     evaluation itself.
@@ -146,10 +146,10 @@ class Assembly:
         self.model = model
         self.chain, self.node = model.chain, model.chain.kind.node
         self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
-        self._slots = self.chain.n_slots
-        # Numbers that tell the rest strains inside a slot.
+        self._segments = self.chain.n_segments
+        # Numbers that tell the rest strains inside a segment.
         self.n_inside = 3 * len(self.node.strains)
-        self._next = np.minimum(np.arange(self._slots) + 1, self.n - 1)
+        self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
         self._functions: dict[str, _Mapped] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -163,46 +163,46 @@ class Assembly:
             self._functions[name] = _Mapped(getattr(functions_of(self.model), name), count)
         return self._functions[name]
 
-    def _call_slots(self, name: str, shapes: Shapes, given: Given) -> list[FloatArray]:
-        """A function of a slot for all slots: outputs (m, n_slots, rows, columns)."""
+    def _call_segments(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
+        """A function of a segment for all segments: outputs (m, n_segments, rows, columns)."""
         m = len(shapes.x)
-        both = np.concatenate([shapes.x[:, : self._slots], shapes.x[:, self._next]], axis=2)
+        both = np.concatenate([shapes.x[:, : self._segments], shapes.x[:, self._next]], axis=2)
         own = self.chain.rest_inside(given.rest[..., None])[..., 0]
         alike = (shapes.lam, given.p, shapes.deviation)
         lam, p, deviation = (
-            np.broadcast_to(one[:, None], (m, self._slots, one.shape[1])) for one in alike
+            np.broadcast_to(one[:, None], (m, self._segments, one.shape[1])) for one in alike
         )
-        place = np.broadcast_to(self.chain.layout.slots, (m, *self.chain.layout.slots.shape))
-        return self._mapped(name, self._slots)(both, lam, p, own, place, deviation)
+        place = np.broadcast_to(self.chain.layout.segments, (m, *self.chain.layout.segments.shape))
+        return self._mapped(name, self._segments)(both, lam, p, own, place, deviation)
 
-    def _call_ends(self, name: str, shapes: Shapes, given: Given) -> list[FloatArray]:
+    def _call_ends(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """A function of both ends: outputs (m, rows, columns)."""
         both = np.concatenate([shapes.x[:, :1], shapes.x[:, -1:]], axis=2)
         others = (shapes.lam, given.p, given.poses, shapes.deviation)
         rows = [both, *(one[:, None] for one in others)]
         return [out[:, 0] for out in self._mapped(name, 1)(*rows)]
 
-    def _added(self, slots: FloatArray, ends: FloatArray) -> Vector:
-        """Rows (2b + k, q) of the slots and the ends, added up to nodes and border."""
-        m, b = len(slots), self.b
-        x = np.zeros((m, max(self._slots + 1, self.n), b, slots.shape[3]))
-        x[:, : self._slots] += slots[:, :, :b]
-        x[:, 1 : self._slots + 1] += slots[:, :, b : 2 * b]
+    def _added(self, segments: FloatArray, ends: FloatArray) -> Vector:
+        """Rows (2b + k, q) of the segments and the ends, added up to nodes and border."""
+        m, b = len(segments), self.b
+        x = np.zeros((m, max(self._segments + 1, self.n), b, segments.shape[3]))
+        x[:, : self._segments] += segments[:, :, :b]
+        x[:, 1 : self._segments + 1] += segments[:, :, b : 2 * b]
         x = x[:, : self.n]
         x[:, 0] += ends[:, :b]
         x[:, -1] += ends[:, b : 2 * b]
-        return Vector(x, slots[:, :, 2 * b :].sum(axis=1) + ends[:, 2 * b :])
+        return Vector(x, segments[:, :, 2 * b :].sum(axis=1) + ends[:, 2 * b :])
 
     # ---- balance -------------------------------------------------------------------------------
 
-    def balance(self, shapes: Shapes, given: Given) -> tuple[FloatArray, Vector, BandMatrix]:
+    def balance(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, Vector, BandMatrix]:
         """Lagrangian (m,) [J], its gradient by increments and multipliers, and its Hessian."""
-        value, slope, bend = self._call_slots("slot", shapes, given)
+        value, slope, bend = self._call_segments("segment", shapes, given)
         end_value, end_slope, end_bend = self._call_ends("at_ends", shapes, given)
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
         return total, self._added(slope, end_slope), self._held(self._band(bend, end_bend), given)
 
-    def _held(self, matrix: BandMatrix, given: Given) -> BandMatrix:
+    def _held(self, matrix: BandMatrix, given: Inputs) -> BandMatrix:
         """Hold the first node of cables that turn about their own axis at no cost.
 
         Straight at rest, such a cable has the null vector (1, 0, 0) at every node. A stiffness
@@ -216,31 +216,31 @@ class Assembly:
         diagonal[straight, 0, 0, 0] += matrix.scale[straight]
         return replace(matrix, diagonal=diagonal)
 
-    def imbalance(self, shapes: Shapes, given: Given) -> Vector:
+    def imbalance(self, shapes: Shapes, given: Inputs) -> Vector:
         """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""
-        (slope,) = self._call_slots("slot_slope", shapes, given)
+        (slope,) = self._call_segments("segment_slope", shapes, given)
         _, end_slope, _ = self._call_ends("at_ends", shapes, given)
         return self._added(slope, end_slope)
 
     def _band(self, bend: FloatArray, ends: FloatArray) -> BandMatrix:
         m, b, k, n = len(bend), self.b, self.k, self.n
-        size = max(self._slots + 1, n)
+        size = max(self._segments + 1, n)
         diagonal = np.zeros((m, size, b, b))
-        diagonal[:, : self._slots] += bend[:, :, :b, :b]
-        diagonal[:, 1 : self._slots + 1] += bend[:, :, b : 2 * b, b : 2 * b]
+        diagonal[:, : self._segments] += bend[:, :, :b, :b]
+        diagonal[:, 1 : self._segments + 1] += bend[:, :, b : 2 * b, b : 2 * b]
         diagonal = diagonal[:, :n]
         diagonal[:, 0] += ends[:, :b, :b]
         diagonal[:, -1] += ends[:, b : 2 * b, b : 2 * b]
         border = np.zeros((m, size, b, k))
-        border[:, : self._slots] += bend[:, :, :b, 2 * b :]
-        border[:, 1 : self._slots + 1] += bend[:, :, b : 2 * b, 2 * b :]
+        border[:, : self._segments] += bend[:, :, :b, 2 * b :]
+        border[:, 1 : self._segments + 1] += bend[:, :, b : 2 * b, 2 * b :]
         border = border[:, :n]
         border[:, 0] += ends[:, :b, 2 * b :]
         border[:, -1] += ends[:, b : 2 * b, 2 * b :]
         corner = bend[:, :, 2 * b :, 2 * b :].sum(axis=1) + ends[:, 2 * b :, 2 * b :]
         return BandMatrix(diagonal, bend[:, : n - 1, :b, b : 2 * b].copy(), border, corner)
 
-    def energy(self, shapes: Shapes, given: Given) -> FloatArray:
+    def energy(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers."""
         total, slope, _ = self.balance(shapes, given)
         return total - self.work(shapes, slope)
@@ -250,15 +250,15 @@ class Assembly:
         own = shapes.lam * slope.y[:, :, 0] * self.model.are_multipliers
         return np.asarray(own.sum(axis=1))
 
-    def imbalance_by(self, shapes: Shapes, given: Given, along: Directions) -> Vector:
+    def imbalance_by(self, shapes: Shapes, given: Inputs, along: Tangents) -> Vector:
         """Change of the gradient at fixed nodes and multipliers, along p, rest and deviation."""
-        (slots,) = self._call_slots("slot_sensitivity", shapes, given)
+        (segments,) = self._call_segments("segment_sensitivity", shapes, given)
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
         n_p = along.p.shape[1]
-        moved = slots[..., :n_p] @ along.p[:, None]
+        moved = segments[..., :n_p] @ along.p[:, None]
         n_r = n_p + self.n_inside
-        moved += slots[..., n_p:n_r] @ self.chain.rest_inside(along.rest)
-        moved += slots[..., n_r:] @ along.deviation[:, None]
+        moved += segments[..., n_p:n_r] @ self.chain.rest_inside(along.rest)
+        moved += segments[..., n_r:] @ along.deviation[:, None]
         at_ends = ends[..., :n_p] @ along.p + ends[..., n_p:] @ along.deviation
         return self._added(moved, at_ends)
 
@@ -272,19 +272,19 @@ class Assembly:
         mean = (rates[:, 1:] + rates[:, :-1]) / 2
         return places, np.concatenate([rates[:, :1], mean, rates[:, -1:]], axis=1)
 
-    def nodes(self, shapes: Shapes, given: Given) -> FloatArray:
+    def nodes(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """True places (m, n + 1, dimension) [m] of the element boundaries."""
-        (advance,) = self._call_slots("slot_curve", shapes, given)
+        (advance,) = self._call_segments("segment_curve", shapes, given)
         return self._stations(advance[..., 0], given.poses[:, : self.node.dimension])[0]
 
-    def curve(self, shapes: Shapes, given: Given) -> FloatArray:
+    def curve(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Measured places, and slopes dr/ds of smooth elements, (m, n + 1, d or 2 d)."""
-        (advance,) = self._call_slots("slot_curve", shapes, given)
+        (advance,) = self._call_segments("segment_curve", shapes, given)
         (rows,) = self._call_stations("station", advance[..., 0], shapes, given)
         return rows[..., 0]
 
     def _call_stations(
-        self, name: str, advance: FloatArray, shapes: Shapes, given: Given
+        self, name: str, advance: FloatArray, shapes: Shapes, given: Inputs
     ) -> list[FloatArray]:
         m, count = len(shapes.x), self.chain.n + 1
         places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
@@ -294,23 +294,23 @@ class Assembly:
         )
         return self._mapped(name, count)(places, rates, x, p, ends)
 
-    def curve_slopes(self, shapes: Shapes, given: Given) -> CurveSlopes:
+    def curve_slopes(self, shapes: Shapes, given: Inputs) -> CurveSlopes:
         """`curve` and what its derivatives are made of."""
-        advance, by_moving, by_others = self._call_slots("slot_curve_slopes", shapes, given)
+        advance, by_moving, by_others = self._call_segments("segment_curve_slopes", shapes, given)
         rows, by_station, by_p = self._call_stations(
             "station_slopes", advance[..., 0], shapes, given
         )
         return CurveSlopes(self, rows[..., 0], by_moving, by_others, by_station, by_p)
 
-    def reactions(self, shapes: Shapes, given: Given) -> FloatArray:
+    def reactions(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Forces and moments (m, n_reactions) of the cable on its fixtures, `ends.REACTIONS`."""
         return self._call_ends("reactions", shapes, given)[0][..., 0]
 
-    def readings(self, shapes: Shapes, given: Given) -> FloatArray:
+    def readings(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """`reactions` as sensors show them."""
         return self._call_ends("readings", shapes, given)[0][..., 0]
 
-    def readings_along(self, shapes: Shapes, given: Given, along: Directions) -> FloatArray:
+    def readings_along(self, shapes: Shapes, given: Inputs, along: Tangents) -> FloatArray:
         """Change (m, n_reactions, q) of `readings` along directions."""
         by_ends, by_p, by_deviation = self._call_ends("reading_slopes", shapes, given)
         moved = np.concatenate([along.x[:, 0], along.x[:, -1], along.lam], axis=1)
@@ -318,9 +318,9 @@ class Assembly:
 
     # ---- state and strain ------------------------------------------------------------------------
 
-    def strain(self, shapes: Shapes, given: Given) -> FloatArray:
+    def strain(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Mean strains (m, n_rests) [1/m] of the cells, one strain after the other."""
-        (rows,) = self._call_slots("slot_strain", shapes, given)
+        (rows,) = self._call_segments("segment_strain", shapes, given)
         return self._stacked(rows[..., 0][:, self.chain.layout.bends])
 
     @staticmethod
@@ -330,14 +330,14 @@ class Assembly:
         m, n_cells, strains, *columns = cells.shape
         return by_strain.reshape((m, n_cells * strains, *columns))
 
-    def state_after(self, shapes: Shapes, given: Given) -> tuple[FloatArray, ...]:
+    def state_after(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, ...]:
         """Rest strains (m, n_rests) that poses leave; their slopes by both nodes, rest and p.
 
         The slopes are (m, n_rests, 2b), (m, n_rests, strains) by the cell's own rest strains, and
         (m, n_rests, n_parameters).
         """
         bends = self.chain.layout.bends
-        after, *slopes = self._call_slots("slot_state", shapes, given)
+        after, *slopes = self._call_segments("segment_state", shapes, given)
         stacked = [self._stacked(part[:, bends]) for part in slopes]
         return (self._stacked(after[..., 0][:, bends]), *stacked)
 
@@ -367,7 +367,7 @@ def assembly_of(model: CableModel) -> Assembly:
 
 @dataclass(frozen=True)
 class CurveSlopes:
-    """Measured curves `z` (m, n + 1, d or 2 d) and their derivatives, slot by slot."""
+    """Measured curves `z` (m, n + 1, d or 2 d) and their derivatives, segment by segment."""
 
     assembly: Assembly
     z: FloatArray
@@ -376,11 +376,11 @@ class CurveSlopes:
     by_station: FloatArray
     by_p: FloatArray
 
-    def along(self, directions: Directions) -> FloatArray:
+    def along(self, directions: Tangents) -> FloatArray:
         """Change (m, n + 1, d or 2 d, q) of the measured curves."""
         a, d = self.assembly, directions
         n_p, b = d.p.shape[1], a.b
-        nodes = np.concatenate([d.x[:, : a._slots], d.x[:, a._next]], axis=2)
+        nodes = np.concatenate([d.x[:, : a._segments], d.x[:, a._next]], axis=2)
         steps = self.by_moving[..., : 2 * b] @ nodes
         steps += self.by_moving[..., 2 * b :] @ d.lam[:, None]
         steps += self.by_others[..., :n_p] @ d.p[:, None]

@@ -36,7 +36,7 @@ COARSE_MESH = 10
 # Roll of the end clamp about the cable against what is declared [rad]: rest twist, see design.
 END_ROLL = "end_roll"
 # Numbers that tell where the camera of a pose stood, see `Pose.vector`.
-SIGHT_SIZE = 3
+VIEWPOINT_SIZE = 3
 
 
 def _stiffness(name: str, nominal: float) -> Parameter:
@@ -61,7 +61,7 @@ class CableModel:
     gravity : (dimension,) [m/s^2]
         In the board frame; three numbers for a cable in space.
     effects : tuple of Effect
-        In the order in which those of one slot are applied.
+        In the order in which those of one segment are applied.
     n_rest : int
         Number of spline coefficients of the rest curvature; 0 = straight at rest.
     priors : dict
@@ -117,7 +117,7 @@ class CableModel:
     @property
     def n_pose(self) -> int:
         """Numbers that declare one pose, see `pose.Pose.vector`."""
-        return EndConditions.size(self.node) + SIGHT_SIZE
+        return EndConditions.size(self.node) + VIEWPOINT_SIZE
 
     @property
     def deviation_names(self) -> tuple[str, ...]:
@@ -211,7 +211,7 @@ class CableModel:
 
     @property
     def n_inner(self) -> int:
-        """Number of unknowns inside a slot beside its nodes: axial strain, and the element's."""
+        """Number of unknowns inside a segment beside its nodes: axial strain, and the element's."""
         return int(self.extensible) + self.chain.kind.n_inner
 
     @property

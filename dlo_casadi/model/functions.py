@@ -1,4 +1,4 @@
-"""What a slot, an end or a node adds, as one CasADi function each.
+"""What a segment, an end or a node adds, as one CasADi function each.
 
 Every stage differentiates the same expressions, see `lagrangian`; the functions are mapped over the
 cable, see `assembly`.
@@ -13,14 +13,14 @@ import numpy as np
 
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.lagrangian import MODELS, SlotNumbers, lagrangian_of
-from dlo_casadi.rod.element import Slot
+from dlo_casadi.model.lagrangian import MODELS, SegmentNumbers, lagrangian_of
+from dlo_casadi.rod.element import Segment
 from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.rod.in_frame import SlotDerivatives, SlotInFrame
+from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
 
 
 class Functions:
-    """CasADi functions of one slot, of the ends and of one station of a model.
+    """CasADi functions of one segment, of the ends and of one station of a model.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class Functions:
         self.model, self.terms = model, lagrangian_of(model)
 
     @property
-    def _slot_arguments(self) -> list[ca.SX]:
+    def _segment_arguments(self) -> list[ca.SX]:
         x, _ = self.terms.nodes
         return [
             x,
@@ -64,8 +64,8 @@ class Functions:
         return ca.Function(name, arguments, [ca.densify(one) for one in found])
 
     @property
-    def _by_slot(self) -> ca.SX:
-        """What the Lagrangian of a slot is differentiated by: local increments, multipliers."""
+    def _by_segment(self) -> ca.SX:
+        """What the Lagrangian of a segment is differentiated by: local increments, multipliers."""
         return ca.vertcat(self.terms.local[1], self.terms.lam)
 
     @property
@@ -79,37 +79,37 @@ class Functions:
         return ca.diagcat(self.terms.local_slope, ca.SX.eye(self.model.n_border))
 
     @cached_property
-    def slot(self) -> ca.Function:
+    def segment(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
         if self.model.in_space:
             found, spread = self._about_nodes, self._of_pulls
             outputs = [found.value, spread @ found.gradient, spread @ found.hessian @ spread.T]
-            return self._here("slot", self._slot_arguments, outputs)
-        value = self.terms.slot_terms.lagrangian
-        hessian, gradient = ca.hessian(value, self._by_slot)
-        return self._here("slot", self._slot_arguments, [value, gradient, hessian])
+            return self._here("segment", self._segment_arguments, outputs)
+        value = self.terms.segment_terms.lagrangian
+        hessian, gradient = ca.hessian(value, self._by_segment)
+        return self._here("segment", self._segment_arguments, [value, gradient, hessian])
 
     @cached_property
-    def slot_slope(self) -> ca.Function:
-        """As `slot` -> its gradient alone, for a small part of the operations."""
+    def segment_slope(self) -> ca.Function:
+        """As `segment` -> its gradient alone, for a small part of the operations."""
         if self.model.in_space:
             gradient = self._of_pulls @ self._about_nodes.gradient
         else:
-            gradient = ca.gradient(self.terms.slot_terms.lagrangian, self._by_slot)
-        return self._here("slot_slope", self._slot_arguments, [gradient])
+            gradient = ca.gradient(self.terms.segment_terms.lagrangian, self._by_segment)
+        return self._here("segment_slope", self._segment_arguments, [gradient])
 
     @cached_property
-    def slot_by_share(self) -> ca.Function:
+    def segment_by_share(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation, shares) -> L_e and advance: see `shares`."""
-        terms = self.terms.slot_terms_by_share
-        arguments = [*self._slot_arguments, self.terms.share_symbols]
-        return self._here("slot_by_share", arguments, [terms.lagrangian, terms.advance])
+        terms = self.terms.segment_terms_by_share
+        arguments = [*self._segment_arguments, self.terms.share_symbols]
+        return self._here("segment_by_share", arguments, [terms.lagrangian, terms.advance])
 
     @cached_property
-    def slot_potential(self) -> ca.Function:
+    def segment_potential(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation, inner) -> energy [J] to minimise, and conditions.
 
-        The slot's share (n_border,) of the conditions on places is the slope by the multipliers.
+        The segment's share (n_border,) of the conditions on places is the slope by the multipliers.
         The unknowns inside are, for an extensible cable, a_e with the axial strain sqrt(C) a_e and
         the energy h a_e^2 / 2, and the element's own.
         """
@@ -119,31 +119,33 @@ class Functions:
             axial = unknowns[0]
             ratio = ratio + ca.sqrt(self.terms.axial_compliance) * axial
         inner = ca.SX.sym("inner", kind.n_inner)
-        slot = self.terms.slot(ratio, inner, inner**2)
-        energy = kind.expanded(slot, self.terms.slot_energy(slot), self.terms.elastic_energy)
+        segment = self.terms.segment(ratio, inner, inner**2)
+        energy = kind.expanded(
+            segment, self.terms.segment_energy(segment), self.terms.elastic_energy
+        )
         energy += self.model.chain.h * axial**2 / 2
         own = ca.reshape(unknowns[self.model.n_inner - kind.n_inner :], inner.shape)
-        reached = ca.gradient(self.terms.work_of_multipliers(slot), self.terms.lam)
+        reached = ca.gradient(self.terms.work_of_multipliers(segment), self.terms.lam)
         outputs = ca.substitute([energy, reached], [inner], [own])
-        arguments = [*self._slot_arguments, unknowns]
-        return self._here("slot_potential", arguments, self.terms.with_shares(outputs))
+        arguments = [*self._segment_arguments, unknowns]
+        return self._here("segment_potential", arguments, self.terms.with_shares(outputs))
 
     @cached_property
-    def _framed(self) -> SlotInFrame:
-        """The slot in space, at this model's own symbols."""
+    def _framed(self) -> SegmentInFrame:
+        """The segment in space, at this model's own symbols."""
         starts = [] if self.model.end == "free" else [0]
         starts += [self.model.n_conditions + 6 * k + 3 for k in range(self.model.n_springs)]
         pulls = [self.terms.lam[k : k + 3] for k in starts]
         if self.model.end == "free":
             pulls = [ca.SX.zeros(3), *pulls]
         shares = ca.SX(self.terms.shares(self.terms.p, self.terms.place))
-        numbers = SlotNumbers(
+        numbers = SegmentNumbers(
             self.terms.p, self.terms.rest_strains, self.terms.place, self.terms.deviation, shares
         )
         return self.terms.in_frame(self.terms.nodes[0], ca.horzcat(*pulls), numbers)
 
     @cached_property
-    def _about_nodes(self) -> SlotDerivatives:
+    def _about_nodes(self) -> SegmentDerivatives:
         """Derivatives by rotations about the nodes' own axes."""
         framed = self._framed
         return framed.derivatives().about(*framed.node_turns)
@@ -167,23 +169,25 @@ class Functions:
 
     @cached_property
     def at_ends(self) -> ca.Function:
-        """(x, lam, p, pose, deviation) of the first and last node -> as `slot`."""
+        """(x, lam, p, pose, deviation) of the first and last node -> as `segment`."""
         hessian, gradient = ca.hessian(self.terms.ends_lagrangian, self._by_ends)
         return self._here(
             "at_ends", self._end_arguments, [self.terms.ends_lagrangian, gradient, hessian]
         )
 
     @cached_property
-    def slot_sensitivity(self) -> ca.Function:
-        """As `slot` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
+    def segment_sensitivity(self) -> ca.Function:
+        """As `segment` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
         by = ca.vertcat(self.terms.p, self.terms.rest_strains, self.terms.deviation)
         if self.model.in_space:
             first, last, pulled = self._framed.by_numbers(by)
             turns = self._framed.node_turns
             mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
         else:
-            mixed = ca.jacobian(ca.gradient(self.terms.slot_terms.lagrangian, self._by_slot), by)
-        return self._here("slot_sensitivity", self._slot_arguments, [mixed], often=False)
+            mixed = ca.jacobian(
+                ca.gradient(self.terms.segment_terms.lagrangian, self._by_segment), by
+            )
+        return self._here("segment_sensitivity", self._segment_arguments, [mixed], often=False)
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
@@ -194,39 +198,39 @@ class Functions:
 
     @cached_property
     def _advanced(self) -> ca.SX:
-        """True advance of a slot and its `_rates`."""
-        return ca.vertcat(self.terms.slot_terms.advance, self._rates)
+        """True advance of a segment and its `_rates`."""
+        return ca.vertcat(self.terms.segment_terms.advance, self._rates)
 
     @cached_property
     def _rates(self) -> ca.SX:
-        """Length ratio of a slot and, in a plane, its turning d phi / ds [1/m]."""
+        """Length ratio of a segment and, in a plane, its turning d phi / ds [1/m]."""
         if self.model.in_space:  # no map of the measurement depends on the frame there
-            return self.terms.slot_terms.ratio
+            return self.terms.segment_terms.ratio
         turning = self.terms.stretch * self.model.chain.kind.strain(self._plain)
-        return ca.vertcat(self.terms.slot_terms.ratio, turning)
+        return ca.vertcat(self.terms.segment_terms.ratio, turning)
 
     @cached_property
-    def slot_curve(self) -> ca.Function:
-        """As `slot` -> advance [m], length ratio and, in a plane, turning [1/m]."""
-        return self._here("slot_curve", self._slot_arguments, [self._advanced])
+    def segment_curve(self) -> ca.Function:
+        """As `segment` -> advance [m], length ratio and, in a plane, turning [1/m]."""
+        return self._here("segment_curve", self._segment_arguments, [self._advanced])
 
     @cached_property
-    def slot_curve_slopes(self) -> ca.Function:
-        """As `slot` -> the same, derivatives by increments and lam, and by p, rest, deviation."""
+    def segment_curve_slopes(self) -> ca.Function:
+        """As `segment` -> the same, derivatives by increments, lam, and by p, rest, deviation."""
         others = ca.vertcat(self.terms.p, self.terms.rest_strains, self.terms.deviation)
         if self.model.in_space:
             # The advance is the Lagrangian's derivative by the force on the end's holder.
             found, spread = self._about_nodes, self._of_pulls
             by_nodes = (spread @ found.hessian)[:, 6:9].T
             advance = [by_nodes, self._framed.by_numbers(others)[2][:3, :]]
-            stretched = self.terms.slot_terms.ratio
-            by_nodes = ca.jacobian(stretched, self._by_slot) @ self._to_local
+            stretched = self.terms.segment_terms.ratio
+            by_nodes = ca.jacobian(stretched, self._by_segment) @ self._to_local
             ratio = [by_nodes, ca.jacobian(stretched, others)]
             blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
         else:
-            blocks = [ca.jacobian(self._advanced, by) for by in (self._by_slot, others)]
+            blocks = [ca.jacobian(self._advanced, by) for by in (self._by_segment, others)]
         outputs = [self._advanced, *blocks]
-        return self._here("slot_curve_slopes", self._slot_arguments, outputs, often=False)
+        return self._here("segment_curve_slopes", self._segment_arguments, outputs, often=False)
 
     @cached_property
     def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
@@ -250,7 +254,7 @@ class Functions:
         image = point
         maps = self.terms.effects_of(MeasurementEffect)
         for effect, local in maps:
-            image = effect.observe(image, frame, self.terms.sight, local)
+            image = effect.observe(image, frame, self.terms.viewpoint, local)
         rows = image
         if kind.smooth:
             slope = ca.jtimes(image, point, slope) if maps else slope
@@ -275,22 +279,22 @@ class Functions:
         return self._here("station_slopes", arguments, [rows, *blocks])
 
     @cached_property
-    def slot_strain(self) -> ca.Function:
-        """As `slot` -> mean strains of the cell [1/m]."""
+    def segment_strain(self) -> ca.Function:
+        """As `segment` -> mean strains of the cell [1/m]."""
         return self._here(
-            "strain", self._slot_arguments, [self.model.chain.kind.strain(self._plain)]
+            "strain", self._segment_arguments, [self.model.chain.kind.strain(self._plain)]
         )
 
     @property
-    def _plain(self) -> Slot:
-        """The slot without its inner unknowns."""
-        return self.terms.slot(
+    def _plain(self) -> Segment:
+        """The segment without its inner unknowns."""
+        return self.terms.segment(
             self.terms.stretch, ca.SX.zeros(self.model.chain.kind.n_inner), ca.SX(0)
         )
 
     @cached_property
-    def slot_state(self) -> ca.Function:
-        """As `slot` -> rest strains of the cell after it; by increments, rest and p."""
+    def segment_state(self) -> ca.Function:
+        """As `segment` -> rest strains of the cell after it; by increments, rest and p."""
         own = self.terms.rest_strains[::3]
         strain, mean = self.model.chain.kind.strain(self._plain), own
         for effect, local in self.terms.effects_of(StateEffect):
@@ -302,7 +306,7 @@ class Functions:
         ]
         slopes[0] = slopes[0] @ self.terms.local_slope
         mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
-        return self._here("slot_state", self._slot_arguments, [mean, *slopes])
+        return self._here("segment_state", self._segment_arguments, [mean, *slopes])
 
     @cached_property
     def _reactions(self) -> ca.SX:

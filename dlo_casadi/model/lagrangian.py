@@ -1,4 +1,4 @@
-"""The Lagrangian of a slot, of the ends, and what they are written in.
+"""The Lagrangian of a segment, of the ends, and what they are written in.
 
     L(x, lam) = sum_e L_e(x_e, x_(e+1), lam) + L_ends(x_0, x_N, lam)
 
@@ -22,19 +22,19 @@ from dlo_casadi.effects import (
     Load,
     PointForceAt,
     SectionLaw,
-    Sight,
     SpringAt,
+    Viewpoint,
 )
 from dlo_casadi.model.cable_model import (
     BENDING_STIFFNESS,
     END_ROLL,
-    SIGHT_SIZE,
     TORSIONAL_STIFFNESS,
+    VIEWPOINT_SIZE,
     CableModel,
 )
-from dlo_casadi.rod.element import Cell, Section, Slot
+from dlo_casadi.rod.element import Cell, Section, Segment
 from dlo_casadi.rod.ends import EndConditions
-from dlo_casadi.rod.in_frame import Forces, SlotInFrame
+from dlo_casadi.rod.in_frame import Forces, SegmentInFrame
 
 # Models whose expressions and functions are kept: a diagnosis compares some thirty at a time.
 MODELS = 64
@@ -59,8 +59,8 @@ class _Law:
 
 
 @dataclass(frozen=True)
-class _SlotTerms:
-    """Expressions of one slot: its Lagrangian and its share of the stretched, bowed curve."""
+class _SegmentTerms:
+    """Expressions of one segment: its Lagrangian and its share of the stretched, bowed curve."""
 
     lagrangian: ca.SX
     advance: ca.SX
@@ -68,8 +68,8 @@ class _SlotTerms:
 
 
 @dataclass(frozen=True)
-class SlotNumbers:
-    """What a slot depends on beside its nodes and multipliers."""
+class SegmentNumbers:
+    """What a segment depends on beside its nodes and multipliers."""
 
     p: ca.SX
     rest: ca.SX
@@ -90,7 +90,7 @@ class Lagrangian:
         self.model = model
 
     def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
-        """Effects of one slot of the model with their own parameters."""
+        """Effects of one segment of the model with their own parameters."""
         picked = []
         for effect in self.model.effects:
             if isinstance(effect, base):
@@ -120,13 +120,13 @@ class Lagrangian:
     @property
     def declared_ends(self) -> ca.SX:
         """The ends as declared, see `EndConditions.vector`."""
-        return self.pose[:-SIGHT_SIZE]
+        return self.pose[:-VIEWPOINT_SIZE]
 
     @property
-    def sight(self) -> Sight:
+    def viewpoint(self) -> Viewpoint:
         """From where the points of a pose are measured."""
         start = EndConditions.of(self.declared_ends, self.model.node).start
-        return Sight(start, self.pose[-3:-1], self.pose[-1])
+        return Viewpoint(start, self.pose[-3:-1], self.pose[-1])
 
     @cached_property
     def deviation(self) -> ca.SX:
@@ -140,20 +140,20 @@ class Lagrangian:
 
     @cached_property
     def nodes(self) -> tuple[ca.SX, ca.SX]:
-        """Coordinates of the two nodes of a slot, and their increments."""
+        """Coordinates of the two nodes of a segment, and their increments."""
         node = self.model.chain.kind.node
         return ca.SX.sym("x", 2 * node.coordinates), ca.SX.sym("delta", 2 * node.increment)
 
     @cached_property
     def local(self) -> tuple[ca.SX, ca.SX]:
-        """Local coordinates of a slot, and their increments: see `Element.local`."""
+        """Local coordinates of a segment, and their increments: see `Element.local`."""
         return ca.SX.sym("local", self.local_of_nodes.numel()), ca.SX.sym(
             "step", 2 * self.model.node.increment
         )
 
     @property
     def local_of_nodes(self) -> ca.SX:
-        """Local coordinates of a slot, of its nodes."""
+        """Local coordinates of a segment, of its nodes."""
         return self.model.chain.kind.local(
             *ca.vertsplit(self.nodes[0], self.model.node.coordinates)
         )
@@ -173,13 +173,13 @@ class Lagrangian:
 
     @cached_property
     def rest_strains(self) -> ca.SX:
-        """Rest strains inside a slot, see `Chain.rest_stencils`."""
+        """Rest strains inside a segment, see `Chain.rest_stencils`."""
         return ca.SX.sym("rest", 3 * len(self.model.node.strains))
 
     @cached_property
     def place(self) -> ca.SX:
-        """A row of `Layout.slots`."""
-        return ca.SX.sym("place", self.model.chain.layout.slots.shape[1])
+        """A row of `Layout.segments`."""
+        return ca.SX.sym("place", self.model.chain.layout.segments.shape[1])
 
     def spring_unknowns(self, k: int) -> tuple[ca.SX, ca.SX]:
         """Place and pull of a spring."""
@@ -268,16 +268,16 @@ class Lagrangian:
         """Sum of all dead loads [N]."""
         return sum((force.force for force in self.dead_forces), start=self.resultant(0.0))
 
-    def slot(self, ratio: ca.SX, inner: ca.SX, square: ca.SX) -> Slot:
-        """The slot's symbols; numbers that all slots share are written in."""
-        kind, table = self.model.chain.kind, self.model.chain.layout.slots
+    def segment(self, ratio: ca.SX, inner: ca.SX, square: ca.SX) -> Segment:
+        """The segment's symbols; numbers that all segments share are written in."""
+        kind, table = self.model.chain.kind, self.model.chain.layout.segments
         place = ca.vertcat(
             *(
                 ca.SX(column[0]) if np.all(column == column[0]) else self.place[i]
                 for i, column in enumerate(table.T)
             )
         )
-        return Slot(
+        return Segment(
             local=kind.local_moved(*self.local),
             rest=self.rest_strains,
             place=place,
@@ -288,9 +288,9 @@ class Lagrangian:
             square=square,
         )
 
-    def elastic_energy(self, slot: Slot) -> ca.SX:
-        """Energy of bending and twist of a slot [J]."""
-        return self.model.chain.kind.elastic(slot, self.section)
+    def elastic_energy(self, segment: Segment) -> ca.SX:
+        """Energy of bending and twist of a segment [J]."""
+        return self.model.chain.kind.elastic(segment, self.section)
 
     @property
     def section(self) -> Section:
@@ -315,36 +315,36 @@ class Lagrangian:
         energy = self.section.density(strain, cell)
         return ca.Function("section_moment", [bend, self.p], [ca.gradient(energy, bend)])
 
-    def slot_energy(self, slot: Slot) -> ca.SX:
-        """Energy of bending and loads of one slot [J]: of the loads, minus their work along it."""
-        return self.elastic_energy(slot) - self.work_along(slot, self.forces_on(slot))
+    def segment_energy(self, segment: Segment) -> ca.SX:
+        """Energy of bending and loads of one segment [J]: of loads, minus their work along it."""
+        return self.elastic_energy(segment) - self.work_along(segment, self.forces_on(segment))
 
-    def work_along(self, slot: Slot, forces: list[ca.SX]) -> ca.SX:
-        """Work of `_slot_forces` along a slot [J]."""
+    def work_along(self, segment: Segment, forces: list[ca.SX]) -> ca.SX:
+        """Work of `_segment_forces` along a segment [J]."""
         kind = self.model.chain.kind
         nodes, weights = kind.rule
         shares = ca.vertsplit(self.share_symbols)
         work = ca.SX(0)
         for force, u, weight in zip(forces, nodes, weights, strict=False):
-            work += weight * slot.length * ca.dot(force, kind.tangent(slot, u))
+            work += weight * segment.length * ca.dot(force, kind.tangent(segment, u))
         for force, share in zip(forces[len(nodes) :], shares, strict=False):
-            work += ca.dot(force, kind.advance(slot, share))
+            work += ca.dot(force, kind.advance(segment, share))
         return work
 
-    def forces_on(self, slot: Slot) -> list[ca.SX]:
-        """Dead forces [N] that a slot carries: at the points of its rule, then those on places."""
+    def forces_on(self, segment: Segment) -> list[ca.SX]:
+        """Dead forces [N] on a segment: at the points of its rule, then those on single places."""
         nodes, _ = self.model.chain.kind.rule
-        spread = [self.resultant(slot.start + u * slot.length) for u in nodes]
+        spread = [self.resultant(segment.start + u * segment.length) for u in nodes]
         return [*spread, *(force.force for force in self.dead_forces)]
 
     @cached_property
     def share_symbols(self) -> ca.SX:
-        """Shares of a slot up to the places of the forces, then of the springs, 0 to 1."""
+        """Shares of a segment up to the places of the forces, then of the springs, 0 to 1."""
         return ca.SX.sym("share", len(self.dead_forces) + self.model.n_springs)
 
     @cached_property
     def shares(self) -> ca.Function:
-        """(p, place) -> the shares of a slot (n_forces + n_springs,)."""
+        """(p, place) -> the shares of a segment (n_forces + n_springs,)."""
         start = self.place[0]
         positions = [local.position for local in self.dead_forces]
         positions += [local.position for local in self.springs]
@@ -355,30 +355,30 @@ class Lagrangian:
         """Expressions with the shares in place of their symbols."""
         return ca.substitute(expressions, [self.share_symbols], [self.shares(self.p, self.place)])
 
-    def work_of_multipliers(self, slot: Slot) -> ca.SX:
-        """Work of the multipliers of places, the end's and the springs', along a slot [J]."""
+    def work_of_multipliers(self, segment: Segment) -> ca.SX:
+        """Work of the multipliers of places, the end's and the springs', along a segment [J]."""
         kind = self.model.chain.kind
         work = ca.SX(0)
         if self.model.end != "free":
-            work = ca.dot(self.lam[: self.model.node.dimension], kind.advance(slot))
+            work = ca.dot(self.lam[: self.model.node.dimension], kind.advance(segment))
         shares = (
             ca.vertsplit(self.share_symbols)[len(self.dead_forces) :]
             if self.model.n_springs
             else []
         )
         for k, share in enumerate(shares):
-            work += ca.dot(self.spring_unknowns(k)[1], kind.advance(slot, share))
+            work += ca.dot(self.spring_unknowns(k)[1], kind.advance(segment, share))
         return work
 
     @cached_property
-    def slot_terms(self) -> _SlotTerms:
-        """A slot's Lagrangian and curve."""
-        terms = self.slot_terms_by_share
-        return _SlotTerms(*self.with_shares([terms.lagrangian, terms.advance, terms.ratio]))
+    def segment_terms(self) -> _SegmentTerms:
+        """A segment's Lagrangian and curve."""
+        terms = self.segment_terms_by_share
+        return _SegmentTerms(*self.with_shares([terms.lagrangian, terms.advance, terms.ratio]))
 
     @cached_property
-    def slot_terms_by_share(self) -> _SlotTerms:
-        """A slot's Lagrangian, and its curve, stretched by the tension and bowed.
+    def segment_terms_by_share(self) -> _SegmentTerms:
+        """A segment's Lagrangian, and its curve, stretched by the tension and bowed.
 
             L_e = V_e + lam^T advance_e - h C N_e^2 / 2,   N_e = -(1/h) dL_e/d(ratio)
 
@@ -386,13 +386,13 @@ class Lagrangian:
         """
         kind, h = self.model.chain.kind, self.model.chain.h
         ratio, inner = ca.SX.sym("ratio"), ca.SX.sym("inner", kind.n_inner)
-        slot = self.slot(ratio, inner, inner**2)
-        plain = self.slot_energy(slot) + self.work_of_multipliers(slot)
+        segment = self.segment(ratio, inner, inner**2)
+        plain = self.segment_energy(segment) + self.work_of_multipliers(segment)
 
         def rigid(expression: ca.SX) -> ca.SX:
             return ca.substitute(expression, ratio, self.stretch)
 
-        condensed = kind.condensed(slot, rigid(plain), self.elastic_energy)
+        condensed = kind.condensed(segment, rigid(plain), self.elastic_energy)
         lagrangian, stretched = condensed.lagrangian, self.stretch
         if self.model.extensible:
             (tension,) = ca.substitute(
@@ -402,12 +402,12 @@ class Lagrangian:
             )
             lagrangian -= self.axial_compliance * h * tension**2 / 2
             stretched = self.stretch + self.axial_compliance * tension
-        true = self.slot(stretched, condensed.inner, condensed.square)
+        true = self.segment(stretched, condensed.inner, condensed.square)
         # The curve whose end the Lagrangian's derivative by the multipliers holds.
-        return _SlotTerms(lagrangian, kind.advance(true), stretched)
+        return _SegmentTerms(lagrangian, kind.advance(true), stretched)
 
-    def in_frame(self, x: ca.SX, pulls: ca.SX, numbers: SlotNumbers) -> SlotInFrame:
-        """A slot in space, written in the frame in its middle.
+    def in_frame(self, x: ca.SX, pulls: ca.SX, numbers: SegmentNumbers) -> SegmentInFrame:
+        """A segment in space, written in the frame in its middle.
 
         Parameters
         ----------
@@ -415,51 +415,51 @@ class Lagrangian:
             Frames of both nodes.
         pulls : (3, 1 + n_springs) [N]
             Force on the end's holder, then the springs' pulls.
-        numbers : SlotNumbers
+        numbers : SegmentNumbers
         """
         spread, dead = len(self.model.chain.kind.rule[0]), len(self.dead_forces)
         weights = np.zeros((spread + dead + self.model.n_springs, pulls.shape[1]))
         weights[:spread, 0] = -1.0
         weights[spread + dead :, 1:] = -np.eye(self.model.n_springs)
-        loads = self.slot_forces(numbers.p, numbers.place, numbers.deviation)
+        loads = self.segment_forces(numbers.p, numbers.place, numbers.deviation)
         own = numbers.p, numbers.rest, numbers.place, numbers.deviation, numbers.shares
 
         def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
             local = ca.vertcat(ca.DM(self.model.node.identity), phi)
-            return ca.SX(self.slot_in_frame(local, inner, forces, *own))
+            return ca.SX(self.segment_in_frame(local, inner, forces, *own))
 
         total = ca.SX(loads) + pulls @ ca.DM(weights.T)
-        return SlotInFrame(self.model.chain.kind, energy, x, Forces(total, weights))
+        return SegmentInFrame(self.model.chain.kind, energy, x, Forces(total, weights))
 
     @cached_property
-    def slot_forces(self) -> ca.Function:
-        """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `slot_in_frame`."""
-        forces = self.forces_on(self.slot(self.stretch, self.inner, ca.SX(0)))
+    def segment_forces(self) -> ca.Function:
+        """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `segment_in_frame`."""
+        forces = self.forces_on(self.segment(self.stretch, self.inner, ca.SX(0)))
         forces += [ca.SX.zeros(self.model.node.dimension)] * self.model.n_springs
         arguments = [self.p, self.place, self.deviation]
-        return ca.Function("slot_forces", arguments, [ca.horzcat(*forces)])
+        return ca.Function("segment_forces", arguments, [ca.horzcat(*forces)])
 
     @cached_property
-    def slot_in_frame(self) -> ca.Function:
-        """(local, inner, forces, p, rest, place, deviation, shares) -> energy [J] of a slot.
+    def segment_in_frame(self) -> ca.Function:
+        """(local, inner, forces, p, rest, place, deviation, shares) -> energy [J] of a segment.
 
-        Its minimum over the inner unknowns is that of `slot_by_share`. Forces are arguments, so
-        that a slot and the forces on it may be turned together: the energy stays. The multipliers
-        of the end's place and of the springs' are such forces, too, see `in_frame`.
+        Its minimum over the inner unknowns is that of `segment_by_share`. Forces are arguments, so
+        that a segment and the forces on it may be turned together: the energy stays. Multipliers of
+        the end's place and of the springs' are such forces, too, see `in_frame`.
         """
         kind, h = self.model.chain.kind, self.model.chain.h
         ratio, inner = ca.SX.sym("ratio"), self.inner
-        slot = self.slot(ratio, inner, inner**2)
-        count = len(self.forces_on(slot)) + self.model.n_springs
+        segment = self.segment(ratio, inner, inner**2)
+        count = len(self.forces_on(segment)) + self.model.n_springs
         forces = ca.SX.sym("force", self.model.node.dimension, count)
-        energy = self.elastic_energy(slot) - self.work_along(slot, ca.horzsplit(forces))
+        energy = self.elastic_energy(segment) - self.work_along(segment, ca.horzsplit(forces))
         tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
-        lagrangian = kind.expanded(slot, energy, self.elastic_energy)
+        lagrangian = kind.expanded(segment, energy, self.elastic_energy)
         lagrangian -= self.axial_compliance * h * tension**2 / 2
         local, step = self.local
         own = [self.p, self.rest_strains, self.place, self.deviation, self.share_symbols]
         found = ca.substitute([lagrangian], [ratio, step], [self.stretch, ca.SX.zeros(step.shape)])
-        return ca.Function("slot_in_frame", [local, inner, forces, *own], found)
+        return ca.Function("segment_in_frame", [local, inner, forces, *own], found)
 
     @cached_property
     def inner(self) -> ca.SX:

@@ -1,4 +1,4 @@
-"""One pose as a whole, as CasADi expressions for IPOPT: the same functions of slots, added up."""
+"""One pose as a whole, as CasADi expressions for IPOPT: the functions of segments, added up."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ class Potential:
 def potential(model: CableModel) -> Potential:
     """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
 
-    The coordinates are the nodes', the places of springs, the unknowns inside the slots, then
+    The coordinates are the nodes', the places of springs, the unknowns inside the segments, then
     those of clamps that give way: a clamp of the compliance c turns by sqrt(c) a and stores a^2/2.
     """
     s, chain = PoseSymbols.of(model), model.chain
-    inner = ca.SX.sym("inner", model.n_inner, chain.n_slots)
+    inner = ca.SX.sym("inner", model.n_inner, chain.n_segments)
     energy, gradient, _ = functions_of(model).at_ends(*_end_arguments(model, s))
     conditions = gradient[2 * chain.kind.node.increment :]
-    for j, arguments in enumerate(_slot_arguments(model, s)):
-        own, reached = functions_of(model).slot_potential(*arguments, inner[:, j])
+    for j, arguments in enumerate(_segment_arguments(model, s)):
+        own, reached = functions_of(model).segment_potential(*arguments, inner[:, j])
         energy, conditions = energy + own, conditions + reached
     multipliers = np.flatnonzero(model.are_multipliers).tolist()
     places = np.flatnonzero(~model.are_multipliers).tolist()
@@ -88,13 +88,13 @@ def potential(model: CableModel) -> Potential:
 
 def balance(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Gradient of the Lagrangian by increments and multipliers: force balance, then conditions."""
-    node, slots = model.chain.kind.node, model.chain.n_slots
+    node, segments = model.chain.kind.node, model.chain.n_segments
     b, n = node.increment, model.chain.n_nodes
-    rows = [ca.SX.zeros(b) for _ in range(max(n, slots + 1))]
+    rows = [ca.SX.zeros(b) for _ in range(max(n, segments + 1))]
     _, ends, _ = functions_of(model).at_ends(*_end_arguments(model, s))
     border = ends[2 * b :]
-    for j, arguments in enumerate(_slot_arguments(model, s)):
-        _, gradient, _ = functions_of(model).slot(*arguments)
+    for j, arguments in enumerate(_segment_arguments(model, s)):
+        _, gradient, _ = functions_of(model).segment(*arguments)
         rows[j] += gradient[:b]
         rows[j + 1] += gradient[b : 2 * b]
         border += gradient[2 * b :]
@@ -107,8 +107,8 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Measured curve ((n + 1) d or 2 d,): place, and slope of smooth elements, node by node."""
     chain, layout = model.chain, model.chain.layout
     c, d = chain.kind.node.coordinates, chain.kind.node.dimension
-    arguments = _slot_arguments(model, s)
-    steps = [functions_of(model).slot_curve(*arguments[j]) for j in layout.advancing]
+    arguments = _segment_arguments(model, s)
+    steps = [functions_of(model).segment_curve(*arguments[j]) for j in layout.advancing]
     rates = [step[d:] for step in steps]
     rates = [
         rates[0],
@@ -131,9 +131,9 @@ def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
 
 def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Rest curvature (n_rests,) [1/m] that the pose leaves behind."""
-    arguments = _slot_arguments(model, s)
+    arguments = _segment_arguments(model, s)
     rests: list[Any] = [
-        functions_of(model).slot_state(*arguments[j])[0].T for j in model.chain.layout.bends
+        functions_of(model).segment_state(*arguments[j])[0].T for j in model.chain.layout.bends
     ]
     return ca.vec(ca.vertcat(*rests))
 
@@ -144,15 +144,15 @@ def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
     return [both, s.lam, s.p, s.pose, s.deviation]
 
 
-def _slot_arguments(model: CableModel, s: PoseSymbols) -> list[list[ca.SX]]:
+def _segment_arguments(model: CableModel, s: PoseSymbols) -> list[list[ca.SX]]:
     chain = model.chain
     c, last = chain.kind.node.coordinates, chain.n_nodes - 1
     cells, weights = chain.rest_stencils
     rows: list[list[Any]] = []
-    for j in range(chain.n_slots):
+    for j in range(chain.n_segments):
         k = min(j + 1, last)
         both = ca.vertcat(s.x[j * c : (j + 1) * c], s.x[k * c : (k + 1) * c])
         axes = ca.vertsplit(s.rest, chain.n_cells)
         own = ca.vertcat(*(ca.DM(weights[j]) @ axis[cells[j].tolist()] for axis in axes))
-        rows.append([both, s.lam, s.p, own, ca.DM(chain.layout.slots[j]), s.deviation])
+        rows.append([both, s.lam, s.p, own, ca.DM(chain.layout.segments[j]), s.deviation])
     return rows

@@ -123,7 +123,7 @@ def final_rest(fit: Fit) -> FloatArray:
     """Rest curvature (n_rests,) [1/m] that the session's last pose leaves behind."""
     if not fit.model.has_state:
         return fit.rest
-    return fit.problem.sweep.rest_after_last(fit.point.shapes, fit.p, fit.rest)
+    return fit.problem.equilibria.rest_after_last(fit.point.shapes, fit.p, fit.rest)
 
 
 def _by_name(values: FloatArray, names: Sequence[str]) -> Any:

@@ -108,10 +108,10 @@ class Room:
         for name, axis in zip("xyz", size * self.upright.T, strict=True):
             marks.append(Mark("world", np.stack([corner, corner + axis])))
             marks.append(Mark("letter", (corner + 1.5 * axis)[None], name))
-        foot = np.array([reach, reach, self.floor])
+        projection = np.array([reach, reach, self.floor])
         rise = np.array([0.0, 0.0, size])
-        top = foot + 2.5 * rise
-        marks.append(Mark("weight", arrow(top, foot - top)))
+        top = projection + 2.5 * rise
+        marks.append(Mark("weight", arrow(top, projection - top)))
         marks.append(Mark("letter", (top + 0.5 * rise)[None], "g"))
         return marks
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.rod.element import Element, Layout, Slot
+from dlo_casadi.rod.element import Element, Layout, Segment
 from dlo_casadi.rod.node import Heading
 
 
@@ -35,21 +35,21 @@ class Arc(Element):
         """Nodes at the element boundaries."""
         nodes = np.linspace(0.0, length, n + 1)
         width = np.full(n, length / n)
-        slots = np.column_stack([nodes[:-1], width, nodes[:-1], width, np.ones(n)])
-        return Layout(nodes, slots, np.stack([np.arange(n + 1)] * 2, axis=1))
+        segments = np.column_stack([nodes[:-1], width, nodes[:-1], width, np.ones(n)])
+        return Layout(nodes, segments, np.stack([np.arange(n + 1)] * 2, axis=1))
 
-    def strain(self, slot: Slot) -> ca.SX:
+    def strain(self, segment: Segment) -> ca.SX:
         """Turning over true length."""
-        return (slot.last - slot.first) * (1 / (slot.length * slot.stretch))
+        return (segment.last - segment.first) * (1 / (segment.length * segment.stretch))
 
-    def heading(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+    def heading(self, segment: Segment, u: ca.SX | float) -> ca.SX:
         """Heading [rad] at the fraction u."""
         x = u - 0.5
-        linear, quadratic = slot.rest[1], slot.rest[2]
+        linear, quadratic = segment.rest[1], segment.rest[2]
         own = linear * (x * x - 0.25) / 2 + quadratic * x * (x * x - 0.25) / 3
-        turn = slot.length * slot.stretch * own
-        return slot.first + u * (slot.last - slot.first) + turn
+        turn = segment.length * segment.stretch * own
+        return segment.first + u * (segment.last - segment.first) + turn
 
-    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+    def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
         """(cos phi, sin phi) of the heading."""
-        return slot.ratio * Heading.tangent(self.heading(slot, u))
+        return segment.ratio * Heading.tangent(self.heading(segment, u))

@@ -72,7 +72,7 @@ class Chain:
 
     @cached_property
     def layout(self) -> Layout:
-        """Nodes, slots and stations."""
+        """Nodes, segments and stations."""
         return self.kind.layout(self.length, self.n, (self.start_clamped, self.end_clamped))
 
     @property
@@ -81,9 +81,9 @@ class Chain:
         return len(self.layout.nodes)
 
     @property
-    def n_slots(self) -> int:
-        """Number of slots: the nodes, or one less."""
-        return len(self.layout.slots)
+    def n_segments(self) -> int:
+        """Number of segments: the nodes, or one less."""
+        return len(self.layout.segments)
 
     @property
     def places(self) -> FloatArray:
@@ -107,7 +107,7 @@ class Chain:
 
     @cached_property
     def rest_stencils(self) -> tuple[NDArray[np.intp], FloatArray]:
-        """Cells (n_slots, 3) that tell the rest curvature inside a slot, and how (n_slots, 3, 3).
+        """Cells (n_segments, 3) that tell the rest curvature inside, and how (n_segments, 3, 3).
 
         From the means m over a cell and its neighbours, for x from -1/2 to 1/2,
 
@@ -115,11 +115,11 @@ class Chain:
             a = (m_(e+1) - m_(e-1)) / 2,   c = (m_(e+1) - 2 m_e + m_(e-1)) / 2
 
         which is exact for parabolas on equal cells. The first and last cell continue their
-        neighbour's. Weights are zero where a slot has no cell.
+        neighbour's. Weights are zero where a segment has no cell.
         """
         count = self.n_cells
-        cells = np.zeros((self.n_slots, 3), dtype=np.intp)
-        weights = np.zeros((self.n_slots, 3, 3))
+        cells = np.zeros((self.n_segments, 3), dtype=np.intp)
+        weights = np.zeros((self.n_segments, 3, 3))
         for e, j in enumerate(self.layout.bends):
             if count < 3:
                 cells[j] = [e, 0, count - 1]
@@ -135,7 +135,7 @@ class Chain:
         return cells, weights
 
     def rest_inside(self, means: FloatArray) -> FloatArray:
-        """Rest strains inside the slots (..., n_slots, 3 strains, q) of means (..., n_rests, q)."""
+        """Rest strains inside (..., n_segments, 3 strains, q) of means (..., n_rests, q)."""
         cells, weights = self.rest_stencils
         by_strain = [weights @ part[..., cells, :] for part in self.by_strain(means)]
         return np.concatenate(by_strain, axis=-2)

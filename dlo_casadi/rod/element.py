@@ -1,8 +1,7 @@
-"""The contract of an element: what a slot of the chain, between two nodes, adds to the Lagrangian.
+"""The contract of an element: what a segment between two nodes adds to the Lagrangian.
 
-A chain of N nodes has S slots, N - 1 or N; slot j joins the nodes j and j + 1. Everything that
-the rod's energy and its shape are made of is a sum over slots, so that derivatives couple
-neighbouring nodes only.
+A chain of N nodes has S segments, N - 1 or N; segment j joins the nodes j and j + 1. The rod's
+energy and its shape are sums over segments, so that derivatives couple neighbouring nodes only.
 """
 
 from __future__ import annotations
@@ -107,43 +106,43 @@ class Section:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the nodes and slots of a chain are.
+    """Where the nodes and segments of a chain are.
 
     Parameters
     ----------
     nodes : (N,) [m]
         Arc lengths of the nodes.
-    slots : (S, 5) [m, m, m, m, 1]
-        Of each slot: start and length of the cable that it advances along, start and width of
+    segments : (S, 5) [m, m, m, m, 1]
+        Of each segment: start and length of the cable that it advances along, start and width of
         its bending cell, and whether it has one (1 or 0).
     stations : (n + 1, 2) int
         Nodes whose mean direction is the cable's at each element boundary.
     """
 
     nodes: FloatArray
-    slots: FloatArray
+    segments: FloatArray
     stations: NDArray[np.intp]
 
     @cached_property
     def bends(self) -> NDArray[np.intp]:
-        """Slots that have a bending cell, in order."""
-        return np.flatnonzero(self.slots[:, 4])
+        """Segments that have a bending cell, in order."""
+        return np.flatnonzero(self.segments[:, 4])
 
     @cached_property
     def cells(self) -> FloatArray:
         """Bending cells (n_cells, 2) [m]."""
-        low, width = self.slots[self.bends, 2:4].T
+        low, width = self.segments[self.bends, 2:4].T
         return np.stack([low, low + width], axis=1)
 
     @cached_property
     def advancing(self) -> NDArray[np.intp]:
-        """Slots whose ends are element boundaries, in order (n,)."""
-        return np.flatnonzero(self.slots[:, 1])
+        """Segments whose ends are element boundaries, in order (n,)."""
+        return np.flatnonzero(self.segments[:, 1])
 
 
 @dataclass(frozen=True)
-class Slot:
-    """Symbols of one slot.
+class Segment:
+    """Symbols of one segment.
 
     Parameters
     ----------
@@ -152,13 +151,13 @@ class Slot:
     rest : (3 strains,) [1/m]
         Rest strains of the cell: mean, and linear and quadratic variation inside, of each.
     place : (5,)
-        A row of `Layout.slots`.
+        A row of `Layout.segments`.
     mesh : float [m]
         Declared length of an element.
     stretch : scalar
         True length over declared length, the same everywhere.
     ratio : scalar
-        Of this slot, stretching under tension included.
+        Of this segment, stretching under tension included.
     inner : (n_inner,)
         Unknowns inside the element.
     square : scalar
@@ -248,7 +247,7 @@ class Element(ABC):
 
     @abstractmethod
     def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
-        """Nodes and slots of a cable of n elements; `clamped`: its start, its end."""
+        """Nodes and segments of a cable of n elements; `clamped`: its start, its end."""
 
     def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
         """Local coordinates (n_local,) of two nodes: what the element is written in.
@@ -266,38 +265,41 @@ class Element(ABC):
         return other - local
 
     @abstractmethod
-    def strain(self, slot: Slot) -> ca.SX:
+    def strain(self, segment: Segment) -> ca.SX:
         """Mean strains of the cell [1/m], see `Node.strains`; 0 without one."""
 
     @abstractmethod
-    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+    def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
         """Derivative of position by s (dimension,) [1] at the fraction u of the element."""
 
-    def advance(self, slot: Slot, u: ca.SX | float = 1.0) -> ca.SX:
+    def advance(self, segment: Segment, u: ca.SX | float = 1.0) -> ca.SX:
         """Vector (dimension,) [m] from the start of the element to the fraction u of it."""
         parts = [
-            weight * self.tangent(slot, u * node) for node, weight in zip(*self.rule, strict=True)
+            weight * self.tangent(segment, u * node)
+            for node, weight in zip(*self.rule, strict=True)
         ]
-        return slot.length * u * sum(parts[1:], start=parts[0])
+        return segment.length * u * sum(parts[1:], start=parts[0])
 
-    def elastic(self, slot: Slot, section: Section) -> ca.SX:
+    def elastic(self, segment: Segment, section: Section) -> ca.SX:
         """Elastic energy [J] of the cell: the mean over the points of `bends`."""
-        bends = self.bends(slot)
-        cells = [slot.cell] if len(bends) == 1 else list(slot.cell.halves)
+        bends = self.bends(segment)
+        cells = [segment.cell] if len(bends) == 1 else list(segment.cell.halves)
         densities = [section.density(k, cell) for k, cell in zip(bends, cells, strict=True)]
         mean = sum(densities[1:], start=densities[0]) / len(densities)
-        return slot.has_cell * slot.cell.width * mean * slot.stretch
+        return segment.has_cell * segment.cell.width * mean * segment.stretch
 
-    def bends(self, slot: Slot) -> list[ca.SX]:
+    def bends(self, segment: Segment) -> list[ca.SX]:
         """Strains minus those at rest [1/m]: of the cell, or at two Gauss points, one a half."""
-        return [self.strain(slot) - slot.rest[::3]]
+        return [self.strain(segment) - segment.rest[::3]]
 
     def condensed(
-        self, slot: Slot, lagrangian: ca.SX, elastic: Callable[[Slot], ca.SX]
+        self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> Condensed:
-        """Eliminate the inner unknowns from the slot's Lagrangian, which is given with them."""
-        return Condensed(lagrangian, slot.inner, slot.square)
+        """Eliminate the inner unknowns from the segment's Lagrangian, which is given with them."""
+        return Condensed(lagrangian, segment.inner, segment.square)
 
-    def expanded(self, slot: Slot, energy: ca.SX, elastic: Callable[[Slot], ca.SX]) -> ca.SX:
+    def expanded(
+        self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
+    ) -> ca.SX:
         """Energy that is minimised over the inner unknowns; the same minimum as `condensed`."""
         return energy

@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.rod.arc import Arc
-from dlo_casadi.rod.element import Condensed, Element, Layout, Slot
+from dlo_casadi.rod.element import Condensed, Element, Layout, Segment
 from dlo_casadi.rod.node import SINE, Frame, conjugate, quaternion_product, rotated, series
 
 # Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
@@ -71,13 +71,13 @@ class Helix(Element):
         """Turn of the frame, difference of the rotation vectors."""
         return ca.vertcat(Frame.gap(local[:4], other[:4]), other[4:] - local[4:])
 
-    def strain(self, slot: Slot) -> ca.SX:
+    def strain(self, segment: Segment) -> ca.SX:
         """Mean twist, and mean curvatures about the axes y and z."""
-        return slot.local[4:] / (slot.length * slot.stretch)
+        return segment.local[4:] / (segment.length * segment.stretch)
 
-    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+    def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
         """The x axis of the frame at the fraction u."""
-        return slot.ratio * rotated(slot.local[:4], _turned(slot.local[4:], u - 0.5))
+        return segment.ratio * rotated(segment.local[:4], _turned(segment.local[4:], u - 0.5))
 
 
 def _turned(phi: ca.SX, x: ca.SX | float) -> ca.SX:
@@ -108,45 +108,47 @@ class BowedHelix(Helix):
     order = 4
     n_inner = 3
 
-    def bends(self, slot: Slot) -> list[ca.SX]:
+    def bends(self, segment: Segment) -> list[ca.SX]:
         """At the two Gauss points."""
-        phi, beta = slot.local[4:], slot.inner
+        phi, beta = segment.local[4:], segment.inner
         mean = phi + 2 / 3 * ca.cross(phi, beta)
-        width = slot.length * slot.stretch
-        rest, slope = slot.rest[::3], slot.rest[1::3]
+        width = segment.length * segment.stretch
+        rest, slope = segment.rest[::3], segment.rest[1::3]
         return [(mean - 8 * x * beta) / width - rest - x * slope for x in (-_GAUSS, _GAUSS)]
 
-    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+    def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
         """The helix's, turned by the bow to first order."""
-        middle, phi = slot.local[:4], slot.local[4:]
+        middle, phi = segment.local[:4], segment.local[4:]
         x = u - 0.5
-        turn = (1 - 4 * x * x) * (slot.inner - x / 3 * ca.cross(phi, slot.inner))
+        turn = (1 - 4 * x * x) * (segment.inner - x / 3 * ca.cross(phi, segment.inner))
         across = ca.vertcat(0, turn[2], -turn[1])
         bowed = across + x * ca.cross(phi, across)
-        return rotated(middle, slot.ratio * _turned(phi, x) + slot.stretch * bowed)
+        return rotated(middle, segment.ratio * _turned(phi, x) + segment.stretch * bowed)
 
     def condensed(
-        self, slot: Slot, lagrangian: ca.SX, elastic: Callable[[Slot], ca.SX]
+        self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> Condensed:
         """Minimum over the bow, resisted by the section alone."""
-        torque, given, own = self._of_bow(slot, lagrangian, elastic)
+        torque, given, own = self._of_bow(segment, lagrangian, elastic)
         bow = -ca.mtimes(inverse_of(own), torque)
-        return Condensed(given + ca.dot(torque, bow) / 2, bow, slot.square)
+        return Condensed(given + ca.dot(torque, bow) / 2, bow, segment.square)
 
-    def expanded(self, slot: Slot, energy: ca.SX, elastic: Callable[[Slot], ca.SX]) -> ca.SX:
+    def expanded(
+        self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
+    ) -> ca.SX:
         """To second order in the bow, as in `condensed`."""
-        torque, given, own = self._of_bow(slot, energy, elastic)
-        bow = slot.inner
+        torque, given, own = self._of_bow(segment, energy, elastic)
+        bow = segment.inner
         return given + ca.dot(torque, bow) + ca.dot(bow, ca.mtimes(own, bow)) / 2
 
     @staticmethod
     def _of_bow(
-        slot: Slot, energy: ca.SX, elastic: Callable[[Slot], ca.SX]
+        segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Slope of an energy by the bow at 0, its value, and the section's own stiffness."""
-        own, _ = ca.hessian(elastic(slot), slot.inner)
-        whole = [ca.gradient(energy, slot.inner), energy, own]
-        torque, given, own = ca.substitute(whole, [slot.inner], [ca.SX.zeros(3)])
+        own, _ = ca.hessian(elastic(segment), segment.inner)
+        whole = [ca.gradient(energy, segment.inner), energy, own]
+        torque, given, own = ca.substitute(whole, [segment.inner], [ca.SX.zeros(3)])
         return torque, given, own
 
 

@@ -1,10 +1,10 @@
-"""A slot between two frames, differentiated in stages: fewer operations than in one go.
+"""A segment between two frames, differentiated in stages: fewer operations than in one go.
 
-The Lagrangian of a slot is the same however the slot and the forces on it are turned together. So
-it is written in the frame R in its middle, by the rotation vector phi from node to node and the
-forces c = R^T F; CasADi differentiates it there by phi, the inner unknowns and c, the inner
-unknowns are eliminated, and the chain rule to the nodes is in closed form. With increments alpha,
-beta of both nodes about the axes of R,
+The Lagrangian of a segment stays the same when the segment and the forces on it are turned
+together. So it is written in the frame R in its middle, by the rotation vector phi from node to
+node and the forces c = R^T F; CasADi differentiates it there by phi, the inner unknowns and c, the
+inner unknowns are eliminated, and the chain rule to the nodes is in closed form. With increments
+alpha, beta of both nodes about the axes of R,
 
     sigma = (alpha + beta) / 2,   epsilon = beta - alpha,
     R -> R exp(mu),               phi -> phi + psi,
@@ -34,7 +34,7 @@ from dlo_casadi.rod.node import conjugate, quaternion_product
 
 FloatArray = NDArray[np.floating]
 
-# Energy [J] of a slot of the rotation vector phi (3,), inner unknowns and forces (3, m).
+# Energy [J] of a segment of the rotation vector phi (3,), inner unknowns and forces (3, m).
 Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
 # Keeps a quotient of two squares of an angle at a straight element finite.
@@ -43,15 +43,15 @@ _TINY = 1e-30
 
 @dataclass(frozen=True)
 class Forces:
-    """Forces on a slot (3, m) [N] in world axes, of `weights` (m, q) times q multipliers (3,)."""
+    """Forces (3, m) [N] on a segment in world axes: `weights` (m, q) times q multipliers (3,)."""
 
     total: ca.SX
     weights: FloatArray
 
 
 @dataclass(frozen=True)
-class SlotDerivatives:
-    """A slot's Lagrangian and its derivatives by rotations of its nodes and by multipliers.
+class SegmentDerivatives:
+    """A segment's Lagrangian and its derivatives by rotations of its nodes and by multipliers.
 
     Rotations are about the axes of the middle frame, or what `about` has made of them;
     multipliers are in world axes, q vectors one after the other.
@@ -81,10 +81,10 @@ class SlotDerivatives:
     mixed: tuple[ca.SX, ca.SX]
     lam_lam: ca.SX
 
-    def about(self, first: ca.SX, last: ca.SX) -> SlotDerivatives:
+    def about(self, first: ca.SX, last: ca.SX) -> SegmentDerivatives:
         """The same by rotations about other axes: matrices (3, 3) that lead to them."""
         (g, h), (aa, ab, bb), (al, bl) = self.slopes, self.bends, self.mixed
-        return SlotDerivatives(
+        return SegmentDerivatives(
             self.value,
             self.turn,
             self.phi,
@@ -109,15 +109,15 @@ class SlotDerivatives:
         )
 
 
-class SlotInFrame:
-    """A slot, written in the frame in its middle.
+class SegmentInFrame:
+    """A segment, written in the frame in its middle.
 
     Parameters
     ----------
     kind : Element
         A helix.
     energy : callable
-        Whose minimum over the inner unknowns is the slot's Lagrangian.
+        Whose minimum over the inner unknowns is the segment's Lagrangian.
     x : (8,)
         Frames of both nodes.
     forces : Forces
@@ -141,7 +141,7 @@ class SlotInFrame:
         self._there = [self._moved.phi, -self._inverse @ torque, self._body]
 
     def _at(self, expressions: list[ca.SX]) -> list[ca.SX]:
-        """At the slot's own rotation vector and forces, the inner unknowns at their minimum."""
+        """At the segment's own rotation vector and forces, the inner unknowns at their minimum."""
         return list(ca.substitute(expressions, self._symbols, self._there))
 
     @property
@@ -149,7 +149,7 @@ class SlotInFrame:
         """Matrices from the axes of the middle frame to those of the first and the last node."""
         return self._moved.node_turns
 
-    def derivatives(self) -> SlotDerivatives:
+    def derivatives(self) -> SegmentDerivatives:
         """Value, gradient and Hessian, by rotations about the axes of the middle frame."""
         phi, inner, c = self._symbols
         both = ca.vertcat(phi, inner)
@@ -199,7 +199,7 @@ class SlotInFrame:
         s_lam = mu_lam @ to_world.T
         e_lam = (lam_phi @ k + mu_lam.T @ lever).T @ to_world.T
         mean, skew = mu_mu / 4 + ee, (se + se.T) / 2
-        return SlotDerivatives(
+        return SegmentDerivatives(
             value,
             turn,
             self._moved.phi,
@@ -248,7 +248,7 @@ class SlotInFrame:
 
 @dataclass(frozen=True)
 class _Kinematics:
-    """What moves with the nodes of a slot, and how.
+    """What moves with the nodes of a segment, and how.
 
     `phi` (3,) [rad]; `turn` (3, 3): R; `node_turns`: from it to the nodes' axes; `z` (3,);
     `stretch` (3, 3): K; `along`: 1 / |phi|^2; `second`: a, b, of the second order of psi, see

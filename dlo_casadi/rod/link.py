@@ -5,14 +5,14 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.rod.element import Element, Layout, Slot
+from dlo_casadi.rod.element import Element, Layout, Segment
 from dlo_casadi.rod.node import Heading
 
 
 class Link(Element):
     """Straight links; nodes are in their middles, a clamp is a node of its own.
 
-    Slot j is link j and the hinge at its end, which stands for the cell between the middles of
+    Segment j is link j and the hinge at its end, which stands for the cell between the middles of
     links j and j + 1. A clamp bends the half cell between itself and the middle of a link.
     """
 
@@ -44,10 +44,14 @@ class Link(Element):
         has_cell[-1] = 0.0
         return Layout(nodes, np.column_stack([links, low, width, has_cell]), stations)
 
-    def strain(self, slot: Slot) -> ca.SX:
+    def strain(self, segment: Segment) -> ca.SX:
         """Bend of the hinge over the width of its cell."""
-        return slot.has_cell * (slot.last - slot.first) * (1 / (slot.cell.width * slot.stretch))
+        return (
+            segment.has_cell
+            * (segment.last - segment.first)
+            * (1 / (segment.cell.width * segment.stretch))
+        )
 
-    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+    def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
         """The link's direction."""
-        return slot.ratio * Heading.tangent(slot.first)
+        return segment.ratio * Heading.tangent(segment.first)

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.rod.arc import Arc
-from dlo_casadi.rod.element import Condensed, Section, Slot
+from dlo_casadi.rod.element import Condensed, Section, Segment
 from dlo_casadi.rod.node import Heading
 
 
@@ -23,45 +23,49 @@ class Quadratic(Arc):
     order = 4
     n_inner = 1
 
-    def tangent(self, slot: Slot, u: ca.SX | float) -> ca.SX:
+    def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
         """The arc's, turned by the bow to second order."""
-        c, s = ca.vertsplit(Heading.tangent(self.heading(slot, u)))
+        c, s = ca.vertsplit(Heading.tangent(self.heading(segment, u)))
         form = 4 * u * (1 - u)
-        across, back = form * slot.inner, form**2 * slot.square / 2
+        across, back = form * segment.inner, form**2 * segment.square / 2
         bowed = ca.vertcat(-across * s - back * c, across * c - back * s)
-        return slot.ratio * ca.vertcat(c, s) + slot.stretch * bowed
+        return segment.ratio * ca.vertcat(c, s) + segment.stretch * bowed
 
-    def elastic(self, slot: Slot, section: Section) -> ca.SX:
+    def elastic(self, segment: Segment, section: Section) -> ca.SX:
         """Energy of the bend at two Gauss points, one a half, to second order in the bow."""
-        (bend,), q = self.bends(slot), ca.SX.sym("q")
+        (bend,), q = self.bends(segment), ca.SX.sym("q")
         moment = bend * ca.substitute(ca.gradient(section.of_bend(q) * q, q), q, bend**2)
-        first, second = (section.along(half) for half in slot.cell.halves)
+        first, second = (section.along(half) for half in segment.cell.halves)
         # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
-        bowed = 4 / np.sqrt(3) * slot.inner * (1 / (slot.length * slot.stretch))
+        bowed = 4 / np.sqrt(3) * segment.inner * (1 / (segment.length * segment.stretch))
         mean = section.of_bend(bend**2) * bend**2 + section.tangent(bend**2) * bowed**2
         # Where the halves resist differently, a mean bend bows the cell.
         density = (first + second) / 2 * mean + (first - second) * moment * bowed
-        return slot.cell.width * section.bending / 2 * density * slot.stretch
+        return segment.cell.width * section.bending / 2 * density * segment.stretch
 
     def condensed(
-        self, slot: Slot, lagrangian: ca.SX, elastic: Callable[[Slot], ca.SX]
+        self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> Condensed:
         """Second-order minimum over the bow, its stiffness kept positive under compression."""
-        torque = ca.gradient(lagrangian, slot.inner)
-        own = ca.jacobian(ca.gradient(elastic(slot), slot.inner), slot.inner)
-        whole = [lagrangian, torque, ca.jacobian(torque, slot.inner), own]
-        given, torque, stiffness, own = ca.substitute(whole, [slot.inner], [ca.SX(0)])
+        torque = ca.gradient(lagrangian, segment.inner)
+        own = ca.jacobian(ca.gradient(elastic(segment), segment.inner), segment.inner)
+        whole = [lagrangian, torque, ca.jacobian(torque, segment.inner), own]
+        given, torque, stiffness, own = ca.substitute(whole, [segment.inner], [ca.SX(0)])
         factor, slope = _stiffening(stiffness / own - 1)
         bow = -torque / (own * factor)
         return Condensed(given + torque * bow / 2, bow, bow**2 * slope)
 
-    def expanded(self, slot: Slot, energy: ca.SX, elastic: Callable[[Slot], ca.SX]) -> ca.SX:
+    def expanded(
+        self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
+    ) -> ca.SX:
         """To second order in the bow, as in `condensed`."""
-        torque = ca.gradient(energy, slot.inner)
-        stiffness = ca.jacobian(torque, slot.inner)
+        torque = ca.gradient(energy, segment.inner)
+        stiffness = ca.jacobian(torque, segment.inner)
         zero = ca.SX(0)
-        given, torque, stiffness = ca.substitute([energy, torque, stiffness], [slot.inner], [zero])
-        return given + torque * slot.inner + stiffness * slot.inner**2 / 2
+        given, torque, stiffness = ca.substitute(
+            [energy, torque, stiffness], [segment.inner], [zero]
+        )
+        return given + torque * segment.inner + stiffness * segment.inner**2 / 2
 
 
 def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:

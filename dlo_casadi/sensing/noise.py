@@ -118,26 +118,26 @@ class NoiseModel:
         return self.source != "estimated"
 
     def covariance(
-        self, s: FloatArray, weight: FloatArray, grain: float = 0.0, count: Count = 1.0
+        self, s: FloatArray, weight: FloatArray, correlation_length: float = 0.0, count: Count = 1.0
     ) -> FloatArray:
         """Covariance matrix (K, K) [m^2] at arc lengths s."""
-        unit = self.correlation(np.abs(s[:, None] - s[None]), grain, count)
+        unit = self.correlation(np.abs(s[:, None] - s[None]), correlation_length, count)
         return self.std**2 * unit * np.outer(weight, weight)
 
     def correlation(
-        self, distance: FloatArray, grain: float = 0.0, count: Count = 1.0
+        self, distance: FloatArray, correlation_length: float = 0.0, count: Count = 1.0
     ) -> FloatArray:
         """Covariance (K, K), over std^2, of points at distances (K, K) [m] along the cable.
 
-        Each is the mean of `count` measured ones. Over `grain` [m] they share the errors that are
-        white otherwise, by a Gaussian.
+        Each is the mean of `count` measured ones. Over `correlation_length` [m] they share the
+        errors that are white otherwise, by a Gaussian.
         """
         if self.share > 0:
             unit = self.share * correlation(self.kernel, distance / self.length)
         else:
             unit = np.zeros_like(distance)
-        if grain:
-            unit += (1 - self.share) * correlation("gaussian", distance / grain)
+        if correlation_length:
+            unit += (1 - self.share) * correlation("gaussian", distance / correlation_length)
         else:
             unit.flat[:: len(unit) + 1] += (1 - self.share) / count
         unit.flat[:: len(unit) + 1] += 1e-9
@@ -160,12 +160,12 @@ class NoiseModel:
         return NoiseModel(std, readings=grown)
 
     def whitening(
-        self, s: FloatArray, weight: FloatArray, grain: float = 0.0, count: Count = 1.0
+        self, s: FloatArray, weight: FloatArray, correlation_length: float = 0.0, count: Count = 1.0
     ) -> FloatArray:
         """Matrix W (K, K) with W cov W^T = 1."""
-        if self.share == 0 and grain == 0:
+        if self.share == 0 and correlation_length == 0:
             return np.diag(np.sqrt(count) / (self.std * weight))
-        factor = np.linalg.cholesky(self.covariance(s, weight, grain, count))
+        factor = np.linalg.cholesky(self.covariance(s, weight, correlation_length, count))
         return solve_triangular(factor, np.eye(len(s)), lower=True)
 
 
@@ -192,7 +192,7 @@ class NoiseSample:
     shared : (R, b)
         Directions along which all poses move together; projected out. Stacked over the poses
         they are independent of one another and of the poses' own directions.
-    grain : scalar [m]
+    correlation_length : scalar [m]
         Over which the points share the errors that are white otherwise.
     count : (K,) or one for all
         Measured points of which each is the mean.
@@ -203,7 +203,7 @@ class NoiseSample:
     weight: FloatArray
     own: FloatArray
     shared: FloatArray
-    grain: float = 0.0
+    correlation_length: float = 0.0
     count: Count = 1.0
 
     def thinned(self, most: int) -> NoiseSample:
@@ -221,7 +221,7 @@ class NoiseSample:
             self.weight[kept],
             basis[:, values > _DEPENDENT * values.max(initial=0.0)],
             self.shared[rows],
-            self.grain,
+            self.correlation_length,
             np.broadcast_to(self.count, len(self.places))[kept],
         )
 
@@ -256,7 +256,9 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
     logdet, count = 0.0, 0
     gram = np.zeros((samples[0].shared.shape[1] + 1,) * 2)
     for sample in samples:
-        factor = np.linalg.cholesky(unit.correlation(sample.distance, sample.grain, sample.count))
+        factor = np.linalg.cholesky(
+            unit.correlation(sample.distance, sample.correlation_length, sample.count)
+        )
         points, each, columns = sample.scaled.shape
         # LAPACK itself: of matrices this small SciPy's checks take longer than the solution.
         y = dtrtrs(factor.T, sample.scaled.reshape((points, -1)), lower=0, trans=1)[0]
@@ -306,8 +308,8 @@ def estimate_noise(
     found = [_white(samples, cable_length)]
     found += [_correlated(samples, cable_length, kernel) for kernel in KERNELS]
     best = min(found, key=lambda item: item.deviance)
-    # Where an average along the cable is declared as `grain`, the kernel does not stand for it.
-    smooth = best.noise.share > SMOOTH and not samples[0].grain
+    # An average along the cable stands in `correlation_length`, not in the kernel.
+    smooth = best.noise.share > SMOOTH and not samples[0].correlation_length
     apart = int(cable_length / best.noise.length) if smooth else max_points
     if apart < max_points and tell_of_noise([sample.thinned(apart) for sample in everything]):
         return estimate_noise(everything, cable_length, apart, max_poses)
@@ -415,7 +417,7 @@ def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float
     # Sines vanish at the fixtures, where points may lie: they determine no mode.
     count = min(SLOW_MODES, max(1, len(sample.places) - 3))
     modes = smooth_modes(sample.places, cable_length, count, free_end=False)
-    seen = noise.whitening(sample.places, sample.weight, sample.grain) @ modes
+    seen = noise.whitening(sample.places, sample.weight, sample.correlation_length) @ modes
     return -float(np.linalg.slogdet(seen.T @ seen)[1]) / count
 
 

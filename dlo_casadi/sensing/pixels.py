@@ -84,7 +84,7 @@ class Pixels(OfPoints):
         Of a pixel at the cable.
     together : (K, 6) [m]
         What a standard deviation of each error of the camera's place does to the residuals.
-    grain : scalar [m]
+    correlation_length : scalar [m]
         Length over which the average along the cable correlates the pixels' errors: what else is
         correlated, such as by light that changes along the cable, is left to the noise model.
     on_line : bool
@@ -98,7 +98,7 @@ class Pixels(OfPoints):
     weight: FloatArray
     size: float
     together: FloatArray
-    grain: float = 0.0
+    correlation_length: float = 0.0
     on_line: bool = False
 
     marked = False
@@ -168,7 +168,7 @@ class Pixels(OfPoints):
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (K, K) [1/m] with W cov W^T = 1, errors of the camera's place among them."""
-        white = noise.whitening(places, self.weight, self.grain)
+        white = noise.whitening(places, self.weight, self.correlation_length)
         seen = white @ self.together
         factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
         return np.asarray(solve_triangular(factor, white, lower=True))
@@ -223,8 +223,18 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     together = size * np.column_stack([by_turn, by_shift]) @ error
     weight = curve.std[kept] * size / std
     # Of an average with a Gaussian, whose errors are correlated over sqrt(2) of its own length.
-    grain = np.sqrt(2.0 / np.pi) * curve.correlation * size
-    return Pixels(viewpoint, pixels, curve.diameter, points, weight, size, together, grain, on_line)
+    correlation_length = np.sqrt(2.0 / np.pi) * curve.correlation * size
+    return Pixels(
+        viewpoint,
+        pixels,
+        curve.diameter,
+        points,
+        weight,
+        size,
+        together,
+        correlation_length,
+        on_line,
+    )
 
 
 def _across(view: ViewInput) -> FloatArray:

@@ -46,7 +46,7 @@ class Sensor(Protocol):
         ...
 
     @property
-    def grain(self) -> float:
+    def correlation_length(self) -> float:
         """Length [m] over which points share the errors that are white otherwise."""
         ...
 
@@ -111,7 +111,7 @@ class OfPoints(ABC):
     points: FloatArray
 
     @property
-    def grain(self) -> float:
+    def correlation_length(self) -> float:
         """None: points err by themselves."""
         return 0.0
 
@@ -200,7 +200,7 @@ class Centerline(_Points):
 
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] of the closest points, near those given."""
-        return seen.curve.feet(self.points, places)
+        return seen.curve.projections(self.points, places)
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """Components along the normals, (K (d - 1), q)."""
@@ -284,7 +284,7 @@ class Wrench:
     node: type[Node]
     per_point = 0
     marked = True
-    grain = 0.0
+    correlation_length = 0.0
     count = 1.0
 
     @property

@@ -129,13 +129,13 @@ def _from_simpler(fit: Fit, stiffness: float, better: bool) -> Fit:
     values[model.stiffness_indices] *= stiffness / values[0]
     theta = problem.unknowns.pack(values, np.zeros(model.n_coefficients))
     p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
-    shapes, known = problem.sweep.settled(fit.point.shapes, p, rest)
+    shapes, known = problem.equilibria.settled(fit.point.shapes, p, rest)
     if not known.all() and better:
         predicted = predicted_shapes(problem, fit.point.shapes, p, rest)
-        shapes, known = problem.sweep.settled(predicted, p, rest)
+        shapes, known = problem.equilibria.settled(predicted, p, rest)
     if not known.all():
         return fit
-    point = problem.evaluate(theta, shapes, fit.point.feet)
+    point = problem.evaluate(theta, shapes, fit.point.projections)
     if not better and point.objective >= fit.point.objective:
         return fit
     point, converged = problem.descend(point)

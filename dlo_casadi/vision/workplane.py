@@ -1,4 +1,4 @@
-"""A metric picture of the cable's plane, coarse enough to find the cable quickly."""
+"""A weights picture of the cable's plane, coarse enough to find the cable quickly."""
 
 from __future__ import annotations
 

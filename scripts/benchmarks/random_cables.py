@@ -26,7 +26,7 @@ from dlo_casadi.equilibrium.guesses import guesses
 from dlo_casadi.equilibrium.initial_arcs import limited
 from dlo_casadi.equilibrium.ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel, EndKind, StartKind
 
 FloatArray = NDArray[np.floating]
@@ -155,7 +155,7 @@ def _is_minimum(
     The error is in m or rad; stability is that of all eigenvalues of the whole matrix.
     """
     model = problem.model
-    given = Given.of(problem.p, problem.rest, problem.poses[i].vector[None])
+    given = Inputs.of(problem.p, problem.rest, problem.poses[i].vector[None])
     shapes = Shapes.declared(frames[None], lam[None])
     _, slope, matrix = assembly_of(model).balance(shapes, given)
     scale = float(matrix.scale[0])
@@ -306,7 +306,7 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
     """
     model, phi = problem.model, shape["x"][:, 0]
     pose = Pose((0.0, 0.0), (float(end[0]), float(end[1])))
-    given = Given.of(model.nominal, problem.rest, pose.vector[None])
+    given = Inputs.of(model.nominal, problem.rest, pose.vector[None])
     shapes = Shapes.declared(phi[None, :, None], shape["end_force"][None])
     _, slope, matrix = assembly_of(model).balance(shapes, given)
     force = slope.x[0, :, 0, 0]

@@ -99,13 +99,13 @@ def compiled(n: int, element: str) -> Method:
 
 def ipopt(n: int, element: str) -> Method:
     """IPOPT through CasADi, of the same model; points from its frames by the Python model."""
-    from dlo_casadi.model.assembly import Given, Shapes
+    from dlo_casadi.model.assembly import Inputs, Shapes
 
     own = problem(n, element, 0.0)
     solver = Ipopt(own.model)
 
     def solve(pose: Pose, fine: FloatArray) -> tuple[FloatArray, float]:
-        given = Given.of(own.model.nominal, own.rest, pose.vector[None])
+        given = Inputs.of(own.model.nominal, own.rest, pose.vector[None])
         results = []
         for found in solver.solve(own.model.nominal, own.rest, pose):
             shapes = Shapes.declared(found.frames[None], found.multipliers[None])

@@ -277,8 +277,10 @@ def write_seen(
                 picture = drawing.draw(dense, width_px=DIAMETER * drawing.SCALE)
             else:
                 picture = scene.photograph(dense, place, diameter=DIAMETER)
-            grain = np.rint(GRAIN * generator.standard_normal(picture.shape))
-            cv2.imwrite(str(folder / name), np.clip(picture + grain, 0, 255).astype(np.uint8))
+            correlation_length = np.rint(GRAIN * generator.standard_normal(picture.shape))
+            cv2.imwrite(
+                str(folder / name), np.clip(picture + correlation_length, 0, 255).astype(np.uint8)
+            )
         return
     marked = cell.measured == "markers"
     count = size.points // 3 if marked else size.points

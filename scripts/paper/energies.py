@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dlo_casadi import CableModel, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
-from dlo_casadi.model.assembly import Given, assembly_of
+from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
@@ -50,7 +50,7 @@ def chain() -> CableModel:
 
 def energy_of(model: CableModel, found: Equilibrium, rest: FloatArray, pose: Pose) -> float:
     """Energy [J] of a shape for another rest curvature."""
-    given = Given.of(model.nominal, rest, pose.vector[None])
+    given = Inputs.of(model.nominal, rest, pose.vector[None])
     return float(assembly_of(model).energy(found.shapes, given)[0])
 
 

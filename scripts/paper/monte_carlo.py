@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, DloError
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.hyperparameters import settle
@@ -116,12 +116,12 @@ def simulate(truth: Truth, rng: np.random.Generator) -> list[MeasuredPose] | Non
         np.array([eq.multipliers for eq in shapes]),
         truth.deviation,
     )
-    sweep = Sweep(model, published.poses())
-    moved, converged = sweep.solve(stacked, truth.p, rest)
+    equilibria = BatchEquilibrium(model, published.poses())
+    moved, converged = equilibria.solve(stacked, truth.p, rest)
     if not converged.all():
         return None
     measured = []
-    for pose, seen in zip(published.poses(), sweep.seen(moved, truth.p, rest), strict=True):
+    for pose, seen in zip(published.poses(), equilibria.seen(moved, truth.p, rest), strict=True):
         s = np.sort(rng.uniform(0.01, 0.99, POINTS)) * published.LENGTH
         factor = np.linalg.cholesky(truth.noise.covariance(s, np.ones(POINTS)))
         points = seen.curve.at(s) + factor @ rng.standard_normal((POINTS, 2))
@@ -138,11 +138,11 @@ def bound(fit: Fit, truth: Truth) -> tuple[float, FloatArray]:
     problem = BatchProblem(unknowns, fit.problem.history, truth.noise, TOLERANCES, truth.roughness)
     theta = unknowns.pack(truth.p, truth.coefficients)
     start = Shapes(fit.point.shapes.x, fit.point.shapes.lam, truth.deviation)
-    shapes, converged = problem.sweep.solve(start, truth.p, unknowns.rest(theta))
+    shapes, converged = problem.equilibria.solve(start, truth.p, unknowns.rest(theta))
     if not converged.all():
         raise DloError("the true parameters have no equilibria near the fitted ones")
-    problem.refresh(theta, shapes, fit.point.feet)
-    point = problem.evaluate(theta, shapes, fit.point.feet)
+    problem.refresh(theta, shapes, fit.point.projections)
+    point = problem.evaluate(theta, shapes, fit.point.projections)
     hessian = problem.normal_equations(point, problem.linearize(point)).hessian
     covariance = np.linalg.inv(hessian)
     tail = slice(unknowns.n_parameters, unknowns.size)

@@ -24,7 +24,7 @@ from dlo_casadi import CableModel, CompiledSolver, Pose
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -60,7 +60,7 @@ def simulated(poses: int) -> list[MeasuredPose]:
         if shape.status != "ok":
             continue
         shapes = Shapes.declared(shape.x[None], shape.end_force[None])
-        given = Given.of(model.nominal, rest, pose.vector[None])
+        given = Inputs.of(model.nominal, rest, pose.vector[None])
         z = assembly_of(model).curve(shapes, given)[0]
         s = np.linspace(0.01, 0.99, POINTS) * published.LENGTH
         points = NodeCurve.of(published.LENGTH, z).at(s) + STD * rng.standard_normal((POINTS, 2))

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from dlo_casadi import CableModel, CompiledSolver, Pose, solve_equilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.initial_arcs import arc_headings
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.report.canvas import BLACK, GREY, VERMILLION
 from paper import published
 from paper.content import Claim, Part, Section, Table, Target, drawing, duration, mm
@@ -114,7 +114,7 @@ def _seen(
     model: CableModel, rest: FloatArray, pose: Pose, x: FloatArray, lam: FloatArray
 ) -> NodeCurve:
     """Curve of given headings."""
-    given = Given.of(model.nominal, rest, pose.vector[None])
+    given = Inputs.of(model.nominal, rest, pose.vector[None])
     shapes = Shapes.declared(x[None], lam[None])
     return NodeCurve.of(published.LENGTH, assembly_of(model).curve(shapes, given)[0])
 

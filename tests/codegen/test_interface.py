@@ -320,7 +320,9 @@ def test_code_does_not_grow_with_the_mesh():
     for n in (10, 200):
         text = generate(*cable("arc", n=n)).files["dlo_solver.c"]
         sizes.append(text.count("\n") - text[text.index("TABLE[]") :].split("};")[0].count("\n"))
-    assert abs(sizes[1] - sizes[0]) < 40  # another loop over slots, not another kernel per slot
+    assert (
+        abs(sizes[1] - sizes[0]) < 40
+    )  # another loop over segments, not another kernel per segment
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])

@@ -10,7 +10,7 @@ from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config, read_yaml
 from dlo_casadi.effects import EFFECTS, ClampAngle
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Given, assembly_of
+from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import conditions
 
@@ -71,6 +71,6 @@ def test_session(name):
         assert np.abs(shape.points - expected.points).max() < 1e-8
         assert shape.min_bend_radius == pytest.approx(expected.min_bend_radius, rel=1e-6)
         if model.has_state:  # a drift enters with its latest state: compile anew
-            given = Given.of(p, rest, pose.vector[None])
+            given = Inputs.of(p, rest, pose.vector[None])
             rest = assembly_of(model).state_after(expected.shapes, given)[0][0]
             solver = CompiledSolver(model, p, rest)

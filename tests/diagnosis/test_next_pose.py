@@ -24,7 +24,7 @@ def separation(noise):
     measured = MeasuredPose.of_points(pose, np.zeros((POINTS, 2)))
     fit = SimpleNamespace(
         problem=SimpleNamespace(measured=(measured,), used=(0,)),
-        point=SimpleNamespace(feet=(np.linspace(0.0, LENGTH, POINTS),)),
+        point=SimpleNamespace(projections=(np.linspace(0.0, LENGTH, POINTS),)),
         noise=noise,
     )
     return _separation(fit, np.array([LENGTH, 0.1]), (lines[0], lines[1]))

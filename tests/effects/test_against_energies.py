@@ -26,7 +26,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Given, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import REACTIONS
 
@@ -461,7 +461,7 @@ def test_what_is_measured_of_a_curve(name, where):
     values, image = IMAGES[name]
     model, p, rest, known = modelled(name, where, values)
     shapes, rod = bent(model, where)
-    found = assembly_of(model).curve(shapes, Given.of(p, rest, POSES[where].vector[None]))[0]
+    found = assembly_of(model).curve(shapes, Inputs.of(p, rest, POSES[where].vector[None]))[0]
     d = model.node.dimension
     # Three Gauss points: elements turn by d = 0.5, d^6 / 2e6.
     np.testing.assert_allclose(found[:, :d], image(rod, known)[:, :d], atol=1e-7)
@@ -475,7 +475,7 @@ def test_a_sensors_bias_is_added_to_what_it_reads(where):
     values = dict(zip(names, np.linspace(-1.0, 1.0, len(names)), strict=True))
     model, p, rest, _ = modelled("sensor_bias", where, values)
     shapes, _ = bent(model, where)
-    given = Given.of(p, rest, POSES[where].vector[None])
+    given = Inputs.of(p, rest, POSES[where].vector[None])
     a = assembly_of(model)
     added = (a.readings(shapes, given) - a.reactions(shapes, given))[0]
     np.testing.assert_allclose(added, [values[name] for name in names], atol=1e-12)
@@ -500,7 +500,7 @@ def test_the_rest_shape_that_a_pose_leaves_behind(name, where):
     values, moved, tolerance = STATES[name]
     model, p, rest, known = modelled(name, where, values)
     shapes, rod = bent(model, where)
-    after = assembly_of(model).state_after(shapes, Given.of(p, rest, POSES[where].vector[None]))[0]
+    after = assembly_of(model).state_after(shapes, Inputs.of(p, rest, POSES[where].vector[None]))[0]
     expected = REST[where] + moved(rod.strains - REST[where], known)
     used = expected.T[-len(model.node.strains) :].ravel()
     np.testing.assert_allclose(after[0], used, atol=tolerance)

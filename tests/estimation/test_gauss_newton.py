@@ -18,7 +18,7 @@ from dlo_casadi.effects import (
     RestCurvatureDrift,
     StiffnessGradient,
 )
-from dlo_casadi.equilibrium.batch import Sweep
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -93,7 +93,7 @@ def solved(problem: BatchProblem, theta: np.ndarray, deviation: np.ndarray | Non
     x = np.array([shape.equilibrium.x for shape in found if shape is not None])
     lam = np.array([shape.equilibrium.multipliers for shape in found if shape is not None])
     still = np.zeros((len(x), len(deviation_names(Heading))))
-    shapes, converged = problem.sweep.solve(
+    shapes, converged = problem.equilibria.solve(
         Shapes(x, lam, still if deviation is None else deviation), p, rest
     )
     assert converged.all()
@@ -111,20 +111,20 @@ def test_poses_solved_together_are_those_solved_alone(element):
     rest = np.full(model.chain.n_cells, 0.8)
     poses = poses_at(3)
     alone = [solve_equilibrium(model, p, rest, pose) for pose in poses]
-    sweep = Sweep(model, poses)
+    equilibria = BatchEquilibrium(model, poses)
     guess = Shapes(
         np.array([eq.x for eq in alone]) + 0.02,
         np.array([eq.multipliers for eq in alone]) * 0.9,
         np.zeros((3, len(deviation_names(Heading)))),
     )
-    together, converged = sweep.solve(guess, p, rest)
+    together, converged = equilibria.solve(guess, p, rest)
     assert converged.all()
     # IPOPT's tol of 1e-11 on the balance, over a tangent stiffness of 1e-2 N m.
     np.testing.assert_allclose(together.x, [eq.x for eq in alone], atol=1e-8)
     np.testing.assert_allclose(together.lam, [eq.multipliers for eq in alone], atol=1e-7)
-    force, _ = sweep.balance(together, p, rest)
+    force, _ = equilibria.balance(together, p, rest)
     assert force.size.max() < 1e-11  # rounding of terms of order one
-    np.testing.assert_array_equal(sweep.stable(together, p, rest), True)
+    np.testing.assert_array_equal(equilibria.stable(together, p, rest), True)
 
 
 def test_a_pose_that_is_lost_leaves_the_others_alone():
@@ -139,7 +139,7 @@ def test_a_pose_that_is_lost_leaves_the_others_alone():
         np.zeros((3, len(deviation_names(Heading)))),
     )
     far = replace(near[1], end=(1.5 * CABLE.length, 0.0))
-    solved, converged = Sweep(model, [near[0], far, near[2]]).solve(guess, p, rest)
+    solved, converged = BatchEquilibrium(model, [near[0], far, near[2]]).solve(guess, p, rest)
     np.testing.assert_array_equal(converged, [True, False, True])
     np.testing.assert_array_equal(solved.x[1], guess.x[1])
     for j in (0, 2):
@@ -152,19 +152,19 @@ def test_a_drift_is_carried_in_order():
     p, rest = np.array([0.06, 0.3]), np.full(8, 0.8)
     poses = poses_at(3)
     shapes = predict_poses(model, p, rest, poses)
-    sweep = Sweep(model, poses)
+    equilibria = BatchEquilibrium(model, poses)
     stacked = Shapes(
         np.array([shape.equilibrium.x for shape in shapes]),
         np.array([shape.equilibrium.multipliers for shape in shapes]),
         np.zeros((3, len(deviation_names(Heading)))),
     )
-    rests = sweep.rests(stacked, p, rest)
+    rests = equilibria.rests(stacked, p, rest)
     np.testing.assert_array_equal(rests[0], rest)
     for j in (1, 2):
         curvature = shapes[j - 1].equilibrium.curvature
         by_hand = rests[j - 1] + 0.3 * (curvature - rests[j - 1])
         np.testing.assert_allclose(rests[j], by_hand, rtol=1e-12)
-    moved, converged = sweep.solve(replace(stacked, x=stacked.x + 0.01), p, rest)
+    moved, converged = equilibria.solve(replace(stacked, x=stacked.x + 0.01), p, rest)
     assert converged.all()
     np.testing.assert_allclose(moved.x, stacked.x, atol=1e-8)  # IPOPT's tol
 
@@ -198,20 +198,20 @@ def rich(element: str, markers: bool = False) -> tuple[BatchProblem, Point]:
     theta = theta + np.random.default_rng(1).normal(scale=0.02, size=len(theta))
     shapes = solved(problem, theta)
     seen = problem.observed(theta, shapes)
-    feet = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
-    problem.refresh(theta, shapes, feet)
-    return problem, problem.evaluate(theta, shapes, feet)
+    projections = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
+    problem.refresh(theta, shapes, projections)
+    return problem, problem.evaluate(theta, shapes, projections)
 
 
 def residuals(problem: BatchProblem, point: Point, theta, deviation=None) -> list[np.ndarray]:
-    """Whitened normal distances at other unknowns: equilibria solved again, feet moved."""
+    """Whitened normal distances at other unknowns: equilibria solved again, projections moved."""
     start = point.shapes if deviation is None else replace(point.shapes, deviation=deviation)
-    shapes, converged = problem.sweep.solve(
+    shapes, converged = problem.equilibria.solve(
         start, problem.unknowns.p(theta), problem.unknowns.rest(theta), tolerance=1e-12
     )
     assert converged.all()
     seen, out = problem.observed(theta, shapes), []
-    for j, guess in zip(problem.used, point.feet, strict=True):
+    for j, guess in zip(problem.used, point.projections, strict=True):
         item = problem.measured[j]
         s = item.located(seen[j], guess)
         out.append(problem.whitening(j) @ item.residual(seen[j], s))
@@ -233,7 +233,7 @@ def test_jacobian_by_the_unknowns_against_central_differences(element, markers):
         behind = residuals(problem, point, point.theta - step)
         for exact, one, other in zip(lin.by_theta, ahead, behind, strict=True):
             # d^2 of third derivatives is 1e-10 of the size. Feet stop at 1e-8 L, and a point
-            # 2 mm beside the curve feels that in second order only. (On links a foot could
+            # 2 mm beside the curve feels that in second order only. (On links a projection could
             # pass a joint, where the distance has a kink: none does within 1e-5.)
             tolerance = 1e-7 * np.abs(exact).max()
             central = (one - other) / (2 * d)
@@ -246,7 +246,7 @@ def test_jacobian_by_the_deviations_against_central_differences():
     lin = problem.linearize(point)
     d = 1e-6  # m
     for j in problem.used:
-        for k, column in enumerate(problem.sweep.used_deviations):
+        for k, column in enumerate(problem.equilibria.used_deviations):
             step = np.zeros_like(point.shapes.deviation)
             step[j, column] = d
             ahead = residuals(problem, point, point.theta, step)[j]
@@ -345,9 +345,9 @@ def test_noise_free_round_trip_is_exact():
     theta = exact + 0.03 * np.array([1, -1, 0.5, 1, -1, 1, -1, 1])
     shapes = solved(problem, theta)
     seen = problem.observed(theta, shapes)
-    feet = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
-    problem.refresh(theta, shapes, feet)
-    found, converged = problem.descend(problem.evaluate(theta, shapes, feet))
+    projections = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
+    problem.refresh(theta, shapes, projections)
+    found, converged = problem.descend(problem.evaluate(theta, shapes, projections))
     assert converged
     # A standard deviation of 1e-7 m against positions of 1 m: relative 1e-6 or better, and the
     # ends may deviate by a share (1e-7 / 2e-4)^2 of what the points ask for.

@@ -88,7 +88,7 @@ def test_points_are_linear_in_the_nodes(links):
     np.testing.assert_allclose(rows @ table.ravel(), exact, atol=1e-14)
 
 
-# ---- feet and normals --------------------------------------------------------------------------
+# ---- projections and normals --------------------------------------------------------------------
 
 
 def test_feet_and_normals_on_a_circle():
@@ -98,8 +98,8 @@ def test_feet_and_normals_on_a_circle():
     offset = 0.02 * np.sin(37 * exact)  # to the left, where the centre is
     points = on_circle(exact, RADIUS - offset)
     rng = np.random.default_rng(0)
-    s = curve.feet(points, exact + rng.uniform(-0.01, 0.01, 40))
-    # The interpolant is off by 3e-7 m; a foot moves by that over 1 - offset / radius > 0.9,
+    s = curve.projections(points, exact + rng.uniform(-0.01, 0.01, 40))
+    # The interpolant is off by 3e-7 m; a projection moves by that over 1 - offset / radius > 0.9,
     # times the curve's slope error h^3 k^3.
     np.testing.assert_allclose(s, exact, atol=2e-6)
     normals = curve.normals(s)[:, 0]
@@ -128,7 +128,7 @@ def test_nearest_place_on_a_curve_that_meets_itself():
 def test_feet_stay_on_the_curve():
     curve = circle(10)
     before, after = np.array([[-0.1, 0.0]]), on_circle(np.array([LENGTH])) - 0.05
-    assert curve.feet(before, np.array([0.05])) == pytest.approx(0.0)
+    assert curve.projections(before, np.array([0.05])) == pytest.approx(0.0)
     assert 0.0 <= curve.nearest(after)[0] <= LENGTH
 
 

@@ -11,7 +11,7 @@ from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.assembly import Directions, Given, assembly_of
+from dlo_casadi.model.assembly import Inputs, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.ends import REACTIONS, reaction_rows
@@ -37,7 +37,7 @@ def reactions(model: CableModel, pose: Pose) -> tuple[dict[str, np.ndarray], flo
     """By their names, energy [J], and nodes."""
     rest = np.full(model.chain.n_rests, 0.5)
     eq = solve_equilibrium(model, model.nominal, rest, pose)
-    given = Given.of(model.nominal, rest, pose.vector[None])
+    given = Inputs.of(model.nominal, rest, pose.vector[None])
     found = assembly_of(model).reactions(eq.shapes, given)[0]
     return {name: found[at] for name, at in reaction_rows(model.node).items()}, eq.energy, eq.points
 
@@ -103,7 +103,7 @@ def test_a_spring_at_a_pin_holds_a_moment():
     p[[model.names.index(f"start_spring.{name}") for name in ("stiffness", "heading")]] = 0.05, 0.4
     rest, pose = np.zeros(model.chain.n_rests), Pose((0.0, 0.0), (0.6, 0.0))
     eq = solve_equilibrium(model, p, rest, pose)
-    found = assembly_of(model).reactions(eq.shapes, Given.of(p, rest, pose.vector[None]))[0]
+    found = assembly_of(model).reactions(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
     np.testing.assert_allclose(found[[2, 5]], [0.05 * (eq.phi[0] - 0.4), 0.0], atol=1e-12)
 
 
@@ -115,13 +115,13 @@ def test_derivatives_of_readings(space):
     model = model.with_effect(SensorBias.made_for(setup))
     rest, assembly = np.full(model.chain.n_rests, 0.5), assembly_of(model)
     shapes = solve_equilibrium(model, model.nominal, rest, pose).shapes
-    given = Given.of(model.nominal, rest, pose.vector[None])
+    given = Inputs.of(model.nominal, rest, pose.vector[None])
     rng = np.random.default_rng(0)
     sizes = [(assembly.n, assembly.b), (model.n_border,), (len(model.names),), (len(rest),)]
     sizes.append((len(model.deviation_names),))
     x, lam, p, r, deviation = (rng.normal(size=(1, *size, 1)) for size in sizes)
     p[:, 0] *= model.nominal[0]
-    slope = assembly.readings_along(shapes, given, Directions(x, lam, p, r, deviation))[0, :, 0]
+    slope = assembly.readings_along(shapes, given, Tangents(x, lam, p, r, deviation))[0, :, 0]
 
     def at(s: float) -> np.ndarray:
         there = replace(
@@ -137,7 +137,7 @@ def test_derivatives_of_readings(space):
 
 
 def test_readings_are_residuals_beside_points():
-    """In units of their noise; what is of points (modes, weights, feet) is theirs alone."""
+    """In units of their noise; what is of points (modes, weights, projections) is theirs alone."""
     points = np.array([[0.1, 0.0], [0.3, 0.0], [0.5, 0.0]])
     readings = {"end_force": (1.0, 2.0), "start_moment": (0.3,)}
     item = MeasuredPose.of_points(Pose((0.0, 0.0)), points).with_readings(readings)

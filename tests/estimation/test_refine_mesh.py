@@ -33,11 +33,11 @@ def test_a_fit_that_gets_stuck_on_a_finer_mesh_starts_again(monkeypatch):
     def stuck(unknowns, history, start, _=0):
         p = start.p * np.where(np.array(start.model.names) == "bending_stiffness", 2.0, 1.0)
         problem = start.problem.of(replace(unknowns, fixed=p), history)
-        problem.share_metric(start.problem)
+        problem.share_weights(start.problem)
         rest = unknowns.model.rest_basis @ start.coefficients
-        moved, _ = problem.sweep.solve(fitting.carried_shapes(problem, start), p, rest)
+        moved, _ = problem.equilibria.solve(fitting.carried_shapes(problem, start), p, rest)
         theta = unknowns.pack(p, start.coefficients)
-        return fitting.Fit(problem, problem.evaluate(theta, moved, start.point.feet), False)
+        return fitting.Fit(problem, problem.evaluate(theta, moved, start.point.projections), False)
 
     monkeypatch.setattr(fitting, "_continue", stuck)
     monkeypatch.setattr(fitting, "refine", lambda problem, near, **_: (problem, near, False))

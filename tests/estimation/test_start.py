@@ -53,9 +53,9 @@ def test_twists_are_turned_the_way_that_fits():
     theta = unknowns.pack(p, np.zeros(model.n_coefficients))
     theta[unknowns.names.index(END_ROLL)] = roll / 0.1
     held = np.isin(unknowns.names, (*STIFFNESSES, END_ROLL))
-    shapes, feet = measured_shapes(problem, roll)
-    problem.refresh(theta, shapes, feet)
-    begun = turned_either_way(problem, Guess(theta, shapes, feet), held, roll)
+    shapes, projections = measured_shapes(problem, roll)
+    problem.refresh(theta, shapes, projections)
+    begun = turned_either_way(problem, Guess(theta, shapes, projections), held, roll)
 
     true = model.node.turning(measured_shapes(problem, ROLL)[0].x)
     before, after = (model.node.turning(x) for x in (shapes.x, begun.shapes.x))

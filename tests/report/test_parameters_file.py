@@ -17,7 +17,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.parameters import load_parameters, parameters_hash
-from dlo_casadi.model.assembly import Given, assembly_of
+from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.report.parameters_text import final_rest, fit_dict, parameters_text
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.fitting import minimum_by_ipopt
@@ -165,7 +165,7 @@ def test_the_next_pose_finds_the_cable_as_the_last_one_left_it(outcome, tmp_path
     rate, expected = fit.value("rest_curvature_drift.rate"), fit.rest
     shapes = fit.point.shapes
     for j, item in enumerate(measured):
-        given = Given.of(fit.p, expected, item.pose.vector[None])
+        given = Inputs.of(fit.p, expected, item.pose.vector[None])
         kappa = assembly_of(fit.model).strain(shapes.subset([j]), given)[0]
         expected = expected + rate * (kappa - expected)
     assert rate > 0.005

@@ -165,8 +165,8 @@ def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
     assert not replace(fit, converged=False).failed  # it is at its minimum
     off = fit.point.theta + 0.5 * np.eye(problem.unknowns.size)[0]  # ln EI
     p, rest = problem.unknowns.p(off), problem.unknowns.rest(off)
-    shapes, _ = problem.sweep.settled(fit.point.shapes, p, rest)
-    point = problem.evaluate(off, shapes, fit.point.feet)
+    shapes, _ = problem.equilibria.settled(fit.point.shapes, p, rest)
+    point = problem.evaluate(off, shapes, fit.point.projections)
     stopped = replace(found, fit=replace(fit, point=point, converged=False))
     assert "Verdict: the fit has failed. Fit poses" in said(stopped)
     assert page_data(stopped)["verdict_word"] == "Fit failed"

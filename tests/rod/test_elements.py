@@ -11,7 +11,7 @@ import pytest
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.rod.chain import ELEMENTS, Chain
-from dlo_casadi.rod.element import Section, Slot
+from dlo_casadi.rod.element import Section, Segment
 
 LENGTH = 0.8  # m
 ROUNDING = 1e-14  # a dozen sums of numbers of order one
@@ -24,38 +24,38 @@ def number(expression) -> np.ndarray:
     return np.array(ca.evalf(ca.SX(expression))).squeeze()
 
 
-def slots_of(chain: Chain, phi: np.ndarray, *, rest=None, stretch=1.0, bow=0.0) -> list[Slot]:
-    """All slots of a chain of these headings (n_nodes,) and rest curvatures (n_cells,) [1/m]."""
+def segments_of(chain: Chain, phi: np.ndarray, *, rest=None, stretch=1.0, bow=0.0) -> list[Segment]:
+    """All segments of a chain of these headings (n_nodes,) and rest curvatures (n_cells,) [1/m]."""
     kind = chain.kind
     rest = np.zeros(chain.n_cells) if rest is None else rest
     inside = chain.rest_inside(rest[:, None])[..., 0]
     inner = ca.SX(ca.DM(np.full((kind.n_inner, 1), bow)))
-    after = np.minimum(np.arange(chain.n_slots) + 1, chain.n_nodes - 1)
+    after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)
     return [
-        Slot(
+        Segment(
             local=ca.SX([float(phi[j]), float(phi[after[j]])]),
             rest=ca.SX(ca.DM(inside[j])),
-            place=ca.SX(ca.DM(chain.layout.slots[j])),
+            place=ca.SX(ca.DM(chain.layout.segments[j])),
             mesh=chain.h,
             stretch=ca.SX(stretch),
             ratio=ca.SX(stretch),
             inner=inner,
             square=inner**2,
         )
-        for j in range(chain.n_slots)
+        for j in range(chain.n_segments)
     ]
 
 
 def nodes(chain: Chain, phi: np.ndarray, **extra) -> np.ndarray:
     """Element boundaries (n + 1, 2) [m] from the start, which is the origin."""
-    slots = slots_of(chain, phi, **extra)
-    steps = [number(chain.kind.advance(slots[j])) for j in chain.layout.advancing]
+    segments = segments_of(chain, phi, **extra)
+    steps = [number(chain.kind.advance(segments[j])) for j in chain.layout.advancing]
     return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
 def strains(chain: Chain, phi: np.ndarray, **extra) -> np.ndarray:
-    slots = slots_of(chain, phi, **extra)
-    return np.array([number(chain.kind.strain(slots[j])) for j in chain.layout.bends])
+    segments = segments_of(chain, phi, **extra)
+    return np.array([number(chain.kind.strain(segments[j])) for j in chain.layout.bends])
 
 
 def wavy(chain: Chain) -> np.ndarray:
@@ -146,11 +146,11 @@ def test_the_direction_follows_the_rest_shape_inside(element):
     chain = Chain(LENGTH, 5, element)
     edges = chain.places
     means = np.diff(turned(edges)) / np.diff(edges)
-    slots = slots_of(chain, turned(edges), rest=means)
+    segments = segments_of(chain, turned(edges), rest=means)
     for j, u in itertools.product(range(5), (0.0, 0.25, 0.6, 1.0)):
         heading = turned(edges[j] + u * chain.h)
         exact = [np.cos(heading), np.sin(heading)]
-        np.testing.assert_allclose(number(chain.kind.tangent(slots[j], u)), exact, atol=1e-13)
+        np.testing.assert_allclose(number(chain.kind.tangent(segments[j], u)), exact, atol=1e-13)
     # Bent and stretched as a whole it keeps that shape: nothing is left to bend.
     np.testing.assert_allclose(strains(chain, turned(edges)), means, rtol=1e-12)
 
@@ -161,17 +161,17 @@ def test_the_direction_follows_the_rest_shape_inside(element):
 @EVERY
 @HELD
 def test_a_layout_is_whole(element, held):
-    """Slots advance along all of the cable in order, each from its node to the next."""
+    """Segments advance along all of the cable in order, each from its node to the next."""
     chain = Chain(LENGTH, 5, element, *held)
     layout = chain.layout
     assert np.all(np.diff(layout.nodes) > 0)
-    assert chain.n_slots in (chain.n_nodes - 1, chain.n_nodes)
-    start, length = layout.slots[:, :2].T
+    assert chain.n_segments in (chain.n_nodes - 1, chain.n_nodes)
+    start, length = layout.segments[:, :2].T
     np.testing.assert_allclose(start + length, [*start[1:], LENGTH], atol=ROUNDING)
     assert start[0] == 0.0
     np.testing.assert_array_equal(layout.advancing, np.flatnonzero(length))
     assert len(layout.advancing) == chain.n
-    # Bends stand between neighbouring nodes, or between the ends that a slot's nodes are.
+    # Bends stand between neighbouring nodes, or between the ends that a segment's nodes are.
     edges = np.stack([layout.nodes[layout.bends], layout.nodes[layout.bends + 1]], axis=1)
     np.testing.assert_allclose(layout.cells, edges, atol=ROUNDING)
     # Inside the cable, directions at the boundaries are those there, to the second order.
@@ -210,17 +210,19 @@ def test_places_are_the_integral_of_the_tangent(element, stretch):
     chain = Chain(LENGTH, 5, element)
     kind, (x, w) = chain.kind, np.polynomial.legendre.leggauss(20)
     rest = np.random.default_rng(1).normal(size=chain.n_cells)
-    for slot in slots_of(chain, 0.5 * wavy(chain), rest=rest, stretch=stretch, bow=0.05)[:5]:
-        assert not number(kind.advance(slot, 0.0)).any()
-        np.testing.assert_array_equal(number(kind.advance(slot, 1.0)), number(kind.advance(slot)))
+    for segment in segments_of(chain, 0.5 * wavy(chain), rest=rest, stretch=stretch, bow=0.05)[:5]:
+        assert not number(kind.advance(segment, 0.0)).any()
+        np.testing.assert_array_equal(
+            number(kind.advance(segment, 1.0)), number(kind.advance(segment))
+        )
         u = ca.SX.sym("u")
-        tangent = ca.Function("tangent", [u], [kind.tangent(slot, u)])
+        tangent = ca.Function("tangent", [u], [kind.tangent(segment, u)])
         for u in (0.2, 0.5, 1.0):
             tangents = np.array([tangent(u * (z + 1) / 2) for z in x])[..., 0]
             exact = chain.h * u * (w / 2) @ tangents
             # Three Gauss points err by h f/ 2e6. Of the sixth power of u is the square of what
             # the rest shape's bend c < 3 1/m turns, c h u^3 / 3: h (c h / 3)^2 / 5600 < 1e-6.
-            np.testing.assert_allclose(number(kind.advance(slot, u)), exact, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(number(kind.advance(segment, u)), exact, rtol=0, atol=1e-6)
             if kind.n_inner == 0:
                 sizes = np.hypot(*tangents.T)
                 np.testing.assert_allclose(sizes, stretch, rtol=ROUNDING)
@@ -232,11 +234,11 @@ def test_smooth_elements_have_one_tangent_at_a_node(element):
     chain = Chain(LENGTH, 4, element)
     rest = np.random.default_rng(1).normal(scale=3.0, size=chain.n_cells)
     phi = wavy(chain)
-    slots = slots_of(chain, phi, rest=rest, stretch=1.1, bow=0.3)
-    for j, slot in enumerate(slots):
+    segments = segments_of(chain, phi, rest=rest, stretch=1.1, bow=0.3)
+    for j, segment in enumerate(segments):
         for u, heading in ((0.0, phi[j]), (1.0, phi[j + 1])):
             exact = 1.1 * np.array([np.cos(heading), np.sin(heading)])
-            np.testing.assert_allclose(number(chain.kind.tangent(slot, u)), exact, atol=ROUNDING)
+            np.testing.assert_allclose(number(chain.kind.tangent(segment, u)), exact, atol=ROUNDING)
 
 
 @EVERY
@@ -274,7 +276,7 @@ def test_rest_curvature_inside_cells_of_a_parabola(n):
 
 
 def test_rest_curvature_inside_few_cells_and_beside_clamps():
-    """Two cells tell a slope, one its mean; a slot without a cell has none."""
+    """Two cells tell a slope, one its mean; a segment without a cell has none."""
     two = Chain(LENGTH, 2, "arc").rest_inside(np.array([[1.0], [3.0]]))[..., 0]
     np.testing.assert_array_equal(two, [[1.0, 2.0, 0.0], [3.0, 2.0, 0.0]])
     one = Chain(LENGTH, 2, "link").rest_inside(np.array([[5.0]]))[..., 0]
@@ -302,14 +304,14 @@ def test_the_bow_is_the_least_energy_of_its_element(pull):
     chain, stiffness, across = Chain(LENGTH, 2, "quadratic"), 0.05, 0.02
     kind = chain.kind
     bow = ca.SX.sym("bow")
-    plain = slots_of(chain, np.zeros(3))[0]
-    slot = Slot(**{**vars(plain), "inner": bow, "square": bow**2})
+    plain = segments_of(chain, np.zeros(3))[0]
+    segment = Segment(**{**vars(plain), "inner": bow, "square": bow**2})
 
-    def elastic(slot: Slot) -> ca.SX:
-        return kind.elastic(slot, Section(ca.SX(stiffness), ca.SX(0)))
+    def elastic(segment: Segment) -> ca.SX:
+        return kind.elastic(segment, Section(ca.SX(stiffness), ca.SX(0)))
 
-    lagrangian = elastic(slot) - ca.dot(ca.DM([pull, across]), kind.advance(slot))
-    found = kind.condensed(slot, lagrangian, elastic)
+    lagrangian = elastic(segment) - ca.dot(ca.DM([pull, across]), kind.advance(segment))
+    found = kind.condensed(segment, lagrangian, elastic)
     energy = ca.Function("energy", [bow], [lagrangian])
     own = 16 / 3 * stiffness / chain.h  # int (4 (1 - 2u) / h)^2 h du
     geometric = pull * chain.h * 8 / 15  # int (4u (1 - u))^2 h du

@@ -92,7 +92,7 @@ def test_errors_of_the_cameras_place_are_part_of_the_covariance():
 
 def test_errors_are_correlated_over_the_average_along_the_cable():
     """All of what is not correlated otherwise: pixels two lengths apart share exp(-2) of it."""
-    pixels = replace(sensor(0.4, curve()), grain=0.02)
+    pixels = replace(sensor(0.4, curve()), correlation_length=0.02)
     places = np.array([0.1, 0.14, 0.5])
     noise, together = NoiseModel(1e-4, 0.5, 0.01, "exponential"), np.zeros((3, 6))
     pixels = replace(pixels, weight=np.ones(3), together=together)
@@ -119,7 +119,7 @@ def test_pixels_near_the_ends_and_beside_each_other_are_left_out():
     assert u.max() < count - 13.0
     np.testing.assert_allclose(np.diff(u), 8.0)
     np.testing.assert_allclose(found.weight, 1.0)
-    assert found.grain == pytest.approx(np.sqrt(2) * 4.0 * 1.2 / 1000)
+    assert found.correlation_length == pytest.approx(np.sqrt(2) * 4.0 * 1.2 / 1000)
 
 
 @pytest.mark.parametrize("line", [True, False])

@@ -152,8 +152,10 @@ def test_a_fit_is_no_worse_than_the_stiffness_alone():
 
     problem, far = fit.problem, fit.point.theta - np.log(10) * np.eye(fit.problem.unknowns.size)[0]
     rest = problem.unknowns.rest(far)
-    shapes, _ = problem.sweep.settled(fit.point.shapes, problem.unknowns.p(far), rest)
-    stopped = replace(fit, point=problem.evaluate(far, shapes, fit.point.feet), converged=False)
+    shapes, _ = problem.equilibria.settled(fit.point.shapes, problem.unknowns.p(far), rest)
+    stopped = replace(
+        fit, point=problem.evaluate(far, shapes, fit.point.projections), converged=False
+    )
     stage, doubts = judged(poses, stopped)
     assert "has not converged" in doubts[0]
     (said,) = worse_than_simpler([stages[0], stage])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.diagnosis.afresh import fit_afresh, origins_of, start_afresh
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
-from dlo_casadi.diagnosis.confirm import screened_afresh
+from dlo_casadi.diagnosis.confirm import screened_from_data
+from dlo_casadi.diagnosis.from_data import fit_from_data, origins_of, start_from_data
 from dlo_casadi.effects import BendingAnisotropy, Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model, fitted_closely
@@ -57,7 +57,7 @@ def test_a_model_that_misses_the_shapes_is_fitted_to_its_misfit(base):
 
 def test_the_effect_comes_nearest_and_is_fitted_to_the_noise(base):
     listed = [x for x in candidates(base.model, setup_of(base.model, n_poses=6)) if x.name in TRIED]
-    begun = screened_afresh(base, listed, InProcess())
+    begun = screened_from_data(base, listed, InProcess())
 
     assert {item.candidate.name for item, _ in begun} == set(TRIED)
     (first, start), (_, second), *_ = begun
@@ -68,7 +68,7 @@ def test_the_effect_comes_nearest_and_is_fitted_to_the_noise(base):
     objective = {item.candidate.name: start.guess.objective for item, start in begun}
     assert objective["tether"] < 1.5 * objective["point_force"]
 
-    fit = fitted_closely(fit_afresh(base, start))
+    fit = fitted_closely(fit_from_data(base, start))
     assert fit.noise.std == NOISE
     assert fit.value("bending_anisotropy.ratio") == pytest.approx(RATIO, rel=0.03)
     assert fit.value("bending_anisotropy.angle") == pytest.approx(ANGLE, abs=0.03)
@@ -77,5 +77,5 @@ def test_the_effect_comes_nearest_and_is_fitted_to_the_noise(base):
 
 
 def test_without_an_effect_the_misfit_stays(base):
-    start = start_afresh(base, origins_of(base), None)
-    assert fitted_closely(fit_afresh(base, start)).noise.source == "misfit"
+    start = start_from_data(base, origins_of(base), None)
+    assert fitted_closely(fit_from_data(base, start)).noise.source == "misfit"

@@ -59,14 +59,14 @@ class Origin:
     values : dict
         By the names of the base's parameters.
     x : (m, n_nodes, coordinates)
-    feet : list of (K_j,) [m]
+    projections : list of (K_j,) [m]
     indices : tuple of int
         Places of the m poses in the session.
     """
 
     values: dict[str, float]
     x: FloatArray
-    feet: list[FloatArray]
+    projections: list[FloatArray]
     indices: tuple[int, ...]
 
 
@@ -79,12 +79,12 @@ def origins_of(base: Fit) -> tuple[Origin, ...]:
     found = []
     for p, own in ((base.p, turns), (declared, None)):
         values = dict(zip(names, map(float, p), strict=True))
-        shapes, feet = measured_shapes(problem, values.get(END_ROLL, 0.0), own)
-        found.append(Origin(values, shapes.x, feet, tuple(problem.indices)))
+        shapes, projections = measured_shapes(problem, values.get(END_ROLL, 0.0), own)
+        found.append(Origin(values, shapes.x, projections, tuple(problem.indices)))
     return tuple(found)
 
 
-def start_afresh(
+def start_from_data(
     base: Fit,
     origins: Sequence[Origin],
     candidate: Candidate | None,
@@ -115,7 +115,7 @@ def start_afresh(
     problem, best = first.problem, None
     if linear != model:
         problem = _searched_problem(base, model)
-        problem.share_metric(first.problem)
+        problem.share_weights(first.problem)
     for look, scan in sorted(looks, key=lambda look: look[0].objective)[:FOLLOWED]:
         guess: Guess | None = look
         if candidate is not None and linear != model:
@@ -139,10 +139,15 @@ class _First:
             for name, value in origin.values.items():
                 p[model.names.index(name)] = value
             if tuple(self.problem.indices) == origin.indices:
-                shapes, feet = self.problem.sweep.start_shapes(origin.x), origin.feet
+                shapes, projections = (
+                    self.problem.equilibria.start_shapes(origin.x),
+                    origin.projections,
+                )
             else:  # a state makes shapes depend on those of poses that were held out
-                shapes, feet = measured_shapes(self.problem, origin.values.get(END_ROLL, 0.0))
-            self.begun.append((p, shapes, feet))
+                shapes, projections = measured_shapes(
+                    self.problem, origin.values.get(END_ROLL, 0.0)
+                )
+            self.begun.append((p, shapes, projections))
         priors = base.model.priors
         released = {name for name in priors if name not in model.priors}
         self.kept = set(base.model.names) - released - {END_ROLL}
@@ -165,17 +170,17 @@ class _First:
         ]
 
     def _look(self, scan: Mapping[str, float], k: int, decade: float = 0.0) -> Guess | None:
-        p, shapes, feet = self.begun[k]
+        p, shapes, projections = self.begun[k]
         p, stiff = p.copy(), self.model.stiffness_indices
         # Torsion goes with bending: their ratio is known better than what a misfit leaves of it.
         p[stiff] = 10**decade * p[0] / self.model.nominal[0] * self.model.nominal[stiff]
         for name, value in scan.items():
             p[self.model.names.index(name)] = value
         theta = self.problem.unknowns.pack(p, np.zeros(self.model.n_coefficients))
-        if not self.problem.has_metric:
-            self.problem.refresh(theta, shapes, feet)
+        if not self.problem.has_weights:
+            self.problem.refresh(theta, shapes, projections)
         held = np.array([name in self.kept or name in scan for name in self.problem.unknowns.names])
-        return all_at_once(self.problem, Guess(theta, shapes, feet), held, STEPS[0])
+        return all_at_once(self.problem, Guess(theta, shapes, projections), held, STEPS[0])
 
     def beyond(self, candidate: Candidate, smaller: Candidate, start: Start) -> list[Guess]:
         """A guess from where a candidate has led that this one contains."""
@@ -187,8 +192,8 @@ class _First:
             values[here + name.removeprefix(there) if name.startswith(there) else name] = value
         p = np.array([values[name] for name in self.model.names])
         shapes = with_border_of(start.guess.shapes, other.model, self.model)
-        begun = Guess(self.problem.unknowns.pack(p, rest), shapes, start.guess.feet)
-        self.problem.share_metric(start.problem)
+        begun = Guess(self.problem.unknowns.pack(p, rest), shapes, start.guess.projections)
+        self.problem.share_weights(start.problem)
         held = np.array([name in self.kept for name in self.problem.unknowns.names])
         guess = all_at_once(self.problem, begun, held, STEPS[0])
         return [] if guess is None else [guess]
@@ -217,7 +222,7 @@ def _searched_problem(base: Fit, model: CableModel) -> BatchProblem:
     )
 
 
-def fit_afresh(base: Fit, start: Start) -> Fit | None:
+def fit_from_data(base: Fit, start: Start) -> Fit | None:
     """The fit that a start leads to, weighed as the base; None where it leads to no equilibria."""
     problem = start.problem
     none = np.zeros(problem.unknowns.size, dtype=bool)
