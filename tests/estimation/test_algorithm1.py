@@ -17,15 +17,14 @@ from dlo_casadi.io.points import read_points
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.paper.algorithm1 import (
     Algorithm1Status,
-    InnerProblem,
     _runs_away,
-    _Target,
     applies,
     best_parameters,
     expected_angles,
     gravity_slopes,
     run_algorithm1,
 )
+from dlo_casadi.paper.inner_problem import InnerProblem, Target
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
@@ -137,7 +136,7 @@ def test_distance_of_nodes_to_their_nearest_points():
     """r_p by hand: 0.01 m off two points of a line, and a node in a gap that does not count."""
     x = np.concatenate([np.linspace(0.01, 0.3, 30), np.linspace(0.6, 0.99, 40)])
     line = MeasuredPose.of_points(Pose((0.0, 0.0), (1.0, 0.0)), np.stack([x, 0 * x], axis=1))
-    target = _Target.of(line, gap=0.1)
+    target = Target.of(line, gap=0.1)
     nodes = np.array([[0.2, 0.01], [0.42, 0.0], [0.8, -0.01]])
     np.testing.assert_array_equal(target.nearest(nodes)[1], [True, False, True])
     assert target.residual(nodes) == pytest.approx(2e-4, rel=1e-9)
@@ -146,7 +145,7 @@ def test_distance_of_nodes_to_their_nearest_points():
 def test_both_minimisers_reach_the_same_minimum():
     problem = InnerProblem(CABLE, GRAVITY, n=5)
     (item,) = measured(0.3, ENDS[1:2])
-    target = _Target.of(item, problem.chain.h / 2)
+    target = Target.of(item, problem.chain.h / 2)
     guess = problem.first_guess(item.pose, target)
     arguments = (2.0, np.zeros(4), target)
     smooth, converged = problem.solve_ipopt(guess, *arguments)
@@ -165,7 +164,7 @@ def test_first_guess_takes_the_measured_side():
     problem = InnerProblem(CABLE, GRAVITY, n=6)
     (item,) = measured(0.3, ENDS[:1])  # hangs below its chord: counter-clockwise
     anonymous = replace(item, pose=replace(item.pose, branch=None))
-    target = _Target.of(anonymous, problem.chain.h / 2)
+    target = Target.of(anonymous, problem.chain.h / 2)
     assert problem.first_guess(anonymous.pose, target)[-1] > 0
     other = replace(item.pose, branch="cw")
     assert problem.first_guess(other, target)[-1] < 0
@@ -272,7 +271,7 @@ def test_parameters_are_those_of_the_model():
     shape = solve_equilibrium(result.model, result.p, result.rest, Pose((0.0, 0.0), ENDS[0]))
     line = MeasuredPose.of_points(Pose((0.0, 0.0), ENDS[0]), shape.points[1:-1])
     by_paper = problem.objective(
-        shape.phi, result.k_theta, result.theta_0, _Target.of(line, gap=1.0)
+        shape.phi, result.k_theta, result.theta_0, Target.of(line, gap=1.0)
     )
     assert shape.energy == pytest.approx(by_paper, rel=1e-10)  # rounding of a few dozen terms
 
