@@ -261,7 +261,7 @@ def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
             "  Try: more points on each line, more poses, the noise as measurement.std, or "
             "rest_shape: straight."
         )
-    weight = np.concatenate([x.relative_white[x.point_of[x.on_points]] for x in items])
+    weight = np.concatenate([x.relative_white[x.point_of] for x in items])
     raw = np.concatenate(fit.linearization.raw)[on_points] / weight
     return NoiseModel(float(np.sqrt((raw**2).sum() / spare)), slow_dof=spare)
 

@@ -117,3 +117,17 @@ def test_an_effect_that_leaves_no_point_over_is_not_significant():
     fit = fitted(1, poses=4, std=STD)
     fit.problem.noise = replace(fit.noise, source="estimated")
     assert p_with_closed_noise(fit, fit, winner=None, tried=1) == 1.0
+
+
+def test_noise_of_few_points_beside_readings():
+    """Forces on the end are no points: they do not count among those the noise is told by."""
+    truth = CableModel(CABLE, 16, n_rest=5)
+    rest = np.array([0.5, 1.0, 1.5, 0.8, 0.4])
+    measured = measured_from(truth, np.array([EI]), rest, 8, STD, 5)
+    alone = fit_model(truth, measured, Tolerances()).noise.std
+    heard = [
+        x.with_readings({"end_force": [0.0, 0.0]}) if k < 2 else x for k, x in enumerate(measured)
+    ]
+    fit = fit_model(truth, heard, Tolerances())
+    assert fit.noise.source == "estimated"
+    assert alone / 2 < fit.noise.std < 2 * alone
