@@ -37,14 +37,19 @@ def cable(element="link", start="pinned", end="pinned", n=10, effects=(), straig
     return model, p, rest
 
 
+def compiled(model, p, rest):
+    """A solver that compiles quickly; tests/codegen/test_space.py has one of the default flags."""
+    return CompiledSolver(model, p, rest, flags=("-O0",))
+
+
 @pytest.fixture(scope="module")
 def links():
-    return CompiledSolver(*cable())
+    return compiled(*cable())
 
 
 @pytest.fixture(scope="module")
 def clamped():
-    return CompiledSolver(*cable("arc", "clamped", "clamped", effects=(AxialStretch(),)))
+    return compiled(*cable("arc", "clamped", "clamped", effects=(AxialStretch(),)))
 
 
 def at(end, *, start=(0.0, 0.0), headings=(None, None), branch=None):
@@ -147,7 +152,7 @@ def test_both_ends_at_one_place_is_a_loop(links):
         loop = links.solve(at((0.0, 0.0), branch=branch))
         assert np.abs(loop.points[-1]).max() < 1e-9
     weightless = CableModel(CABLE, n=16, gravity=(0.0, 0.0))
-    shape = CompiledSolver(weightless, weightless.nominal, np.zeros(16)).solve(at((0.0, 0.0)))
+    shape = compiled(weightless, weightless.nominal, np.zeros(16)).solve(at((0.0, 0.0)))
     assert np.abs(shape.points[-1]).max() < 1e-9
 
 
@@ -158,7 +163,7 @@ def test_almost_taut(links):
 
 
 def test_branches_bow_either_way():
-    solver = CompiledSolver(*cable("arc", straight=True))
+    solver = compiled(*cable("arc", straight=True))
     left = solver.solve(at((0.5, 0.0), branch="ccw"))
     right = solver.solve(at((0.5, 0.0), branch="cw"))
     assert (left.turn, right.turn) == (1, -1)
@@ -168,7 +173,7 @@ def test_branches_bow_either_way():
 def test_a_branch_without_an_equilibrium_is_a_status():
     """A limp cable hangs, and does not stand up: nothing is returned in place of what was named."""
     model = CableModel(Cable(0.8, 0.2, 0.01, 0.005), n=12)
-    solver = CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells))
+    solver = compiled(model, model.nominal, np.zeros(model.chain.n_cells))
     hung = solver.solve(at((0.5, 0.0)))
     assert hung.turn == 1
     for warm in (None, hung):
@@ -183,7 +188,7 @@ def test_a_branch_without_an_equilibrium_is_a_status():
 
 
 def test_a_warm_start_of_the_other_branch_is_not_followed():
-    solver = CompiledSolver(*cable("arc", straight=True))
+    solver = compiled(*cable("arc", straight=True))
     left = solver.solve(at((0.5, 0.0), branch="ccw"))
     right = solver.solve(at((0.5, 0.0), branch="cw"), warm=left)
     assert right.turn == -1
@@ -191,7 +196,7 @@ def test_a_warm_start_of_the_other_branch_is_not_followed():
 
 def test_a_clamped_loop_turns_once_clockwise():
     model, p, rest = cable("arc", "clamped", "clamped", n=40, straight=True)
-    shape = CompiledSolver(model, p, rest).solve(at((0.2, 0.0), headings=(0.0, -2 * np.pi)))
+    shape = compiled(model, p, rest).solve(at((0.2, 0.0), headings=(0.0, -2 * np.pi)))
     assert shape.x[-1] == pytest.approx(-2 * np.pi, abs=1e-9)
     assert shape.end_error < 1e-9
 
@@ -199,7 +204,7 @@ def test_a_clamped_loop_turns_once_clockwise():
 @pytest.mark.parametrize(("element", "start", "end"), KINDS)
 @pytest.mark.parametrize("effects", [(), (AxialStretch(), BendingSoftening(), EndOffset())])
 def test_sensitivities_are_central_differences(element, start, end, effects):
-    solver = CompiledSolver(*cable(element, start, end, effects=effects))
+    solver = compiled(*cable(element, start, end, effects=effects))
     pose = np.array([0.5, 0.12, 0.7, -0.6])
 
     def posed(numbers):
@@ -257,7 +262,7 @@ def test_minus_the_end_force_is_the_slope_of_the_energy(links):
 def test_path_holds_its_branch_and_reports_the_snap():
     """A strip clamped at one end whose other clamp is turned snaps through at a fold."""
     model, p, rest = cable("arc", "clamped", "clamped", n=24, straight=True)
-    solver = CompiledSolver(model, p, rest)
+    solver = compiled(model, p, rest)
     turns = np.linspace(0.6, -2.5, 32)
     path = solver.path([at((0.7, 0.0), headings=(turn, -turn)) for turn in turns])
     assert path.first_jump is not None

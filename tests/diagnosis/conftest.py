@@ -1,40 +1,30 @@
-"""Sessions with known truth, run once each by the command that users run."""
+"""Sessions with known truth, run once each."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import pytest
 import yaml
 
+from dlo_casadi.config import load_config
+from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.session import run_session
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@lru_cache
-def _run(config: Path, output: Path) -> dict:
-    subprocess.run(
-        [sys.executable, "scripts/fit.py", str(config), "--output", str(output), "--quiet"],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-    )
-    return json.loads((output / "report.json").read_text())
-
-
 @pytest.fixture(scope="session")
-def report(tmp_path_factory):
-    """Function that runs fit.py on a bench session and reads its report."""
-    folder = tmp_path_factory.mktemp("results")
+def report():
+    """Function that runs a bench session and gives its report."""
 
+    @cache
     def of(name: str) -> dict:
         config = ROOT / "tests" / "data" / "bench" / name / "session.yaml"
         if name == "connector":
             config = ROOT / "configs" / "cable.yaml"
-        return _run(config, folder / name)
+        return report_dict(run_session(load_config(config)))
 
     return of
 

@@ -1,4 +1,4 @@
-"""Whole sessions by fit.py against the truth that an independent simulator put into them.
+"""Whole sessions against the truth that an independent simulator put into them.
 
 Declared models of the others: tests/session/test_truth.py; scripts/check_bench.py does all.
 """

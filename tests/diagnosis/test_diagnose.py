@@ -37,7 +37,7 @@ def session():
 
 def fit_of(session, measured=None, std=None):
     declared, own = session
-    return fit_model(declared.model.with_mesh(20), measured or own, declared.tolerances, std)
+    return fit_model(declared.model.with_mesh(12), measured or own, declared.tolerances, std)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ TRIED = ("bending_anisotropy", "stiffness_gradient", "point_force", "tether")
 @pytest.fixture(scope="module")
 def base():
     """The round cable that is declared, fitted to poses of one that is flat."""
-    flat = CableModel(TRUE, 8, "quadratic", n_rest=2, effects=(BendingAnisotropy(),), **HELD)
+    flat = CableModel(TRUE, 6, "quadratic", n_rest=2, effects=(BendingAnisotropy(),), **HELD)
     p = flat.nominal.copy()
     p[flat.names.index("bending_anisotropy.ratio")] = RATIO
     p[flat.names.index("bending_anisotropy.angle")] = ANGLE
@@ -45,7 +45,7 @@ def base():
         (shape,) = predict_poses(flat, p, rest, [pose])
         points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 3))
         measured.append(MeasuredPose.of_points(pose, points))
-    round_ = CableModel(DECLARED, 8, "quadratic", n_rest=2, **HELD)
+    round_ = CableModel(DECLARED, 6, "quadratic", n_rest=2, **HELD)
     return fit_model(round_, measured, Tolerances(), NOISE)
 
 

@@ -78,7 +78,7 @@ def poses_in(where: str, pinned: bool) -> list[Pose]:
                 *(None if pinned else float(turn[2]) for turn in pair),
                 camera_center=(0.2, 0.0, 1.2),
             )
-            for end, pair in zip(ends, turns, strict=True)
+            for end, pair in zip(ends[:2], turns, strict=False)
         ]
     frames = [[tuple(Rotation.from_rotvec(turn).as_quat()) for turn in pair] for pair in turns]
     return [

@@ -28,20 +28,19 @@ def pool():
 
 
 @pytest.mark.parametrize(
-    ("name", "tried", "n", "verdict"),
+    ("name", "tried", "verdict"),
     [
-        ("thin", "gravity_tilt", 10, "unexplained"),
-        ("softening", "bending_softening", None, "effect_found"),
+        ("thin", "gravity_tilt", "unexplained"),
+        ("softening", "bending_softening", "effect_found"),
     ],
 )
-def test_a_whole_session(tmp_path, name, tried, n, verdict):
+def test_a_whole_session(tmp_path, name, tried, verdict):
     """One that ends with a pull, and one with an effect."""
     config = load_config(write_session(tmp_path / "cable", name))
     few = {tried, "rest_curvature_drift"}
     limits = {"enabled": True, "max_effects": 1, "exclude": tuple(sorted(set(EFFECTS) - few))}
     config = replace(
         config,
-        model=config.model.model_copy(update={"n": n}),
         estimation=config.estimation.model_copy(update={"algorithm1": True}),
         diagnosis=config.diagnosis.model_copy(update=limits),
     )

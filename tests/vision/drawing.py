@@ -25,16 +25,16 @@ def to_pixels(points):
     return CORNER + SCALE * np.asarray(points) * [1, -1]
 
 
-def distance(points, shape):
-    """Distance [px] of each pixel from a polyline, and the share of its length up to there."""
+def distance(points, shape, farthest):
+    """Distance [px] of each pixel from a polyline; infinite where it is `farthest` or more."""
     line = to_pixels(points)
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     s = np.concatenate([[0], np.cumsum(steps)])
     fine = np.linspace(0, s[-1], int(10 * s[-1]))
     dense = np.column_stack([np.interp(fine, s, line[:, i]) for i in (0, 1)])
     v, u = np.mgrid[: shape[0], : shape[1]]
-    away, nearest = cKDTree(dense).query(np.column_stack([u.ravel(), v.ravel()]))
-    return away.reshape(shape), (nearest / len(dense)).reshape(shape)
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    return cKDTree(dense).query(pixels, distance_upper_bound=farthest)[0].reshape(shape)
 
 
 def draw(
@@ -57,12 +57,11 @@ def draw(
     if gradient:
         picture = picture * (1 + gradient * np.linspace(-1, 1, shape[1])[None, :, None])
     if shadow:
-        beside, _ = distance(
-            np.asarray(points) + 1.2 * width_px / SCALE * np.array([0.8, -0.6]), shape
-        )
+        aside = np.asarray(points) + 1.2 * width_px / SCALE * np.array([0.8, -0.6])
+        beside = distance(aside, shape, 0.5 + width_px / 2)
         dark = gaussian_filter(np.clip(0.5 + width_px / 2 - beside, 0, 1), 0.25 * width_px)
         picture = picture * (1 - shadow * dark[..., None])
-    away, _ = distance(points, shape)
+    away = distance(points, shape, 0.5 + width_px / 2)
     cover = np.clip(0.5 + width_px / 2 - away, 0, 1)[..., None]
     body = (
         np.array(cable, float) + highlight * np.exp(-((away / (0.15 * width_px)) ** 2))[..., None]

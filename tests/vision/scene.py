@@ -94,17 +94,18 @@ def background(where, grey=185.0, twice=()):
     centers = [*board.marker_centers.items(), *twice]
     for i in parts:
         for j in parts:
-            at = rays + i * right + j * down
-            mapped = np.concatenate([at, np.ones((*SHAPE, 1))], axis=2) @ plane.T
-            flat = mapped[..., :2] / mapped[..., 2:]
-            inside = np.all(np.abs(flat - [0.05, 0.0]) < [0.5, 0.45], axis=2)
+            u, v = np.moveaxis(rays + i * right + j * down, 2, 0)
+            across, up, depth = (a * u + b * v + c for a, b, c in plane)
+            x, y = across / depth, up / depth
+            inside = (np.abs(x - 0.05) < 0.5) & (np.abs(y) < 0.45)
             light = np.where(inside, grey, 0.45 * grey)
             for number, center in centers:
                 cells = cv2.aruco.generateImageMarker(dictionary, number, 7)
                 cells = np.pad(cells, 1, constant_values=255)
-                local = (flat - center) / board.marker_size * [1, -1] * 7 + 4.5
-                on = np.all((local >= 0) & (local < 9), axis=2)
-                column, row = local[on].astype(int).T
+                half = 4.5 / 7 * board.marker_size
+                on = np.nonzero((np.abs(x - center[0]) < half) & (np.abs(y - center[1]) < half))
+                column = ((x[on] - center[0] + half) / half * 4.5).astype(int)
+                row = ((half - y[on] + center[1]) / half * 4.5).astype(int)
                 light[on] = 10.0 + 0.92 * cells[row, column]
             total += light
     return total / len(parts) ** 2

@@ -97,7 +97,7 @@ def test_the_middle_of_an_outline_is_that_of_the_cylinders_surface(pictures):
         seen = project_outline(view, axis, tangent, diameter)
         one = np.cross(tangent, [0.3, 0.5, 0.8])
         one /= np.linalg.norm(one)
-        angle, s = np.meshgrid(np.linspace(0, 2 * np.pi, 1441), np.linspace(-0.02, 0.02, 801))
+        angle, s = np.meshgrid(np.linspace(0, 2 * np.pi, 361), np.linspace(-0.02, 0.02, 801))
         ring = np.multiply.outer(np.cos(angle), one)
         ring += np.multiply.outer(np.sin(angle), np.cross(tangent, one))
         surface = axis + 0.5 * diameter * ring + s[..., None] * tangent
