@@ -523,6 +523,11 @@ def test_a_pose_that_is_not_finite_is_named():
         solve(CableModel(HEAVY, 8), 0.1, Pose((0.0, 0.0), (0.6, np.nan), name="pose_08"))
 
 
+def test_a_held_end_that_a_pose_does_not_have_is_not_the_origin():
+    with pytest.raises(EquilibriumError, match=r"the end of the cable is pinned, and the pose has"):
+        solve(CableModel(HEAVY, 8), 0.1, Pose((0.0, 0.0)))
+
+
 @pytest.mark.parametrize("label", ["", "wrong_label", "spool"])
 def test_a_longer_cable_reaches_farther_whatever_its_effect_is_called(label):
     """Two length errors multiply; the end fixture is where it really is."""

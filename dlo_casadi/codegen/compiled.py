@@ -110,7 +110,15 @@ class CompiledSolver:
         return self._read(out[0], status)
 
     def step(self, shape: Shape, pose: Pose, *, steps: int = 4) -> Shape:
-        """Shape in a pose close by, in at most so many Newton steps; see its `status`."""
+        """Shape in a pose close by, in at most so many Newton steps; see its `status`.
+
+        Raises
+        ------
+        DloError
+            If pose or shape do not fit the cable, or `steps` is no whole number.
+        """
+        if not isinstance(steps, int | np.integer):
+            raise DloError(f"steps: a whole number of Newton steps belongs here, found {steps!r}")
         table, _ = pose_table(self.model, [pose])
         kept, out = self._record_of(shape), np.zeros(1, self.record)
         status = self._c.dlo_step(_at(table), _at(kept), steps, _at(out), *self._work())
@@ -203,10 +211,15 @@ class CompiledSolver:
         Raises
         ------
         DloError
-            If there is no obstacle, or a number is not finite.
+            If there is no obstacle or another object, or a number is not finite.
         """
         kept, given = self._record_of(shape), np.zeros(len(obstacles), obstacle_record(self.model))
         for row, obstacle in zip(given, obstacles, strict=True):
+            if not isinstance(obstacle, Obstacle):
+                raise DloError(f"a Capsule or a HalfSpace belongs here, found {obstacle!r}")
+            if any(np.shape(place) != row["a"].shape for place in obstacle.ends):
+                count = counted(self.model.node.dimension, "number")
+                raise DloError(f"places of an obstacle must have {count}, found {obstacle!r}")
             row["kind"], row["radius"] = isinstance(obstacle, HalfSpace), obstacle.radius
             row["a"], row["b"] = obstacle.ends
         along = None if slope is None else _filled(self._slope, slope)

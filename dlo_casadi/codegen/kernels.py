@@ -24,8 +24,6 @@ FloatArray = NDArray[np.floating]
 
 # Numbers that differ by less come from differences of the same mesh.
 _ROUNDING = 1e-14
-# Columns of a segment's own numbers: where it starts [m], and its rest curvature inside [1/m].
-_OWN = 4
 # What CasADi calls by names of its own; the others are those of libm.
 _CALLS = {"casadi_sq": "square", "casadi_sign": "sign_of", "casadi_real": "double"}
 _HELPERS = {

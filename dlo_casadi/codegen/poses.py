@@ -52,6 +52,8 @@ def pose_table(
                 f"poses: an array (m, {size}) as dlo_pose in the C header belongs here, found "
                 f"{poses.shape}"
             )
+        if poses.dtype.kind not in "fiu":
+            raise DloError(f"poses: real numbers belong in the array, found {poses.dtype}")
         return np.ascontiguousarray(poses, float), _branch_number(branch)
     if branch is not None:
         raise DloError(f"branch {branch!r} is for poses in an array; a Pose names its own")
@@ -72,6 +74,10 @@ def _branch_number(branch: object) -> int:
 def _row(model: CableModel, pose: object) -> FloatArray:
     if not isinstance(pose, Pose):
         raise DloError(f"a Pose belongs here, found {pose!r}\n  Try: dlo_casadi.Pose(start, end)")
+    if pose.end is None and model.end != "free":
+        raise DloError(
+            f"{pose.name}: the end of the cable is {model.end}: where is it?\n  Try: end"
+        )
     d = model.node.dimension
     for name, place in (("start", pose.start), ("end", pose.end)):
         if place is not None and np.shape(place) != (d,):

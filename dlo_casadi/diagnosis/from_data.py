@@ -1,4 +1,4 @@
-"""Fits that begin at the measured shapes, of a model with something more than one that is astray.
+"""Fits of a model with an added effect that begin at the measured shapes.
 
 Equilibria of a model that lacks an effect may be far from the measured shapes, and its stiffness
 far from the cable's: no path of equilibria leads from there to the model with the effect. All at
@@ -32,8 +32,9 @@ from dlo_casadi.model.rest_curvature import RestScatter
 
 FloatArray = NDArray[np.floating]
 
-# Decades of stiffness about that of the fit that is astray, and about the prior's. In five sessions
-# in which an effect is missing such fits were off by factors of 0.35 to 2.3, priors by 0.6 to 1.9.
+# Decades of stiffness about that of the fit without the effect, and about the prior's. In five
+# sessions in which an effect is missing such fits were off by factors of 0.35 to 2.3, priors by 0.6
+# to 1.9.
 DECADES_NEAR = (-0.5, 0.5)
 # Places of an effect that are tried first, and starts that are followed.
 PLACES_TRIED, FOLLOWED = 5, 2

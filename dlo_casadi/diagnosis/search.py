@@ -143,9 +143,9 @@ class Search:
         lost: dict[str, str] = {}
         for k in range(self.max_effects):
             self.step("search for a missing effect", k, self.max_effects)
-            astray = current.noise.source == "misfit"
+            misfit = current.noise.source == "misfit"
             tried: list[Confirmed | None] = []
-            if astray and pull is None:
+            if misfit and pull is None:
                 screened, tried = self._from_data(current)
             else:
                 screened = self.first if k == 0 else self._screened(current)
@@ -154,7 +154,7 @@ class Search:
             }
             if k == 0 and pull is not None:
                 tried = self._causes(pull, screened)
-            elif not astray:
+            elif not misfit:
                 tried = self._leading(current, screened, p_values)
             explaining = explained_by(current, tried)
             confirmed = explaining or improving(tried, validation, self.doubt)
@@ -183,7 +183,7 @@ class Search:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = sidak(single, len(screened))
             closed = winner.fit if explaining else as_complete(winner.fit)
-            if not (closed.errors_known or astray):
+            if not (closed.errors_known or misfit):
                 again = p_with_closed_noise(current, closed, winner, len(screened))
                 p_value = max(p_value, again)
             if p_value > self.significance:

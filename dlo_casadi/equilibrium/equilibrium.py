@@ -69,7 +69,7 @@ class Equilibrium:
     iterations : int
     other_side : Equilibrium or None
         The stable equilibrium of the same pose if it tells the other side, see
-        `Composition.tipped_by`; None where there is none, and where the pose tells its side.
+        `CableModel.tipped_by`; None where there is none, and where the pose tells its side.
     """
 
     x: FloatArray

@@ -41,7 +41,13 @@ MOST_SHED = 1.3
 
 
 def check_pose(model: CableModel, p: FloatArray, pose: Pose) -> None:
-    """Raise EquilibriumError where a number is not finite, or the end farther than the cable."""
+    """Raise EquilibriumError where the end is missing or out of reach, or a number not finite."""
+    if pose.end is None and model.end != "free":
+        raise EquilibriumError(
+            f"no equilibrium: the end of the cable is {model.end}, and the pose has none.\n"
+            "  Try: Pose(start, end).",
+            pose.name,
+        )
     if not np.all(np.isfinite(pose.vector)):
         raise EquilibriumError(
             f"no equilibrium: a number of the pose is not finite: start {pose.start} m, end "

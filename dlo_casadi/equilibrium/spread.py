@@ -47,6 +47,13 @@ class Uncertainty:
     rest_scatter: RestScatter
     hanging: float = 0.0
 
+    @property
+    def root(self) -> FloatArray:
+        """Matrix A (N, N) with A A^T = `covariance`, which may be singular."""
+        std = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(std, std))
+        return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+
     def unknowns_in(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
         """What each of `names` moves: parameters (n_parameters, N) and rests (n_rests, N)."""
         size = len(self.names)
@@ -71,7 +78,7 @@ class Uncertainty:
 
 
 def modes_in(model: CableModel) -> FloatArray:
-    """The same as rest curvatures of a model's cells, axis by axis: (n_rests, axes MODES)."""
+    """Modes of a hanging's own rest curvature in a model's cells: (n_rests, axes MODES)."""
     axes = np.eye(len(model.node.strains))[:, -len(model.node.curvatures) :]
     return np.kron(axes, modes_of(model.chain.cells, model.cable.length))
 
@@ -99,7 +106,7 @@ def displacements(
     curve = NodeCurve.of(model.cable.length, seen.z[0])
     way = curve.moved(s, seen.slopes[0])
     moved: list[FloatArray] = [
-        way[..., :size] @ _root(uncertainty.covariance),
+        way[..., :size] @ uncertainty.root,
         way[..., size:] * uncertainty.scatter_in(model),
         np.broadcast_to(uncertainty.hanging * np.eye(curve.d), (len(s), curve.d, curve.d)),
     ]
@@ -116,10 +123,3 @@ def spread_across(curve: NodeCurve, s: FloatArray, moved: FloatArray) -> FloatAr
     The noise of a measurement comes on top.
     """
     return np.linalg.norm(np.einsum("knd,kdq->knq", curve.normals(s), moved), axis=2)
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Matrix A with A A^T = covariance, which may be singular."""
-    std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
-    return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

@@ -54,8 +54,7 @@ def tipping_of(
     First order, from all that makes a prediction uncertain: the slope of an equilibrium's energy
     by anything is that of the Lagrangian at fixed nodes and multipliers.
     """
-    values, vectors = np.linalg.eigh(uncertainty.covariance)
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))
+    roots = uncertainty.root
     by_p, by_rest = (by @ roots for by in uncertainty.unknowns_in(model))
     scatter = uncertainty.scatter_in(model)
     own = uncertainty.rest_modes_in(model)

@@ -60,7 +60,7 @@ class MeasuredBranch:
     turns : 0.5, -0.5 or None
         The same of a cable in space that is twisted the other way round, see `Pose`.
     other_side : bool
-        Whether it is a side of the cable, see `Composition.tipped_by`, and the pose tells none.
+        Whether it is a side of the cable, see `CableModel.tipped_by`, and the pose tells none.
     """
 
     prediction: Prediction
@@ -160,7 +160,7 @@ def predicted_shapes(
 ) -> Shapes:
     """Shapes of a problem's poses as a user is told them, who knows their ends alone.
 
-    Where there is no prediction, or one on the other side (see `Composition.tipped_by`), they are
+    Where there is no prediction, or one on the other side (see `CableModel.tipped_by`), they are
     those of `shapes`. A prediction takes 3 ms in the plane.
     """
     model, history = problem.unknowns.model, [item.pose for item in problem.history]
@@ -184,7 +184,7 @@ def predicted_shapes(
 
 
 def _tells_no_side(model: CableModel, pose: Pose) -> bool:
-    """Whether a cable has sides, see `Composition.tipped_by`, of which the pose tells none."""
+    """Whether a cable has sides, see `CableModel.tipped_by`, of which the pose tells none."""
     return model.tipped_by is not None and not pose.branch and not pose.turns
 
 

@@ -213,7 +213,7 @@ class Lagrangian(Symbols):
         return self.elastic_energy(segment) - self.work_along(segment, self.forces_on(segment))
 
     def work_along(self, segment: Segment, forces: list[ca.SX]) -> ca.SX:
-        """Work of `_segment_forces` along a segment [J]."""
+        """Work of `forces_on` a segment along it [J]."""
         kind = self.model.chain.kind
         nodes, weights = kind.rule
         shares = ca.vertsplit(self.share_symbols)

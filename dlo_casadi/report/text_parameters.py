@@ -85,10 +85,12 @@ def footnotes(outcome: Outcome) -> list[str]:
         bound = unidentified(stiffness)
         known = f"EI {bound}" if bound[0] in "<>" else f"EI: {bound}"
         lines.append(f"{known}, not identifiable from these shapes.")
-        lines.append(
-            "Try: poses in which weight and stiffness compete more (ends close together), or "
-            "hang a known weight on the cable and declare it under model.effects."
+        hung = (
+            "poses in which weight and stiffness compete more (ends close together), or hang a "
+            "known weight on the cable and declare it under model.effects."
         )
+        force = "end_force or start_force of a pose: without gravity shapes tell no stiffness."
+        lines.append(f"Try: {hung if any(outcome.config.experiment.gravity) else force}")
     elif stiffness is not None and not outcome.measurement.readings:
         known = "EI is" if twisting is None else "EI and GJ are"
         weight = outcome.fit.mass * math.hypot(*outcome.config.experiment.gravity)

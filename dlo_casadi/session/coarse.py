@@ -66,8 +66,23 @@ class Comparison(NamedTuple):
         return left[0], left[1]
 
     @property
+    def told(self) -> str:
+        """What both leave, in words."""
+        own, other = self.misfits
+        left = f"the lines are {own:.3g} m RMS from the shapes of any stiffness, but"
+        if self.own is None:
+            left = "no stiffness gives equilibria near the lines, but they are within"
+        return f"{left} {other:.3g} m with {self.what}"
+
+    @property
     def better(self) -> bool:
-        """Whether the declaration leaves more than noise, and the hypothesis clearly less."""
+        """Whether the declaration leaves more than noise, and the hypothesis clearly less.
+
+        Where the declaration has no fit the hypothesis has to show a weight: a fit of few points
+        may fail, or not, by chance.
+        """
+        if self.own is None and not (self.other and tells_weight(self.other)):
+            return False
         own, other = self.misfits
         return own > UNEXPLAINED * self.length and other < MUCH_BETTER * own
 

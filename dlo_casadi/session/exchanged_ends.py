@@ -36,13 +36,11 @@ def ends_exchanged(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion
     found = compare(config, read, hypotheses, _POSES)
     if found is None or not found.better:
         return ()
-    left, other = found.misfits
     return (
         Suspicion(
             f"the lines leave their clamps {np.degrees(own):.0f} degrees (median) off the declared "
-            f"directions, and are {left:.3g} m RMS from the shapes of any stiffness, but "
-            f"{other:.3g} m with {found.what}. Try: start where the cable begins, and headings or "
-            "x axes along the cable from start to end, at both clamps.",
+            f"directions; {found.told}. Try: start where the cable begins, and headings or x axes "
+            "along the cable from start to end, at both clamps.",
             found.certain,
         ),
     )

@@ -35,19 +35,18 @@ def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicio
     found = compare(config, read, list(_otherwise(config, read, pull)))
     if found is None or not (found.better or found.shows_weight):
         return ()
-    own, other = found.misfits
-    told = f"its shapes are {own:.3g} m RMS from those of any stiffness, but {other:.3g} m with"
+    weightless = ""
     if found.own is not None and not tells_weight(found.own):
-        stiff = found.own.value(BENDING_STIFFNESS)
-        told = (
-            f"its shapes show no weight, as if bending_stiffness were {stiff:.2g} N m^2 or more, "
-            f"and are {own:.3g} m RMS from such a cable's, but {other:.3g} m with"
+        least = found.own.value(BENDING_STIFFNESS)
+        weightless = (
+            f"the lines show no weight, as if bending_stiffness were {least:.2g} N m^2 or more; "
         )
     up = "[0.0, -9.81] with y up" if len(gravity) == 2 else "[0.0, 0.0, -9.81] with z up"
     return (
         Suspicion(
-            f"the cable does not hang along gravity {_vector(gravity)} m/s^2: {told} {found.what}. "
-            f"Try: points, start, end and gravity in one frame, such as gravity: {up}."
+            f"the cable does not hang along gravity {_vector(gravity)} m/s^2: {weightless}"
+            f"{found.told}. Try: points, start, end and gravity in one frame, such as gravity: "
+            f"{up}."
             + ("" if found.certain else " A strap that lifts the cable would look the same."),
             found.certain,
         ),

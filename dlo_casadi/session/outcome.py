@@ -96,7 +96,7 @@ class BranchShape:
 
 @dataclass(frozen=True)
 class EitherSide:
-    """A pose on both of the sides on which its cable may hang, see `Composition.tipped_by`.
+    """A pose on both of the sides on which its cable may hang, see `CableModel.tipped_by`.
 
     Parameters
     ----------

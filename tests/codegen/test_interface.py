@@ -83,6 +83,7 @@ def test_wrong_ends_give_a_status_and_zeros(links, end, status):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"end": None}, "pose: the end of the cable is pinned: where is it"),
         ({"end": "ab"}, "pose: end must have 2 numbers, found 'ab'"),
         ({"end": ("a", "b")}, r"numbers belong in a pose, found .*\('a', 'b'\)"),
         ({"end": [(0.3, -0.1), (0.4, 0.1)]}, "end must have 2 numbers"),
@@ -116,6 +117,9 @@ def test_many_poses_are_of_one_branch_or_rows_of_numbers(links):
         links.solve_many(way, branch="cw")
     with pytest.raises(DloError, match=r"an array \(m, 6\) as dlo_pose .* found \(2, 2\)"):
         links.solve_many(np.array(ends))
+    for rows in (np.array([["a"] * 6]), np.array([[None] * 6]), np.zeros((1, 6), complex)):
+        with pytest.raises(DloError, match=r"real numbers belong in the array, found (<U1|ob|com)"):
+            links.solve_many(rows)
 
 
 def test_not_finite_clamps_and_warm_starts(clamped):
@@ -243,6 +247,8 @@ def test_a_step_stays_on_its_branch_within_its_bound_on_the_work(solver, request
         short = solver.step(shape, near, steps=steps)
         assert short.status == status
         assert all_zero(short)
+    with pytest.raises(DloError, match=r"steps: a whole number .* found 1.5"):
+        solver.step(shape, near, steps=1.5)
 
 
 def test_sensitivity_of_a_shape_of_another_pose_is_refused(links):

@@ -66,6 +66,15 @@ def test_no_number_is_given_for_what_the_shapes_do_not_tell(outcome, interval, w
     assert " 17" not in text.split("Distance of the measured points")[0].split("points;")[1]
 
 
+def test_without_gravity_a_reading_is_asked_for_and_no_weight(outcome):
+    experiment = outcome.config.experiment.model_copy(update={"gravity": (0.0, 0.0)})
+    unknown = with_stiffness(outcome, (None, None))
+    assert "hang a known weight" in said(unknown)
+    text = said(replace(unknown, config=replace(outcome.config, experiment=experiment)))
+    assert "Try: end_force or start_force of a pose: without gravity" in text
+    assert "hang a known weight" not in text
+
+
 def test_a_parameter_on_its_bound_says_so(outcome):
     estimate = ParameterEstimate(0.0, 0.1, "kg", at_bound=True)
 

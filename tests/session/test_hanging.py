@@ -100,3 +100,30 @@ def test_a_strap_or_a_stiff_cable_is_doubted_but_not_refused():
     ]
     assert [item.better for item in found] == [True, True, False, False]
     assert [item.certain for item in found] == [False, True, False, False]
+    assert found[0].told.startswith("the lines are 0.008 m RMS from the shapes of any stiffness")
+    assert coarse.Comparison("y down", None, Left(0.001), 1.0).told == (
+        "no stiffness gives equilibria near the lines, but they are within 0.001 m with y down"
+    )
+
+
+def test_a_loop_of_which_only_the_ends_were_measured_is_no_mistake(tmp_path):
+    """No fit starts from a chord that has no loop; that a mirrored one does shows no weight."""
+    (tmp_path / "ends.csv").write_text("x_m,y_m\n0,0\n-0.125466,0.002561\n")
+    pose = {"file": "ends.csv", "start": [0.0, 0.0], "end": [-0.12, 0.0], "role": "fit"}
+    data = {
+        "cable": {
+            "length": 1.5,
+            "mass": 0.04077,
+            "diameter": 0.0039,
+            "bending_stiffness": 2.6e-3,
+        },
+        "experiment": {
+            "gravity": [0.0, -9.81],
+            "boundary": {"start": "clamped", "end": "clamped"},
+            "measurement": {"kind": "centerlines", "std": 1e-3},
+            "poses": [{**pose, "start_heading": 0.0, "end_heading": -6.283185}],
+        },
+    }
+    (tmp_path / "loop.yaml").write_text(dump_yaml(data))
+    config = load_config(tmp_path / "loop.yaml")
+    assert checks.find_suspicions(config, read_inputs(config, lambda *_: None)) == ()
