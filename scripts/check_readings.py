@@ -42,7 +42,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.mesh import fine_enough
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.io.files import write_file
-from dlo_casadi.report.canvas import BLUE, GREY, VERMILLION, figure
+from dlo_casadi.report.canvas import BLUE, GREY, VERMILLION, save_figure, styled
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import declared_model
@@ -262,7 +262,7 @@ def main() -> None:
 
 def draw(rows: list[dict], path: Path) -> None:
     """Evidence against the number of readings: medians and quartiles of all sets."""
-    with figure(path, (6.4, 4.2)) as drawing:
+    with styled((6.4, 4.2)) as drawing:
         axes = drawing.subplots()
         for (table, label), color in zip(RIVALS.items(), (BLUE, VERMILLION), strict=True):
             if table in rows[0]:
@@ -277,6 +277,7 @@ def draw(rows: list[dict], path: Path) -> None:
             title=f"{len(rows)} simulated cables: median and quartiles",
         )
         axes.legend()
+    save_figure(path, drawing)
 
 
 def gains_of(rows: list[dict], table: str) -> np.ndarray:

@@ -12,7 +12,8 @@ from dlo_casadi.api import PredictedShape, predict
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import command, console, print_json
 from dlo_casadi.errors import DloError
-from dlo_casadi.report.drawing import draw_prediction
+from dlo_casadi.report.canvas import save_figure
+from dlo_casadi.report.drawing import prediction_figure
 from dlo_casadi.report.terminal import prediction_table
 
 DRAWN = (".png", ".pdf", ".svg", ".jpg")
@@ -76,7 +77,7 @@ def main(argv: Sequence[str]) -> int:
         branch=chosen.branch,
     )
     if figure is not None:
-        draw_prediction(figure, shape.as_dict())
+        save_figure(figure, prediction_figure(shape.as_dict()))
     if chosen.json:
         print_json(shape.as_dict())
         return OK

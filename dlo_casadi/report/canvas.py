@@ -1,7 +1,11 @@
-"""Figures without a screen: sizes, colours and labels that all figures share."""
+"""Figures without a screen: what all share, and how one becomes a file or a part of a page."""
 
 from __future__ import annotations
 
+import io
+import re
+import textwrap
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,11 +20,10 @@ from numpy.typing import NDArray
 from dlo_casadi.io.files import write_file
 from dlo_casadi.session.outcome import Outcome, Stage, StageName
 
-# Okabe and Ito's colours, which the colour-blind can tell apart.
-BLACK, GREY = "#000000", "#6B6B6B"
-ORANGE, SKY, GREEN = "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILLION = "#0072B2", "#D55E00"
-HELD_OUT = "#CC79A7"  # poses that no fit saw
+# Colours that the colour-blind can tell apart, each at least 4.5 to 1 against white.
+BLACK, GREY = "#1F2933", "#6B7280"
+ORANGE, BLUE, GREEN, VERMILLION = "#B35A00", "#0067A3", "#00805A", "#9E2A00"
+HELD_OUT = "#8C3B6C"  # poses that no fit saw
 # By what name tables and charts have the RMS distance that the noise of points gives by itself.
 NOISE_ALONE = "noise alone"
 
@@ -47,28 +50,61 @@ _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "text.parse_math": False,  # a name with two dollar signs is no formula
 }
-_DPI = 150
+# Width [inch] of a chart: on a telephone its letters are still as large as that of a footnote.
+WIDTH = 4.8
+_SVG = "http://www.w3.org/2000/svg"
 
 
-@contextmanager
-def figure(
-    path: Path, size: tuple[float, float], layout: Literal["constrained"] | None = "constrained"
-) -> Iterator[Figure]:
-    """Open a figure of a size [inch] and save it to a file when it is drawn."""
-    with styled(size, layout) as drawing:
-        yield drawing
-        save_figure(path, drawing, _DPI)
-
-
-def save_figure(path: Path, drawing: Figure, dpi: float) -> None:
+def save_figure(path: Path, drawing: Figure, dpi: float = 150) -> None:
     """Write a figure in the format of the file's ending, whole or not at all."""
-    form, layout = path.suffix[1:], drawing.get_layout_engine()
+    with mpl.rc_context(_STYLE):
+        _lay_out(drawing, dpi)
+        write_file(path, lambda stream: drawing.savefig(stream, format=path.suffix[1:], dpi=dpi))
+
+
+def inline_svg(drawing: Figure, name: str) -> str:
+    """A figure as a part of a page, where several stand side by side.
+
+    Of an artist with a gid, the gid becomes the id of its group, and its label is what the browser
+    tells at the pointer. All other ids are made of the `name` of the chart.
+    """
+    text = io.StringIO()
+    with mpl.rc_context(_STYLE | {"svg.fonttype": "none", "svg.hashsalt": name}):
+        _lay_out(drawing, 72)
+        drawing.savefig(text, format="svg", metadata={"Date": None})
+    root = ET.fromstring(text.getvalue())
+    for unwanted in root[:2]:  # metadata, and a style that would be one of the whole page
+        root.remove(unwanted)
+    root.attrib = {"viewBox": root.attrib["viewBox"]}
+    told = {item.get_gid(): str(item.get_label()) for item in drawing.findobj() if item.get_gid()}
+    defined = {node.get("id") for part in root.iter(f"{{{_SVG}}}defs") for node in part.iter()}
+    for node in root.iter():
+        if node.get("id") in told:
+            title = ET.Element(f"{{{_SVG}}}title")
+            title.text = told[node.get("id")]
+            node.insert(0, title)
+        elif node.get("id") not in defined:
+            node.attrib.pop("id", None)
+        if "d" in node.attrib:
+            node.set("d", re.sub(r"(\.\d\d)\d+", r"\1", node.attrib["d"]))
+    ET.register_namespace("", _SVG)
+    ET.register_namespace("xlink", "http://www.w3.org/1999/xlink")
+    return ET.tostring(root, encoding="unicode")
+
+
+def _lay_out(drawing: Figure, dpi: float) -> None:
+    """Lay a figure out once: one that still has an engine is drawn twice each time."""
     drawing.set_dpi(dpi)
+    layout = drawing.get_layout_engine()
     if layout is not None:
-        # A figure that still has an engine is drawn twice: for its layout, and for the file.
         layout.execute(drawing)
         drawing.set_layout_engine(None)
-    write_file(path, lambda stream: drawing.savefig(stream, format=form, dpi=dpi))
+
+
+def headline(drawing: Figure, text: str) -> None:
+    """Write what a figure shows above it, in lines that are no wider than it."""
+    letters = int(12 * drawing.get_figwidth())
+    drawing.suptitle(textwrap.fill(text, letters, break_on_hyphens=False), fontsize=11)
 
 
 def drawn(drawing: Figure, dpi: float) -> NDArray[np.uint8]:
@@ -104,6 +140,16 @@ def before_after(outcome: Outcome) -> tuple[Stage | None, Stage | None]:
     name: StageName = "batch" if after.name == "closed" else "initial"
     before = next((stage for stage in with_shapes if stage.name == name), None)
     return (None if before is after else before), after
+
+
+# A stage that is compared: "before" or "after", what to call it, and the stage.
+Compared = tuple[str, str, Stage]
+
+
+def compared(outcome: Outcome) -> list[Compared]:
+    """The stages of `before_after` that there are."""
+    stages = zip(("before", "after"), before_after(outcome), strict=True)
+    return [(kind, label_of(stage, outcome), stage) for kind, stage in stages if stage is not None]
 
 
 def label_of(stage: Stage, outcome: Outcome) -> str:

@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from dlo_casadi.report.canvas import BLACK, BLUE, GREY, VERMILLION, figure, styled
+from dlo_casadi.report.arrows import arrow
+from dlo_casadi.report.canvas import BLACK, BLUE, GREY, VERMILLION, styled
 from dlo_casadi.report.geometry import band_outline
 
-_SIZE = (7.0, 6.0)
-# Room for the number at the tip of an arrow, as a share of the drawing.
-_LABEL = 0.12
+# How far beyond the tip of an arrow its number stands, as a share of its length.
+_LABEL = 0.2
 
 
-def draw_prediction(path: Path, shape: dict[str, Any]) -> None:
-    """Draw a predicted shape with the forces on its fixtures into a file.
+def prediction_figure(shape: dict[str, Any]) -> Figure:
+    """A predicted shape with the forces on its fixtures.
 
     Parameters
     ----------
     shape : dict
         As from `PredictedShape.as_dict`.
     """
-    with figure(path, _SIZE) as drawing:
-        _draw(drawing, shape)
-
-
-def prediction_figure(shape: dict[str, Any]) -> Figure:
-    """The same as a figure."""
-    with styled(_SIZE) as drawing:
+    with styled((7.0, 6.0)) as drawing:
         _draw(drawing, shape)
     return drawing
 
@@ -59,26 +52,13 @@ def _draw(drawing: Figure, shape: dict[str, Any]) -> None:
         size = float(np.linalg.norm(force))
         if size <= 1e-3 * largest or largest == 0:
             continue
-        tip = at + reach * force
-        if in_space:
-            axes.quiver(*at, *(tip - at), color=VERMILLION, lw=1.8, arrow_length_ratio=0.15)
-            axes.text(*tip, f"{size:.3g} N", color=VERMILLION)
-            continue
-        arrow = {"arrowstyle": "-|>", "color": VERMILLION, "lw": 1.8}
-        axes.annotate("", xy=(tip[0], tip[1]), xytext=(at[0], at[1]), arrowprops=arrow)
-        axes.annotate(
-            f"{size:.3g} N",
-            xy=(tip[0], tip[1]),
-            xytext=(8 * force[0] / size, 10 * force[1] / size),
-            textcoords="offset points",
-            color=VERMILLION,
-            ha="left" if force[0] > 0 else "right",
-            va="bottom" if force[1] > 0 else "top",
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
-        )
-        # Annotations do not count for the axes' limits: keep room for the arrow and its number.
-        room = _LABEL * max(span, reach * largest) * force / size
-        axes.plot(*np.transpose([tip, tip + room]), alpha=0)
+        drawn = arrow(at, reach * force)
+        axes.plot(*drawn.T, color=VERMILLION, lw=1.8)
+        beyond = at + (1 + _LABEL) * reach * force
+        paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
+        number = axes.text(*beyond, f"{size:.3g} N", ha="center", va="center", bbox=paper)
+        number.set_color(VERMILLION)
+        axes.plot(*beyond[:, None], alpha=0)  # a text does not count for the axes' limits
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.12)
     axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})

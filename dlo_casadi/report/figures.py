@@ -1,130 +1,275 @@
-"""Figures of a run: residuals, rest curvature, errors, candidates, the unexplained load."""
+"""Figures of a run: errors, residuals, rest curvature, candidates, the board.
+
+Those of a run are drawn once: the page has them as they are, and each is a file of its own.
+"""
 
 from __future__ import annotations
 
-import math
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, StrMethodFormatter
+from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 from dlo_casadi.estimation.moment import LEAST_POINTS, law_of, measured_moment_curve
 from dlo_casadi.report.canvas import (
     BLACK,
     BLUE,
-    GREEN,
     GREY,
     HELD_OUT,
     NOISE_ALONE,
     ORANGE,
-    SKY,
     VERMILLION,
+    WIDTH,
     before_after,
-    figure,
+    compared,
+    headline,
     label_of,
     millimetres,
+    save_figure,
+    styled,
 )
-from dlo_casadi.report.figures_room import draw_marks, frame_room
-from dlo_casadi.report.geometry import (
-    directions,
-    measured_line,
-    residual_along,
-    residual_range,
-    rest_about,
-)
-from dlo_casadi.report.scene import pull_marks, scene_of
-from dlo_casadi.report.text_findings import finding_of
-from dlo_casadi.session.outcome import Outcome
+from dlo_casadi.report.figures_room import STYLES, draw_marks, frame
+from dlo_casadi.report.geometry import directions, residual_along, residual_range, rest_about
+from dlo_casadi.report.room import Mark, Room
+from dlo_casadi.report.scene import Board, next_marks, pull_marks, scene_of
+from dlo_casadi.report.text_findings import cross_validated, finding_of
+from dlo_casadi.session.outcome import Outcome, PoseInput
+from dlo_casadi.thresholds import NORMAL_95
 
 # A candidate that was not refitted.
 _UNTRIED = "#C8C8C8"
+# Where noise lies 95 % of the time.
+_BAND = "#E8EEF3"
 # Behind a number that may lie on a line.
 _PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+# Errors beyond these are drawn at the edge of an axis [mm].
+_LEAST_MM, _MOST_MM = 1e-9, 1e9
+# A line of more points looks the same.
+_POINTS = 600
+_DPI = 200
 
 
-def write_figures(folder: Path, outcome: Outcome) -> None:
-    """Draw residuals, parameters and findings, as far as there are any, into a folder."""
-    if any(stage.shapes for stage in outcome.stages):
-        draw_residuals(folder / "residuals.png", outcome)
-        draw_rest_curvature(folder / "rest_curvature.png", outcome)
-    if outcome.measurement.readings and outcome.stages[-1].shapes:
-        draw_readings(folder / "readings.png", outcome)
-    draw_errors(folder / "errors.png", outcome)
-    if outcome.candidates:
-        draw_candidates(folder / "candidates.png", outcome)
-    if outcome.unexplained is not None:
-        draw_unexplained(folder / "unexplained.png", outcome)
-    if outcome.config.experiment.boundary.end == "free":
-        draw_moment(folder / "moment.png", outcome)
+def figures_of(outcome: Outcome) -> dict[str, Figure]:
+    """Errors, residuals, parameters and findings, as far as there are any, by their names."""
+    last, end = outcome.stages[-1], outcome.config.experiment.boundary.end
+    with_shapes = any(stage.shapes for stage in outcome.stages)
+    wanted: list[tuple[str, object, Callable[[Outcome], Figure | None]]] = [
+        ("errors", True, errors_figure),
+        ("pose_errors", with_shapes, pose_errors_figure),
+        ("residuals", with_shapes, residuals_figure),
+        ("rest_curvature", with_shapes, rest_curvature_figure),
+        ("readings", outcome.measurement.readings and last.shapes, readings_figure),
+        ("candidates", outcome.candidates, candidates_figure),
+        ("unexplained", outcome.unexplained, unexplained_figure),
+        ("next_pose", outcome.next_pose, next_pose_figure),
+        ("moment", end == "free", moment_figure),
+    ]
+    drawn = {name: draw(outcome) for name, needed, draw in wanted if needed}
+    return {name: drawing for name, drawing in drawn.items() if drawing is not None}
+
+
+def write_figures(folder: Path, drawn: Mapping[str, Figure]) -> None:
+    """Write figures by their names into a folder."""
+    for name, drawing in drawn.items():
+        save_figure(folder / f"{name}.png", drawing, _DPI)
+
+
+# ---- errors ------------------------------------------------------------------------------------
+
+
+_KINDS = {"fit": ("o", BLUE), "cross-validated": ("D", BLUE), "held out": ("s", HELD_OUT)}
+
+
+def errors_figure(outcome: Outcome) -> Figure:
+    """Errors of all stages as points on a logarithmic axis, with that of noise alone."""
+    validated = cross_validated(outcome)
+    floor = outcome.measurement.noise_distance
+    shown = ["fit", *["cross-validated"] * bool(validated)]
+    shown += ["held out"] * bool(outcome.measurement.poses_held_out)
+    rows = []
+    for k, stage in enumerate(outcome.stages):
+        values = (stage.rmse_fit, validated.get(stage.name), stage.rmse_held_out)
+        known = dict(zip(_KINDS, values, strict=True))
+        own = [kind for kind in shown if kind != "cross-validated" or stage.name in validated]
+        rows += [(k, kind, known[kind]) for kind in own]
+    places = [-(i + 0.8 * k) for i, (k, *_) in enumerate(rows)]
+    with styled((WIDTH, 1.6 + 0.2 * len(rows) + 0.2 * len(outcome.stages))) as drawing:
+        axes = drawing.subplots()
+        left, right = _error_axis(axes, [value for *_, value in rows], floor, 4.0)
+        for y, (_, kind, value) in zip(places, rows, strict=True):
+            if value is None or not np.isfinite(value):
+                axes.text(1.1 * left, y, "no value", va="center", color=GREY, bbox=_PAPER)
+                continue
+            marker, color = _KINDS[kind]
+            at = float(np.clip(1e3 * value, left, right))
+            fill = "white" if kind == "cross-validated" else color
+            axes.plot(at, y, marker, color=color, mfc=fill, ms=7)
+            # Beyond the line of the noise, not on it.
+            beside = max(at, 1e3 * floor) if at > 500 * floor else at
+            axes.annotate(
+                millimetres(value),
+                (min(beside, right / 4), y),
+                xytext=(7, 0),
+                textcoords="offset points",
+                va="center",
+                bbox=_PAPER,
+            )
+        middles = [
+            np.mean([y for y, (own, *_) in zip(places, rows, strict=True) if own == k])
+            for k in range(len(outcome.stages))
+        ]
+        names = [textwrap.fill(label_of(stage, outcome), 18) for stage in outcome.stages]
+        axes.set_yticks(middles, names)
+        handles = [_dot(kind, *_KINDS[kind]) for kind in shown]
+        drawing.legend(handles=[*handles, _floor(floor)], loc="outside lower center", ncols=2)
+        headline(drawing, f"{outcome.config.cable.name}: error of each stage")
+    return drawing
+
+
+def pose_errors_figure(outcome: Outcome) -> Figure:
+    """Error of every pose, before and after; a row of it can be chosen on the page."""
+    floor = outcome.measurement.noise_distance
+    looks = {"before": (ORANGE, "^"), "after": (BLUE, "o")}
+    stages = [(stage, label, *looks[kind]) for kind, label, stage in compared(outcome)]
+    with styled((WIDTH, 1.6 + 0.2 * len(stages) + 0.22 * max(3, len(outcome.poses)))) as drawing:
+        axes = drawing.subplots()
+        found = [[stage.shapes.get(x.name) for stage, *_ in stages] for x in outcome.poses]
+        errors = [[None if shape is None else shape.rmse for shape in own] for own in found]
+        left, right = _error_axis(axes, (x for own in errors for x in own), floor, 1.6)
+        for k, (pose, own) in enumerate(zip(outcome.poses, errors, strict=True)):
+            at = np.clip([np.nan if x is None else 1e3 * x for x in own], left, right)
+            axes.plot(at, [-k] * len(at), color=GREY, lw=1.2, zorder=1)
+            said = []
+            for x, error, (_, label, color, marker) in zip(at, own, stages, strict=True):
+                fill = "white" if pose.role == "held_out" else color
+                axes.plot(x, -k, marker, color=color, mfc=fill, mew=1.5, ms=6)
+                said.append(f"{label} {millimetres(error)}")
+            row = axes.axhspan(-k - 0.5, 0.5 - k, alpha=0.0, zorder=10)
+            row.set(gid=f"choose-{k}", label="; ".join([_name(pose), *said]))
+        axes.set_yticks(range(0, -len(outcome.poses), -1), [_short(x.name) for x in outcome.poses])
+        axes.set_ylim(0.6 - len(outcome.poses), 0.6)
+        handles = [_dot(label, marker, color) for _, label, color, marker in stages]
+        handles.append(_floor(floor))
+        if any(pose.role == "held_out" for pose in outcome.poses):
+            handles.append(_dot("hollow: held out", "o", GREY, fill="white"))
+        drawing.legend(handles=handles, loc="outside lower center", ncols=1)
+        headline(drawing, f"{outcome.config.cable.name}: error of each pose")
+    return drawing
+
+
+def _error_axis(
+    axes: Axes, values: Iterable[float | None], floor: float, beyond: float
+) -> tuple[float, float]:
+    """Make x logarithmic for errors [m]; its range [mm] is finite, and `beyond` the largest."""
+    known = [
+        min(max(1e3 * x, _LEAST_MM), _MOST_MM) for x in (*values, floor) if x and 0 < x < np.inf
+    ]
+    low, high = min(known, default=0.1) / 1.6, max(known, default=10.0) * beyond
+    axes.set(xscale="log", xlim=(low, high), xlabel="RMS distance [mm]")
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    apart = max(1, len(decades) // 5)
+    steps = (1,) if high / low > 300 else (1, 3) if high / low > 30 else (1, 2, 5)
+    ticks = [float(f"{step * tens:.0e}") for tens in decades[::apart] for step in steps]
+    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.grid(visible=False, axis="y")
+    axes.axvline(1e3 * floor, color=BLACK, ls="--", lw=1.2, zorder=0.9)
+    return low, high
+
+
+def _dot(label: str, marker: str, color: str, fill: str = "") -> Line2D:
+    fill = fill or ("white" if marker == "D" else color)
+    return Line2D([], [], ls="none", ms=7, marker=marker, color=color, mfc=fill, label=label)
+
+
+def _floor(floor: float) -> Line2D:
+    return Line2D([], [], color=BLACK, ls="--", label=f"{NOISE_ALONE} {millimetres(floor)}")
+
+
+def _name(pose: PoseInput) -> str:
+    return f"{pose.name} (held out)" if pose.role == "held_out" else pose.name
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 18 else f"{name[:17]}…"
 
 
 # ---- residuals ---------------------------------------------------------------------------------
 
 
-def draw_residuals(path: Path, outcome: Outcome) -> None:
-    """Normal distance of the measured points from the prediction along the arc, in noise units."""
-    before, after = before_after(outcome)
-    stages = [stage for stage in (before, after) if stage is not None]
-    panels = [(stage, direction) for stage in stages for direction in directions(outcome)]
-    with figure(path, (8.5, 0.9 + 2.7 * len(panels))) as drawing:
+def residuals_figure(outcome: Outcome) -> Figure:
+    """Residual along the arc in noise units, before and after, a line for each pose."""
+    panels = [(*found, way) for found in compared(outcome) for way in directions(outcome)]
+    noise = outcome.measurement.std
+    with styled((WIDTH, 1.4 + 1.9 * len(panels))) as drawing:
         grid = drawing.subplots(len(panels), 1, squeeze=False, sharex=True)
-        for axes, (stage, direction) in zip(grid[:, 0], panels, strict=True):
-            axes.axhspan(-2, 2, color="#EDEDED", zorder=0)
+        for axes, (kind, label, stage, direction) in zip(grid[:, 0], panels, strict=True):
+            axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
             axes.axhline(0, color=GREY, lw=0.8)
-            for pose in outcome.poses:
+            for k, pose in enumerate(outcome.poses):
                 shape = stage.shapes.get(pose.name)
                 if shape is None:
                     continue
                 held_out = pose.role == "held_out"
+                every = slice(None, None, -(-len(shape.s) // _POINTS) or 1)
+                error = "" if shape.rmse is None else f", RMS distance {millimetres(shape.rmse)}"
                 axes.plot(
-                    shape.s,
-                    residual_along(shape, direction) / outcome.measurement.std,
+                    shape.s[every],
+                    residual_along(shape, direction)[every] / noise,
                     color=HELD_OUT if held_out else BLUE,
+                    ls="--" if held_out else "-",
                     lw=1.1,
                     alpha=0.85 if held_out else 0.45,
                     zorder=3 if held_out else 2,
+                    gid=f"residual-{kind}-{k}{direction and f'-{direction}'}",
+                    label=_name(pose) + error,
                 )
             chi2 = stage.chi2_per_dof
-            quality = "" if chi2 is None else f" (chi-square per degree of freedom {chi2:.3g})"
-            along = direction and f", along {direction}"
-            axes.set_title(label_of(stage, outcome) + along + quality, loc="left")
-            axes.set_ylabel("distance / noise")
-            axes.set_ylim(residual_range(stage, outcome.measurement.std))
+            quality = "" if chi2 is None else f", χ²\u00a0per\u00a0dof\u00a0{chi2:.3g}"
+            title = f"{kind}: {label}{direction and f', along {direction}'}"
+            axes.set_title(textwrap.fill(title + quality, 52), loc="left")
+            axes.set_ylabel("residual [noise std]")
+            axes.set_ylim(residual_range(stage, noise))
         grid[-1, 0].set_xlabel("arc length from the start s [m]")
         grid[-1, 0].set_xlim(0, outcome.config.cable.length)
-        handles = [Line2D([], [], color=BLUE, label="fit pose")]
-        if outcome.measurement.poses_held_out:
-            handles.append(Line2D([], [], color=HELD_OUT, label="held-out pose"))
-        handles.append(_noise_band())
-        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
-        drawing.suptitle(
-            f"{outcome.config.cable.name}: measured minus predicted, noise std "
-            f"{millimetres(outcome.measurement.std)} ({outcome.measurement.std_source})",
-            fontsize=12,
+        _legend_of_poses(drawing, outcome.poses, "")
+        headline(
+            drawing,
+            f"{outcome.config.cable.name}: residuals, noise std "
+            f"{millimetres(noise)} ({outcome.measurement.std_source})",
         )
+    return drawing
 
 
-# ---- readings ----------------------------------------------------------------------------------
+def _legend_of_poses(drawing: Figure, poses: Iterable[PoseInput], marker: str) -> None:
+    """Tell fit poses, held-out poses if there are any, and the band of noise apart."""
+    style: dict[str, Any] = {"marker": marker, "ls": "none"} if marker else {}
+    handles = [Line2D([], [], color=BLUE, label="fit pose", **style)]
+    if any(pose.role == "held_out" for pose in poses):
+        held = {"ls": "--"} | style
+        handles.append(Line2D([], [], color=HELD_OUT, label="held-out pose", **held))
+    handles.append(Line2D([], [], color=_BAND, lw=8, label="95 % of the noise lies within"))
+    drawing.legend(handles=handles, loc="outside lower center", ncols=2)
 
 
-def _noise_band() -> Line2D:
-    return Line2D([], [], color="#EDEDED", lw=8, label="95 % of the noise lies within")
-
-
-def draw_readings(path: Path, outcome: Outcome) -> None:
+def readings_figure(outcome: Outcome) -> Figure:
     """Forces and moments on the fixtures, measured minus predicted, in units of their noise."""
     stage = outcome.stages[-1]
     names = sorted({name for shape in stage.shapes.values() for name in shape.readings})
     poses = [x for x in outcome.poses if x.name in stage.shapes and stage.shapes[x.name].readings]
-    with figure(path, (8.5, 0.9 + 2.4 * len(names))) as drawing:
+    with styled((8.5, 0.9 + 2.4 * len(names))) as drawing:
         grid = drawing.subplots(len(names), 1, squeeze=False, sharex=True)
         for axes, name in zip(grid[:, 0], names, strict=True):
             std, unit = outcome.measurement.std_of(name.split("_")[1])
-            axes.axhspan(-2, 2, color="#EDEDED", zorder=0)
+            axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
             axes.axhline(0, color=GREY, lw=0.8)
             for k, pose in enumerate(poses):
                 if name not in stage.shapes[pose.name].readings:
@@ -141,28 +286,23 @@ def draw_readings(path: Path, outcome: Outcome) -> None:
             axes.set_ylabel("residual / noise")
         ticks = [pose.name for pose in poses]
         grid[-1, 0].set_xticks(range(len(poses)), ticks, rotation=60, ha="right", fontsize=8)
-        handles = [Line2D([], [], color=BLUE, marker="o", ls="none", label="fit pose")]
-        if any(pose.role == "held_out" for pose in poses):
-            handles.append(
-                Line2D([], [], color=HELD_OUT, marker="o", ls="none", label="held-out pose")
-            )
-        handles.append(_noise_band())
-        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
-        drawing.suptitle(
+        _legend_of_poses(drawing, poses, "o")
+        headline(
+            drawing,
             f"{outcome.config.cable.name}: readings, measured minus predicted "
             f"({label_of(stage, outcome)})",
-            fontsize=12,
         )
+    return drawing
 
 
 # ---- rest curvature ----------------------------------------------------------------------------
 
 
-def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
+def rest_curvature_figure(outcome: Outcome) -> Figure:
     """Rest curvature of the last stage with its band, and of the fit that it improves on."""
     before, after = before_after(outcome)
     shown = directions(outcome)
-    with figure(path, (8.5, 3.8 + 2.4 * (len(shown) - 1))) as drawing:
+    with styled((WIDTH, 1.9 + 1.9 * len(shown))) as drawing:
         grid = drawing.subplots(len(shown), 1, squeeze=False, sharex=True)
         for axes, direction in zip(grid[:, 0], shown, strict=True):
             if before is not None and before.name == "batch":
@@ -170,9 +310,17 @@ def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
                 axes.plot(rest.s, rest.value, "--", color=ORANGE, label=label_of(before, outcome))
             if after is not None:
                 rest = rest_about(after, direction)
-                band = np.stack([rest.value - 2 * rest.std, rest.value + 2 * rest.std])
+                half = NORMAL_95 * rest.std
                 axes.plot(rest.s, rest.value, color=BLUE, label=label_of(after, outcome))
-                axes.fill_between(rest.s, *band, color=BLUE, alpha=0.2, lw=0, label="its 95 % band")
+                axes.fill_between(
+                    rest.s,
+                    rest.value - half,
+                    rest.value + half,
+                    color=BLUE,
+                    alpha=0.2,
+                    lw=0,
+                    label="its 95 % band",
+                )
             axes.axhline(0, color=GREY, lw=0.8)
             about = direction and f" k_{direction}"
             axes.set(
@@ -180,21 +328,22 @@ def draw_rest_curvature(path: Path, outcome: Outcome) -> None:
                 ylabel=f"rest curvature{about} [1/m]",
             )
         grid[-1, 0].set_xlabel("arc length from the start s [m]")
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        drawing.legend(handles, labels, loc="outside lower center", ncols=3)
+        handles, _ = grid[0, 0].get_legend_handles_labels()
+        drawing.legend(handles=handles, loc="outside lower center", ncols=1)
         straight = outcome.config.cable.rest_shape == "straight"
         note = "declared straight, not fitted" if straight else "shape without load"
-        drawing.suptitle(f"{outcome.config.cable.name}: rest curvature ({note})", fontsize=12)
+        headline(drawing, f"{outcome.config.cable.name}: rest curvature ({note})")
+    return drawing
 
 
-def draw_moment(path: Path, outcome: Outcome) -> None:
+def moment_figure(outcome: Outcome) -> Figure | None:
     """Bending moment against curvature of a cable with a free end, measured and fitted."""
     cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
     weight = outcome.fit.mass / cable.length * float(np.linalg.norm(gravity))
     shown = [p for p in outcome.poses if p.role == "fit" and len(p.points) >= LEAST_POINTS]
     if not weight or not shown or cable.rest_shape != "straight":
-        return  # the moment needs the weight, and the bend the shape without load
-    with figure(path, (8.5, 4.5)) as drawing:
+        return None  # the moment needs the weight, and the bend the shape without load
+    with styled((WIDTH, 3.8)) as drawing:
         axes = drawing.subplots()
         most = 0.0
         for pose in shown:
@@ -206,80 +355,21 @@ def draw_moment(path: Path, outcome: Outcome) -> None:
         law = law_of(outcome.fit.model, outcome.fit.p, grid)
         axes.plot(grid, 1e3 * law, color=VERMILLION, label="fitted law of the section")
         axes.set(xlabel="curvature [1/m]", ylabel="bending moment [N mm]", xlim=(0, None))
-        drawing.legend(loc="outside lower center", ncols=2)
-        drawing.suptitle(f"{cable.name}: moment against curvature", fontsize=12)
-
-
-# ---- errors ------------------------------------------------------------------------------------
-
-
-def draw_errors(path: Path, outcome: Outcome) -> None:
-    """Errors of all stages as points on a logarithmic axis, with that of noise alone."""
-    rows: list[tuple[str, str, float | None]] = []
-    for stage in outcome.stages:
-        label = label_of(stage, outcome)
-        rows.append((label, "fit", stage.rmse_fit))
-        if outcome.measurement.poses_held_out:
-            rows.append((label, "held_out", stage.rmse_held_out))
-    known = [value for *_, value in rows if value and np.isfinite(value)]
-    floor = outcome.measurement.noise_distance
-    left, right = min([*known, floor]) / 2, 3.5 * max([*known, floor])
-    per_stage = 2 if outcome.measurement.poses_held_out else 1
-    with figure(path, (8.5, 1.7 + 0.36 * len(rows))) as drawing:
-        axes = drawing.subplots()
-        for k, (_, role, value) in enumerate(rows):
-            y = -(k + 0.8 * (k // per_stage))
-            color = BLUE if role == "fit" else HELD_OUT
-            if value is None or not np.isfinite(value):
-                axes.text(1.1e3 * left, y, "no value", va="center", color=GREY)
-                continue
-            axes.plot(1e3 * value, y, "o" if role == "fit" else "s", color=color, ms=8)
-            axes.text(
-                # Beyond the line of the noise, not on it.
-                1.08e3 * (floor if 0.5 * floor < value < floor else value),
-                y,
-                millimetres(value),
-                va="center",
-                fontsize=9,
-                bbox=_PAPER,
-            )
-        axes.axvline(1e3 * floor, color=BLACK, ls="--", lw=1.2, zorder=1.5)
-        middles = [
-            -(k + 0.8 * (k // per_stage)) - (per_stage - 1) / 2
-            for k in range(0, len(rows), per_stage)
-        ]
-        axes.set_yticks(middles, [rows[k][0] for k in range(0, len(rows), per_stage)])
-        axes.set_xscale("log")
-        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-        for part in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
-            part(StrMethodFormatter("{x:g}"))
-        axes.set_xlim(1e3 * left, 1e3 * right)
-        axes.grid(visible=False, axis="y")
-        axes.set_xlabel("distance of the measured points from the prediction, RMS [mm]")
-        handles = [_dot("o", BLUE, "fit poses")]
-        if per_stage == 2:
-            handles.append(_dot("s", HELD_OUT, "held-out poses"))
-        handles.append(
-            Line2D([], [], color=BLACK, ls="--", label=f"{NOISE_ALONE} {millimetres(floor)}")
-        )
-        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
-        drawing.suptitle(f"{outcome.config.cable.name}: error of each stage", fontsize=12)
-
-
-def _dot(marker: str, color: str, label: str) -> Line2D:
-    return Line2D([], [], ls="none", ms=8, marker=marker, color=color, label=label)
+        drawing.legend(loc="outside lower center", ncols=1)
+        headline(drawing, f"{cable.name}: moment against curvature")
+    return drawing
 
 
 # ---- diagnosis ---------------------------------------------------------------------------------
 
 
-def draw_candidates(path: Path, outcome: Outcome) -> None:
+def candidates_figure(outcome: Outcome) -> Figure:
     """Candidates for a missing effect: score, and cross-validated error where refitted."""
     added = {effect["name"] for effect in outcome.effects}
     tied = {name for effect in outcome.effects for name in effect["indistinguishable_from"]}
     rows = list(outcome.candidates)
     scores = [row["score"] or 0.0 for row in rows]
-    with figure(path, (8.5, 1.9 + 0.36 * len(rows))) as drawing:
+    with styled((8.5, 1.9 + 0.36 * len(rows))) as drawing:
         axes = drawing.subplots()
         for k, (row, score) in enumerate(zip(rows, scores, strict=True)):
             tried = row["reason"] or row["rmse_cross_validated"] is not None
@@ -314,56 +404,54 @@ def draw_candidates(path: Path, outcome: Outcome) -> None:
             title = "candidates tried; what is left is not explained by any"
         elif not outcome.effects:
             title = "candidates tried; the declared model needs none"
-        drawing.suptitle(f"{outcome.config.cable.name}: {title}", fontsize=12)
+        headline(drawing, f"{outcome.config.cable.name}: {title}")
+    return drawing
 
 
-def draw_unexplained(path: Path, outcome: Outcome) -> None:
+# ---- the board ---------------------------------------------------------------------------------
+
+
+def unexplained_figure(outcome: Outcome) -> Figure:
     """Where the cable is pulled, and how, in each fit pose."""
     load = outcome.unexplained
     assert load is not None
-    with figure(path, (8.5, 7.0)) as drawing:
-        axes = drawing.subplots()
-        if outcome.config.experiment.in_space:
-            room, under = scene_of(outcome)
-            draw_marks(axes, [*under, *pull_marks(outcome, room)])
-            frame_room(axes, room)
-        else:
-            _draw_pull(axes, outcome, load)
-        low, high = load["interval_95"]
-        size = math.hypot(*load["force"])
-        handles = [
-            Line2D([], [], color=SKY, label="fit poses"),
-            Line2D([], [], color=GREEN, lw=4, label=f"pulled at {low:.3f} to {high:.3f} m (95 %)"),
-            Line2D([], [], color=VERMILLION, label=f"force, on average {size:.3g} N"),
-        ]
-        drawing.legend(handles=handles, loc="outside lower center", ncols=3)
-        drawing.suptitle(
-            f"{outcome.config.cable.name}: unexplained, pulled by something that is not in the "
-            "model",
-            fontsize=12,
-        )
-
-
-def _draw_pull(axes: Axes, outcome: Outcome, load: dict[str, Any]) -> None:
-    names = load.get("poses") or [
-        pose.name for pose in outcome.poses if pose.role == "fit" and len(pose.points)
+    low, high = load["interval_95"]
+    size = float(np.linalg.norm(load["force"]))
+    handles = [
+        _line_of("taken", "measured"),
+        _line_of("pulled", f"pulled at {low:.3f} to {high:.3f} m (95 %)"),
+        _line_of("pull", f"force in each pose, on average {size:.3g} N"),
     ]
-    length = outcome.config.cable.length
-    forces = np.array(load["force_per_pose"], dtype=float).reshape(-1, 2)
-    reach = 0.25 * length / max(float(np.hypot(*forces.T).max(initial=0.0)), 1e-12)
-    for name, force in zip(names, forces, strict=False):
-        line = measured_line(outcome, name)
-        if line is None:
-            continue
-        places, points = line
-        axes.plot(*points.T, color=SKY, lw=1.2)
-        pulled = np.linspace(load["interval_95"][0], load["interval_95"][1], 9)
-        part = [np.interp(pulled, places, points[:, i]) for i in (0, 1)]
-        axes.plot(*part, color=GREEN, lw=5, solid_capstyle="butt")
-        root = [np.interp(load["position"], places, points[:, i]) for i in (0, 1)]
-        tip = [root[i] + reach * force[i] for i in (0, 1)]
-        arrow = {"arrowstyle": "-|>", "color": VERMILLION, "lw": 1.6}
-        axes.annotate("", xy=(tip[0], tip[1]), xytext=(root[0], root[1]), arrowprops=arrow)
-        axes.plot(*tip, alpha=0)  # an annotation does not count for the axes' limits
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="x [m]", ylabel="y [m]")
+    said = "unexplained, pulled by something that is not in the model"
+    return _scene_figure(outcome, pull_marks, handles, said)
+
+
+def next_pose_figure(outcome: Outcome) -> Figure:
+    """Where to hold the end in the next pose, among those that were taken."""
+    handles = [
+        _line_of("taken", "measured"),
+        _dot("next end", "P", VERMILLION),
+        _dot("starts", "s", BLACK),
+        _dot("ends", "o", BLACK),
+    ]
+    return _scene_figure(outcome, next_marks, handles, "which pose to measure next")
+
+
+def _scene_figure(
+    outcome: Outcome,
+    marks: Callable[[Outcome, Room | Board], list[Mark]],
+    handles: list[Line2D],
+    said: str,
+) -> Figure:
+    with styled((WIDTH, 4.6)) as drawing:
+        place, under = scene_of(outcome)
+        axes = drawing.subplots()
+        draw_marks(axes, [*under, *marks(outcome, place)])
+        frame(axes, place)
+        drawing.legend(handles=handles, loc="outside lower center", ncols=1 + len(handles) // 4)
+        headline(drawing, f"{outcome.config.cable.name}: {said}")
+    return drawing
+
+
+def _line_of(kind: str, label: str) -> Line2D:
+    return Line2D([], [], **STYLES[kind], label=label)

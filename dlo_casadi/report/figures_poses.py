@@ -21,11 +21,12 @@ from dlo_casadi.report.canvas import (
     HELD_OUT,
     ORANGE,
     before_after,
-    figure,
     label_of,
     millimetres,
+    save_figure,
+    styled,
 )
-from dlo_casadi.report.figures_room import FORCE, STYLES, draw_marks, frame_room
+from dlo_casadi.report.figures_room import FORCE, STYLES, draw_marks, frame
 from dlo_casadi.report.geometry import band_outline, magnified
 from dlo_casadi.report.room import Room, around, rooms, seen
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
@@ -33,7 +34,6 @@ from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 FloatArray = NDArray[np.floating]
 
 _POSES_A_PAGE = 20
-_HELD_OUT_TEXT = "#8C3B6C"
 # A typical deviation is drawn about this share of the cable's length wide.
 _VISIBLE = 0.02
 _FACTORS = (1, 5, 10, 20, 50, 100)
@@ -67,7 +67,7 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
         span = standing[0].window
     size, spaces = _laid_out(rows, columns, float(span[1] / span[0]), ticks=not standing)
     # Asked where every tick and title ends, an engine would take as long as all the drawing.
-    with figure(path, size, layout=None) as drawing:
+    with styled(size, layout=None) as drawing:
         grid = drawing.subplots(
             rows, columns, squeeze=False, sharex=True, sharey=True, gridspec_kw=spaces
         )
@@ -113,6 +113,7 @@ def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None
             fontsize=11,
             y=1 - _EDGE / size[1],
         )
+    save_figure(path, drawing)
 
 
 def _laid_out(
@@ -208,7 +209,7 @@ def _draw_in_room(
     declared = next(item for item in outcome.config.experiment.poses if item.name == pose.name)
     shape = lines[-1][0].shapes.get(pose.name) if lines else None
     under, over = around(room, declared, pose.points, shape)
-    frame_room(axes, room)
+    frame(axes, room)
     draw_marks(axes, under)
     _draw_pose(axes, pose, lines, factor, lambda points: seen(room.points(points)))
     draw_marks(axes, over)
@@ -253,7 +254,7 @@ def _draw_pose(
         title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch; true size"
     axes.set_title(title)
     if pose.role == "held_out":
-        axes.title.set_color(_HELD_OUT_TEXT)
+        axes.title.set_color(HELD_OUT)
         for spine in axes.spines.values():
             spine.set(visible=True, color=HELD_OUT, linewidth=2)
 

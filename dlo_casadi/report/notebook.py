@@ -6,13 +6,19 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from dlo_casadi.errors import counted
-from dlo_casadi.report.canvas import BLACK, BLUE, HELD_OUT, NOISE_ALONE, label_of, styled
-from dlo_casadi.report.figures_room import draw_marks, frame_room
+from dlo_casadi.report.canvas import (
+    BLACK,
+    BLUE,
+    HELD_OUT,
+    NOISE_ALONE,
+    label_of,
+    millimetres,
+    styled,
+)
+from dlo_casadi.report.figures_room import draw_marks, frame
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.room import seen
 from dlo_casadi.report.scene import scene_of
@@ -20,8 +26,6 @@ from dlo_casadi.report.terminal import prediction_rows
 from dlo_casadi.report.text_findings import ON_BRANCH, predicted_share, verdict_lines
 from dlo_casadi.report.text_parameters import describe
 from dlo_casadi.session.outcome import Outcome
-
-FloatArray = NDArray[np.floating]
 
 _POINTS = 40
 
@@ -49,33 +53,23 @@ def outcome_html(outcome: Outcome) -> str:
 def outcome_figure(outcome: Outcome) -> Figure:
     """All poses in one frame: measured points, and the shapes predicted from their ends alone."""
     stage = outcome.stages[-1]
-    in_space = outcome.config.experiment.in_space
     with styled((7.0, 5.0)) as drawing:
         axes = drawing.subplots()
-        room = scene_of(outcome)[0] if in_space else None
-        if room is not None:
-            draw_marks(axes, room.ground())
-
-        def place(points: FloatArray) -> FloatArray:
-            return points if room is None else seen(room.points(points))
-
+        room, _ = scene_of(outcome)
+        draw_marks(axes, room.ground())
         for pose in outcome.poses:
             color = HELD_OUT if pose.role == "held_out" else BLUE
             shape = stage.shapes.get(pose.name)
             if shape is not None:
-                axes.plot(*place(shape.curve).T, color=color, lw=1.4)
+                axes.plot(*seen(room.points(shape.curve)).T, color=color, lw=1.4)
             if len(pose.points):
                 shown = pose.points[:: max(1, len(pose.points) // _POINTS)]
-                axes.plot(*place(shown).T, ".", color=BLACK, ms=2.5)
+                axes.plot(*seen(room.points(shown)).T, ".", color=BLACK, ms=2.5)
         axes.plot([], [], ".", color=BLACK, label="measured")
         axes.plot([], [], color=BLUE, label=label_of(stage, outcome))
         if any(pose.role == "held_out" for pose in outcome.poses):
             axes.plot([], [], color=HELD_OUT, label="held out of the fit")
-        if room is not None:
-            frame_room(axes, room)
-        else:
-            axes.set_aspect("equal", adjustable="datalim")
-            axes.set(xlabel="x [m]", ylabel="y [m]")
+        frame(axes, room)
         errors = ", ".join(f"{row[0]} {row[1]}" for row in _errors(outcome)[:2])
         axes.set_title(f"{outcome.config.cable.name}: {errors}")
         drawing.legend(loc="outside lower center", ncols=3)
@@ -101,20 +95,18 @@ def _parameters(outcome: Outcome) -> list[tuple[str, ...]]:
 def _errors(outcome: Outcome) -> list[tuple[str, ...]]:
     """RMS distance of the measured points from the predicted shapes, and by noise alone."""
     stage = outcome.stages[-1]
-    rows = [("error of the fit", _mm(stage.rmse_fit))]
+    rows = [("error of the fit", millimetres(stage.rmse_fit))]
     if stage.rmse_held_out is not None:
         share = predicted_share(outcome, stage)
-        rows.append(("held out", _mm(stage.rmse_held_out) + share))
+        rows.append(("held out", millimetres(stage.rmse_held_out) + share))
     if stage.other_branch:
         both = (stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch)
-        rows.append((ON_BRANCH, ", ".join(_mm(value) for value in both if value is not None)))
+        rows.append(
+            (ON_BRANCH, ", ".join(millimetres(value) for value in both if value is not None))
+        )
     measurement = outcome.measurement
-    floor = (f"{NOISE_ALONE} ({measurement.std_source})", _mm(measurement.noise_distance))
+    floor = (f"{NOISE_ALONE} ({measurement.std_source})", millimetres(measurement.noise_distance))
     return [*rows, floor]
-
-
-def _mm(value: float | None) -> str:
-    return "-" if value is None else f"{1e3 * value:.3g} mm"
 
 
 def _table(title: str, rows: Iterable[Sequence[str]], remarks: Iterable[str] = ()) -> str:

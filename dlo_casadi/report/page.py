@@ -5,16 +5,20 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
+from matplotlib.figure import Figure
 
 from dlo_casadi.errors import counted
+from dlo_casadi.report.canvas import compared, inline_svg
+from dlo_casadi.report.figures import figures_of
 from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.page_pictures import pictures, scene_pictures
-from dlo_casadi.report.page_views import view_pictures_of
+from dlo_casadi.report.page_views import view_pictures
 from dlo_casadi.report.room import VIEWS
 from dlo_casadi.report.text_parameters import vector
 from dlo_casadi.session.outcome import Outcome
@@ -23,52 +27,51 @@ from dlo_casadi.session.outcome import Outcome
 GENERATOR = '<meta name="generator" content="dlo_casadi">'
 
 
-def report_page(outcome: Outcome) -> str:
+def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> str:
     """The text of report.html.
 
     All text of the session is escaped. The page's own policy forbids it to load anything, and to
     run any script but those that are written into it, known by their hashes.
-    """
-    # Bokeh takes half a second to load: only who draws a page waits for it.
-    from dlo_casadi.report.page_charts import charts
 
-    drawn = pictures(outcome)
+    Parameters
+    ----------
+    drawn : mapping of str to Figure, optional
+        The `figures_of` the outcome, if they have been drawn already.
+    """
+    shown = pictures(outcome)
+    charts = figures_of(outcome) if drawn is None else drawn
     return render(
         "report.html",
-        [_script_library(), page_script()],
         outcome.config.experiment.in_space,
-        pictures=drawn,
-        photographs=view_pictures_of(outcome),
-        room=drawn[0].room,
-        forces_read=any(mark.kind == "force-read" for item in drawn for mark in item.over),
+        pictures=shown,
+        photographs=view_pictures(outcome.poses, compared(outcome)),
+        room=shown[0].behind.room,
+        forces_read=any(mark.kind == "force-read" for item in shown for mark in item.over),
         scenes=scene_pictures(outcome),
-        charts={name: as_data(text) for name, text in charts(outcome).items()},
+        charts={name: Markup(inline_svg(chart, name)) for name, chart in charts.items()},
         **page_data(outcome),
     )
 
 
-def render(template: str, scripts: list[str], in_space: bool, **data: Any) -> str:
+def render(template: str, in_space: bool, **data: Any) -> str:
     """Fill a template with data.
 
     Parameters
     ----------
     template : str
         Name of a file in `templates/`.
-    scripts : list of str
-        Those that the page may run.
     in_space : bool
         Whether its pictures are rooms that can be turned.
     """
     page = _environment().get_template(template)
-    style = _text("page.css")
-    if in_space:
-        scripts, style = [*scripts, _text("room.js")], f"{style}\n{_text('room.css')}"
+    names = ["page", *["room"] * in_space]
+    scripts = [_text(f"{name}.js") for name in names]
     return page.render(
         generator=Markup(GENERATOR),
-        style=Markup(style),
+        style=Markup("\n".join(_text(f"{name}.css") for name in names)),
         views=VIEWS if in_space else None,
         scripts=[Markup(script) for script in scripts],
-        policy=" ".join(f"'sha256-{_hash(script)}'" for script in scripts) or "'none'",
+        policy=" ".join(f"'sha256-{_hash(script)}'" for script in scripts),
         **data,
     )
 
@@ -82,19 +85,6 @@ def units(text: str) -> str:
 def breakable(name: str) -> Markup:
     """A name in code that may be broken after its underscores and dots."""
     return Markup(re.sub(r"([_.])", r"\1<wbr>", str(escape(name))))
-
-
-def page_script() -> str:
-    """The page's own script."""
-    return _text("page.js")
-
-
-def as_data(text: str) -> Markup:
-    """JSON that may stand in a script element: nothing in it can end the element."""
-    escaped = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026"}
-    for sign, code in escaped.items():
-        text = text.replace(sign, code)
-    return Markup(text)
 
 
 @cache
@@ -119,16 +109,6 @@ def _text(name: str) -> str:
     environment = _environment()
     assert environment.loader is not None
     return environment.loader.get_source(environment, name)[0].strip()
-
-
-@cache
-def _script_library() -> str:
-    """Bokeh's own script, without its widgets and tables."""
-    from bokeh.resources import INLINE
-
-    script = INLINE.clone(components=["bokeh"]).js_raw[0]
-    assert "</script" not in script
-    return script.strip()
 
 
 def _hash(script: str) -> str:

@@ -12,13 +12,11 @@ from dlo_casadi.report.canvas import NOISE_ALONE, before_after, label_of, millim
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.text_findings import (
     CANDIDATE_ORDER,
-    ON_BRANCH,
-    cross_validated,
     finding_of,
     p_value_note,
-    predicted_share,
     reading_text,
     separation_text,
+    stage_rows,
     timing_rows,
     verdict_lines,
 )
@@ -58,14 +56,12 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
         "before": None if before is None else label_of(before, outcome),
         "after": None if after is None else label_of(after, outcome),
         "last": label_of(outcome.stages[-1], outcome),
-        "rest_before": before is not None and before.name == "batch",
-        "stages": stage_rows(outcome),
+        "stages": stage_rows(outcome, NOTHING),
         "noise": millimetres(m.std),
         "noise_alone": NOISE_ALONE,
         "noise_distance": millimetres(m.noise_distance),
         "noise_source": m.std_source,
         "correlation": millimetres(m.correlation_length) if m.correlation_length > 0 else None,
-        "held_out": m.poses_held_out,
         "candidates": candidate_rows(outcome),
         "candidate_order": CANDIDATE_ORDER,
         "p_value_note": p_value_note(outcome),
@@ -129,41 +125,6 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
     lost = f"; {len(m.held_out_missing)} held out were not measured" if m.held_out_missing else ""
     said = f"to fit + held out to check{lost}"
     rows.append(("poses", f"{m.poses_fit} + {m.poses_held_out}", said))
-    return rows
-
-
-def stage_rows(outcome: Outcome) -> list[dict[str, Any]]:
-    """Errors of the stages: fit, cross-validated, held out, chi-square.
-
-    A stage of which poses were measured in another equilibrium has a second row.
-    """
-    validated = cross_validated(outcome)
-    before, after = before_after(outcome)
-    rows = []
-    for stage in outcome.stages:
-        rows.append(
-            {
-                "label": label_of(stage, outcome),
-                "mark": "before" if stage is before else "after" if stage is after else "",
-                "fit": _mm(stage.rmse_fit),
-                "validated": _mm(validated.get(stage.name)),
-                "held_out": _mm(stage.rmse_held_out) + predicted_share(outcome, stage),
-                "chi2": NOTHING if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
-                "note": stage.note,
-            }
-        )
-        if stage.other_branch:
-            rows.append(
-                {
-                    "label": ON_BRANCH,
-                    "mark": "",
-                    "fit": _mm(stage.rmse_fit_measured_branch),
-                    "validated": NOTHING,
-                    "held_out": _mm(stage.rmse_held_out_measured_branch),
-                    "chi2": NOTHING,
-                    "note": f"poses in another equilibrium: {', '.join(stage.other_branch)}",
-                }
-            )
     return rows
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError
 from dlo_casadi.io.files import write_file
-from dlo_casadi.report.page import page_script, render
+from dlo_casadi.report.page import render
 from dlo_casadi.report.page_data import configuration_text, sentence
 from dlo_casadi.report.page_pictures import pictures_of_failure
 from dlo_casadi.report.page_views import view_pictures
@@ -52,7 +52,6 @@ def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = (
     heading, _, rest = error.message.partition("\n")
     return render(
         "failed.html",
-        [page_script()],
         config.experiment.in_space,
         title=config.cable.name,
         config_name=config.name,

@@ -8,8 +8,8 @@ their places there, and the page draws them anew as the room is turned.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,13 @@ from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.errors import counted
 from dlo_casadi.report.arrows import forces_read
-from dlo_casadi.report.canvas import before_after, label_of, millimetres
+from dlo_casadi.report.canvas import Compared, compared, millimetres
 from dlo_casadi.report.geometry import beside
 from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds, flat, in_room
 from dlo_casadi.report.room import Mark, Room, around
 from dlo_casadi.report.scene import next_marks, pull_marks, scene_of
 from dlo_casadi.report.text_findings import branch_text
-from dlo_casadi.session.outcome import Outcome, PoseInput, PoseShape
+from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, PoseShape
 
 FloatArray = NDArray[np.floating]
 
@@ -68,20 +68,16 @@ class Picture:
 
     Parameters
     ----------
-    box, whole : (left, top, width, height)
-        What is shown at first, the part with the cable; and all there is.
-    photograph : str
-        As a data URI; empty for a board.
-    grid : tuple of (x1, y1, x2, y2)
-        Lines of the board, every 100 mm.
+    behind : Background
+        What lies under the lines.
+    box : (left, top, width, height)
+        What of it is shown at first: the part with the cable.
     start, end : (u, v) or None
         Where the cable begins and ends: predicted, or declared where nothing was.
     facts : tuple of (kind, name, text)
         The kind is that of the line that a fact is about.
     notes : tuple of str
         What the camera step noticed, or why the pose could not be read.
-    room : Room or None
-        In which the cable stands.
     under, over : tuple of Solid
         What stands there behind the cable, and in front of it; in a plane the forces that were
         read, beside the predicted ones.
@@ -90,28 +86,26 @@ class Picture:
     name: str
     role: str
     alt: str
+    behind: Background
     box: Box
-    whole: Box
-    photograph: str = ""
-    grid: tuple[Box, ...] = ()
     lines: tuple[Line, ...] = ()
     start: tuple[float, float] | None = None
     end: tuple[float, float] | None = None
     facts: tuple[tuple[str, str, str], ...] = ()
     problem: str = ""
-    notes: tuple[str, ...] = field(default_factory=tuple)
-    room: Room | None = None
+    notes: tuple[str, ...] = ()
     under: tuple[Solid, ...] = ()
     over: tuple[Solid, ...] = ()
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """A picture of every pose of a run, in the order in which they were taken."""
-    stages = [stage for stage in before_after(outcome) if stage is not None]
-    behind = backgrounds(outcome.config, outcome.poses, stages)
-    in_plane = stages and not outcome.config.experiment.in_space
-    read = forces_read(stages[-1], outcome.config.cable.length) if in_plane else {}
-    return [_picture(outcome, pose, b, read) for pose, b in zip(outcome.poses, behind, strict=True)]
+    return _pictures(outcome.config, outcome.poses, compared(outcome), outcome.measurement)
+
+
+def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Picture]:
+    """A picture of every pose of a run that has failed, with what was measured until then."""
+    return _pictures(config, poses, [], None)
 
 
 def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
@@ -121,71 +115,51 @@ def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
         "next": ("with the proposed end", outcome.next_pose, next_marks),
     }
     shown = {key: value for key, value in said.items() if value[1] is not None}
-    if not outcome.config.experiment.in_space or not shown:
-        return {}
     room, under = scene_of(outcome)
+    if not isinstance(room, Room):
+        return {}
     return {
         key: Picture(
             name=key,
             role="fit",
             alt=f"Measured cables in space, {text}",
+            behind=in_room(room),
             box=in_room(room).whole,
-            whole=in_room(room).whole,
-            room=room,
             under=tuple(map(_drawn, [*under, *marks(outcome, room)])),
         )
         for key, (text, _, marks) in shown.items()
     }
 
 
-def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Picture]:
-    """A picture of every pose of a run that has failed, with what was measured until then."""
+def _pictures(
+    config: Config,
+    poses: Sequence[PoseInput],
+    stages: Sequence[Compared],
+    measurement: MeasurementSummary | None,
+) -> list[Picture]:
+    behind = backgrounds(config, poses, [stage for *_, stage in stages])
+    in_plane = stages and not config.experiment.in_space
+    read = forces_read(stages[-1][2], config.cable.length) if in_plane else {}
     declared = {pose.name: pose for pose in config.experiment.poses}
-    drawn = []
-    for pose, behind in zip(poses, backgrounds(config, poses, []), strict=True):
-        measured = behind.points(pose.points)
-        held = [declared[pose.name].start, declared[pose.name].end]
-        nowhere = (np.nan,) * len(declared[pose.name].start)
-        ends = [behind.points(np.array([nowhere if at is None else at])) for at in held]
-        found = len(measured) > 0
-        under, over = _around(declared[pose.name], pose, None, behind.room)
-        drawn.append(
-            Picture(
-                name=pose.name,
-                role=pose.role,
-                alt=_what(pose, behind) + (", with the measured line." if found else "."),
-                box=behind.about([measured, *ends]),
-                whole=behind.whole,
-                photograph=behind.photograph,
-                grid=behind.grid,
-                lines=(_measured(pose, behind),) if found else (),
-                start=None if behind.room else _point(ends[0]),
-                end=None if behind.room else _point(ends[1]),
-                facts=(("measured", "measured", _seen(pose)),) if found else (),
-                problem=pose.problem,
-                notes=pose.messages,
-                room=behind.room,
-                under=under,
-                over=over,
-            )
-        )
-    return drawn
+    return [
+        _picture(pose, declared[pose.name], b, stages, read.get(pose.name, ()), measurement)
+        for pose, b in zip(poses, behind, strict=True)
+    ]
 
 
 def _picture(
-    outcome: Outcome,
     pose: PoseInput,
+    declared: Pose,
     behind: Background,
-    read: Mapping[str, Sequence[tuple[str, FloatArray]]],
+    stages: Sequence[Compared],
+    read: Sequence[tuple[str, FloatArray]],
+    measurement: MeasurementSummary | None,
 ) -> Picture:
-    before, after = before_after(outcome)
     lines, facts = [], []
     measured = behind.points(pose.points)
     drawn = [measured]
-    for kind, stage in (("before", before), ("after", after)):
-        if stage is None:
-            continue
-        label, shape = label_of(stage, outcome), stage.shapes.get(pose.name)
+    for kind, label, stage in stages:
+        shape = stage.shapes.get(pose.name)
         if shape is None:
             facts.append((kind, label, "no equilibrium"))
             continue
@@ -206,44 +180,40 @@ def _picture(
             facts.append((kind, label, "not stable"))
         if shape.measured_branch is not None:
             facts.append((kind, label, branch_text(shape.measured_branch)))
+    if lines:
+        ends = [drawn[-1][:1], drawn[-1][-1:]]
+    else:
+        nowhere = (np.nan,) * len(declared.start)
+        held = (declared.start, declared.end or nowhere)
+        ends = [behind.points(np.array([place])) for place in held]
     if len(measured):
-        lines.append(_measured(pose, behind))
+        solid = _solid(behind.room, pose.points, 2)
+        lines.append(Line("measured", svg(measured, 2), solid=solid))
         facts.append(("measured", "measured", _seen(pose)))
-    last = None if after is None else after.shapes.get(pose.name)
+    last = stages[-1][2].shapes.get(pose.name) if stages else None
     if behind.room is not None and last is not None:
         facts.append(("force", "forces on start, end", _newtons(last.forces)))
-    if last is not None:
-        facts += [("force-read", *fact) for fact in _readings(outcome, last)]
-    declared = next(item for item in outcome.config.experiment.poses if item.name == pose.name)
+    if last is not None and measurement is not None:
+        facts += [("force-read", *fact) for fact in _readings(measurement, last)]
     under, over = _around(declared, pose, last, behind.room)
-    ends = drawn[-1]
-    if behind.room is None:
-        arrows = [(kind, behind.points(line)) for kind, line in read.get(pose.name, ())]
-        drawn += [line for _, line in arrows]
-        over = tuple(Solid(kind, svg(line, 1)) for kind, line in arrows)
+    arrows = [(kind, behind.points(line)) for kind, line in read]
+    over += tuple(Solid(kind, svg(line, 1)) for kind, line in arrows)
+    start, end = (None if behind.room else _point(at) for at in ends)
     return Picture(
         name=pose.name,
         role=pose.role,
-        alt=_alt(outcome, pose, behind),
-        box=behind.about(drawn),
-        whole=behind.whole,
-        photograph=behind.photograph,
-        grid=behind.grid,
+        alt=_alt(pose, behind, stages),
+        behind=behind,
+        box=behind.about([*drawn, *ends, *(line for _, line in arrows)]),
         lines=tuple(line for line in lines if line.points),
-        start=None if behind.room else _point(ends[:1]),
-        end=None if behind.room else _point(ends[-1:]),
+        start=start,
+        end=end,
         facts=tuple(facts),
         problem=pose.problem,
         notes=pose.messages,
-        room=behind.room,
         under=under,
         over=over,
     )
-
-
-def _measured(pose: PoseInput, behind: Background) -> Line:
-    solid = _solid(behind.room, pose.points, 2)
-    return Line("measured", svg(behind.points(pose.points), 2), solid=solid)
 
 
 def _around(
@@ -273,12 +243,12 @@ def _newtons(forces: FloatArray) -> str:
     return ", ".join(f"{np.linalg.norm(force):.3g}" for force in forces) + " N"
 
 
-def _readings(outcome: Outcome, shape: PoseShape) -> list[tuple[str, str]]:
+def _readings(measurement: MeasurementSummary, shape: PoseShape) -> list[tuple[str, str]]:
     """Each reading by its name: how far from the predicted one, in units and in its noise."""
     facts = []
     for name, (known, model) in shape.readings.items():
         kind = name.split("_")[1]
-        std, unit = outcome.measurement.std_of(kind)
+        std, unit = measurement.std_of(kind)
         off = float(np.linalg.norm(known - model))
         size = float(np.linalg.norm(known))
         text = f"{size:.3g} {unit}, off by {off:.2g} {unit}"
@@ -296,16 +266,16 @@ def _what(pose: PoseInput, behind: Background) -> str:
     return f"{'Drawing in space' if behind.room else kind}, pose {pose.name}"
 
 
-def _alt(outcome: Outcome, pose: PoseInput, behind: Background) -> str:
-    _, after = before_after(outcome)
-    shape = None if after is None else after.shapes.get(pose.name)
+def _alt(pose: PoseInput, behind: Background, stages: Sequence[Compared]) -> str:
     if not len(pose.points):
         return f"{_what(pose, behind)}: no cable was measured."
-    if after is None or shape is None or shape.rmse is None:
+    _, label, stage = stages[-1] if stages else ("", "", None)
+    shape = None if stage is None else stage.shapes.get(pose.name)
+    if shape is None or shape.rmse is None:
         return f"{_what(pose, behind)}, with the measured line."
     return (
         f"{_what(pose, behind)}, with the measured line and the predicted ones; "
-        f"{label_of(after, outcome)}, they are {millimetres(shape.rmse)} apart."
+        f"{label}, they are {millimetres(shape.rmse)} apart."
     )
 
 

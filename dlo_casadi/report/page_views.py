@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import counted
-from dlo_casadi.report.canvas import before_after, label_of
+from dlo_casadi.report.canvas import Compared
 from dlo_casadi.report.page_backgrounds import PHOTOGRAPHS, Background, photograph_of
 from dlo_casadi.report.page_pictures import Line, Picture, svg
 from dlo_casadi.sensing.pixels import ViewInput
-from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
+from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.vision import nearest_in_order
 
 FloatArray = NDArray[np.floating]
@@ -20,30 +20,19 @@ FloatArray = NDArray[np.floating]
 _PER_POINT = 4  # of a predicted curve, between two of its points
 
 
-def view_pictures(
-    poses: Sequence[PoseInput], stages: Sequence[tuple[str, str, Stage]] = ()
-) -> list[Picture]:
+def view_pictures(poses: Sequence[PoseInput], stages: Sequence[Compared] = ()) -> list[Picture]:
     """A picture of every usable photograph of poses in space, those of a pose side by side.
 
     Parameters
     ----------
-    stages : sequence of (kind, label, Stage)
-        Whose predictions are projected into it; kind is "before" or "after".
+    stages : sequence of Compared
+        Whose predictions are projected into it.
     """
     shown = [(pose, view) for pose in poses for view in pose.views]
     return [_picture(pose, view, stages, PHOTOGRAPHS // len(shown)) for pose, view in shown]
 
 
-def view_pictures_of(outcome: Outcome) -> list[Picture]:
-    """The same of a run, with the predictions before and after."""
-    stages = zip(("before", "after"), before_after(outcome), strict=True)
-    told = [(kind, label_of(stage, outcome), stage) for kind, stage in stages if stage is not None]
-    return view_pictures(outcome.poses, told)
-
-
-def _picture(
-    pose: PoseInput, view: ViewInput, stages: Sequence[tuple[str, str, Stage]], budget: int
-) -> Picture:
+def _picture(pose: PoseInput, view: ViewInput, stages: Sequence[Compared], budget: int) -> Picture:
     viewpoint, pixels = view.seen.viewpoint, view.seen.pixels
     lines, facts, drawn = [], [], [pixels]
     for kind, label, stage in stages:
@@ -72,9 +61,8 @@ def _picture(
         role=pose.role,
         alt=f"Photograph {view.name}, with the line that is seen in it"
         + (" and the predicted ones." if stages else "."),
+        behind=behind,
         box=behind.about(drawn),
-        whole=whole,
-        photograph=behind.photograph,
         lines=tuple(lines),
         start=first,
         end=last,

@@ -174,8 +174,10 @@ def seen(points: FloatArray, view: tuple[str, float, float] = VIEWS[0]) -> Float
     """Points (..., 3) of a room as they are seen from afar: (..., 2) to the right and up.
 
     right = (-sin a, cos a, 0), up = (-sin e cos a, -sin e sin a, cos e)
-    with azimuth a and elevation e of the eye.
+    with azimuth a and elevation e of the eye. Points (..., 2) of a board are seen as they are.
     """
+    if points.shape[-1] == 2:
+        return points
     a, e = radians(view[1]), radians(view[2])
     axes = np.array([[-sin(a), cos(a), 0.0], [-sin(e) * cos(a), -sin(e) * sin(a), cos(e)]])
     return np.asarray(points @ axes.T)

@@ -16,11 +16,10 @@ from dlo_casadi.report.canvas import NOISE_ALONE, label_of, millimetres
 from dlo_casadi.report.json_report import all_warnings
 from dlo_casadi.report.text_findings import (
     CANDIDATE_ORDER,
-    ON_BRANCH,
     cross_validated,
     finding_of,
     p_value_note,
-    predicted_share,
+    stage_rows,
     timing_rows,
     verdict_lines,
 )
@@ -110,31 +109,19 @@ def error_table(outcome: Outcome) -> Table:
     """Errors of the stages: fit, cross-validated, held out, chi-square, beside the noise."""
     table = _table("Distance of the measured points from the predicted shape, RMS")
     table.add_column("stage")
-    validated = cross_validated(outcome)
-    columns = ["fit", "cross-validated", "held out", "chi2/dof"]
-    if not validated:
-        columns.remove("cross-validated")
-    for column in columns:
-        table.add_column(column, justify="right")
-    for stage in outcome.stages:
-        cells = {
-            "fit": millimetres(stage.rmse_fit),
-            "cross-validated": millimetres(validated.get(stage.name)),
-            "held out": millimetres(stage.rmse_held_out) + predicted_share(outcome, stage),
-            "chi2/dof": "-" if stage.chi2_per_dof is None else f"{stage.chi2_per_dof:.3g}",
-        }
-        table.add_row(label_of(stage, outcome), *(cells[column] for column in columns))
-        if stage.other_branch:
-            cells = {
-                "fit": millimetres(stage.rmse_fit_measured_branch),
-                "held out": millimetres(stage.rmse_held_out_measured_branch),
-            }
-            table.add_row(f"  {ON_BRANCH}", *(cells.get(column, "") for column in columns))
+    columns = {"fit": "fit", "validated": "cross-validated", "held_out": "held out"}
+    columns["chi2"] = "chi2/dof"
+    if not cross_validated(outcome):
+        del columns["validated"]
+    for name in columns.values():
+        table.add_column(name, justify="right")
+    for row in stage_rows(outcome, "-"):
+        table.add_row(row["label"], *(row[column] for column in columns))
     last = outcome.stages[-1]
     if outcome.measurement.readings:
         cells = {
             "fit": _newtons(last.readings_fit),
-            "held out": _newtons(last.readings_held_out),
+            "held_out": _newtons(last.readings_held_out),
         }
         table.add_row("  forces, moments", *(cells.get(column, "") for column in columns))
     table.add_section()

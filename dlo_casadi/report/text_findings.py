@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
-from dlo_casadi.report.canvas import NOISE_ALONE, millimetres
+from dlo_casadi.report.canvas import NOISE_ALONE, compared, label_of, millimetres
 from dlo_casadi.report.text_parameters import plus_minus, vector
 from dlo_casadi.session.outcome import BranchShape, EitherSide, Outcome, Stage, StageName
 from dlo_casadi.thresholds import APART, NOTABLE
@@ -40,6 +40,41 @@ def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
         "batch": outcome.effects[0]["rmse_cross_validated_before"],
         "closed": outcome.effects[-1]["rmse_cross_validated_after"],
     }
+
+
+def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
+    """Errors of the stages in words: fit, cross-validated, held out, chi-square.
+
+    A stage of which poses were measured in another equilibrium has a second row.
+
+    Parameters
+    ----------
+    nothing : str
+        What stands where there is no number.
+    """
+
+    def row(label: str, note: str, fit: float | None, held_out: float | None) -> dict[str, str]:
+        known = {"fit": fit, "held_out": held_out, "validated": None}
+        cells = {k: nothing if x is None else millimetres(x) for k, x in known.items()}
+        return {"label": label, "mark": "", "note": note, "chi2": nothing, **cells}
+
+    marks = {stage.name: kind for kind, _, stage in compared(outcome)}
+    validated = cross_validated(outcome)
+    rows = []
+    for stage in outcome.stages:
+        own = row(label_of(stage, outcome), stage.note, stage.rmse_fit, stage.rmse_held_out)
+        own["mark"] = marks.get(stage.name, "")
+        own["held_out"] += predicted_share(outcome, stage)
+        if (error := validated.get(stage.name)) is not None:
+            own["validated"] = millimetres(error)
+        if stage.chi2_per_dof is not None:
+            own["chi2"] = f"{stage.chi2_per_dof:.3g}"
+        rows.append(own)
+        if stage.other_branch:
+            note = f"poses in another equilibrium: {', '.join(stage.other_branch)}"
+            errors = stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch
+            rows.append(row(ON_BRANCH, note, *errors))
+    return rows
 
 
 def verdict_lines(outcome: Outcome) -> list[str]:

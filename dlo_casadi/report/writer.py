@@ -14,7 +14,7 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.io.files import FolderDraft, is_marked, make_folder, refuse_foreign, write_file
 from dlo_casadi.io.points import write_points, write_table
-from dlo_casadi.report.figures import write_figures
+from dlo_casadi.report.figures import figures_of, write_figures
 from dlo_casadi.report.figures_poses import draw_poses
 from dlo_casadi.report.json_report import report_text
 from dlo_casadi.report.overlay import write_overlays
@@ -147,8 +147,9 @@ def draw_each(figures: Path, outcome: Outcome) -> None:
 
 def draw_summary(folder: Path, outcome: Outcome) -> None:
     """Write the page, and the other figures: the other half."""
-    write_file(folder / "report.html", report_page(outcome))
-    write_figures(folder / "figures", outcome)
+    drawn = figures_of(outcome)
+    write_file(folder / "report.html", report_page(outcome, drawn))
+    write_figures(folder / "figures", drawn)
 
 
 def _is_ours(report: Path) -> bool:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dlo_casadi.report import canvas, figures, figures_poses, overlay
-from dlo_casadi.report.canvas import before_after, label_of
-from dlo_casadi.report.drawing import draw_prediction
+from dlo_casadi.report import figures, figures_poses, overlay
+from dlo_casadi.report.canvas import before_after, label_of, save_figure
+from dlo_casadi.report.drawing import prediction_figure
 from dlo_casadi.report.geometry import magnified
 from dlo_casadi.session.outcome import PoseInput
 
@@ -63,10 +63,16 @@ def drawn(path):
 
 def test_an_outcome_without_effects(outcome, tmp_path):
     figures_poses.draw_poses(tmp_path, outcome)
-    figures.write_figures(tmp_path, outcome)
+    figures.write_figures(tmp_path, figures.figures_of(outcome))
 
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"poses.png", "residuals.png", "rest_curvature.png", "errors.png"}
+    assert names == {
+        "poses.png",
+        "residuals.png",
+        "rest_curvature.png",
+        "errors.png",
+        "pose_errors.png",
+    }
     for path in tmp_path.iterdir():
         (height, width), ink = drawn(path)
         assert min(height, width) >= 500, path.name
@@ -74,9 +80,9 @@ def test_an_outcome_without_effects(outcome, tmp_path):
 
 
 def test_candidates_and_the_unexplained_load_are_drawn(closed, tmp_path):
-    figures.draw_candidates(tmp_path / "candidates.png", closed)
     unexplained = replace(closed, verdict="unexplained", unexplained=LOAD)
-    figures.draw_unexplained(tmp_path / "unexplained.png", unexplained)
+    shown = figures.figures_of(unexplained)
+    figures.write_figures(tmp_path, {k: shown[k] for k in ("candidates", "unexplained")})
 
     assert drawn(tmp_path / "candidates.png")[1] > 0.02
     assert drawn(tmp_path / "unexplained.png")[1] > 0.01
@@ -96,15 +102,18 @@ def test_nothing_is_drawn_of_what_is_missing(outcome, tmp_path):
     empty = replace(outcome.stages[0], rmse_fit=None, rmse_held_out=None, shapes={})
     half = replace(outcome, poses=(lost, *outcome.poses[1:3]), stages=(empty, *outcome.stages[1:]))
     figures_poses.draw_poses(tmp_path, half)
-    figures.draw_residuals(tmp_path / "residuals.png", half)
-    figures.draw_errors(tmp_path / "errors.png", half)
+    shown = figures.figures_of(half)
+    figures.write_figures(tmp_path, shown)
 
     assert (tmp_path / "poses.png").exists()
+    gids = {line.get_gid() for axes in shown["residuals"].axes for line in axes.lines}
+    assert {gid for gid in gids if gid} == {f"residual-after-{k}" for k in range(3)}
+    assert "no value" in {text.get_text() for text in shown["errors"].axes[0].texts}
 
 
 def test_stages_without_any_prediction_have_no_residuals(outcome, tmp_path):
     none = tuple(replace(stage, shapes={}) for stage in outcome.stages)
-    figures.write_figures(tmp_path, replace(outcome, stages=none))
+    figures.write_figures(tmp_path, figures.figures_of(replace(outcome, stages=none)))
     figures_poses.draw_poses(tmp_path, replace(outcome, stages=none))
 
     assert {path.name for path in tmp_path.iterdir()} == {"poses.png", "errors.png"}
@@ -175,7 +184,7 @@ def test_a_prediction_is_drawn(tmp_path, end):
         "stable": end is None,
         "other_side": None if end is None else {"points": (-points).tolist()},
     }
-    draw_prediction(tmp_path / "shape.png", shape)
+    save_figure(tmp_path / "shape.png", prediction_figure(shape))
 
     assert drawn(tmp_path / "shape.png")[1] > 0.005
 
@@ -198,7 +207,7 @@ def with_readings(outcome):
 @pytest.mark.parametrize("count", [1, 8, 21])
 def test_all_names_lie_on_the_page(outcome, tmp_path, monkeypatch, count, size):
     pages = []
-    monkeypatch.setattr(canvas, "save_figure", lambda path, drawing, dpi: pages.append(drawing))
+    monkeypatch.setattr(figures_poses, "save_figure", lambda path, drawing: pages.append(drawing))
     pose = replace(outcome.poses[0], points=size * outcome.poses[0].points)
     shape = outcome.stages[-1].shapes[pose.name]
     shapes = {pose.name: replace(shape, curve=size * shape.curve)}
@@ -220,7 +229,7 @@ def test_all_names_lie_on_the_page(outcome, tmp_path, monkeypatch, count, size):
 def test_readings_are_drawn_beside_predicted_ones(outcome, tmp_path):
     """Residuals over their noise, and arrows of one scale at the ends."""
     shown = with_readings(outcome)
-    figures.draw_readings(tmp_path / "readings.png", shown)
+    figures.write_figures(tmp_path, {"readings": figures.readings_figure(shown)})
     figures_poses.draw_poses(tmp_path, shown)
     assert imread(tmp_path / "readings.png").shape[2] == 4
     assert (tmp_path / "poses.png").is_file()

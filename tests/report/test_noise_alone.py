@@ -2,18 +2,16 @@
 
 import numpy as np
 import pytest
-from bokeh.models import Span
 from matplotlib.figure import Figure
 from test_terminal import said
 
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.report import figures
-from dlo_casadi.report.canvas import millimetres
+from dlo_casadi.report.canvas import BLACK, millimetres
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.notebook import outcome_html, outcome_text
 from dlo_casadi.report.page import report_page
-from dlo_casadi.report.page_charts import errors_chart, poses_chart
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 STD = 3e-4
@@ -31,16 +29,16 @@ def test_a_line_is_compared_across_and_a_marker_in_all_directions(d):
     assert noise_distance([line, MeasuredPose(pose), markers], STD) == pytest.approx(both * STD)
 
 
-def test_markers_in_space_have_one_floor_everywhere(in_room, tmp_path, monkeypatch):
+def test_markers_in_space_have_one_floor_everywhere(in_room, monkeypatch):
     """sqrt(3) of the std of one coordinate, which report.json keeps."""
     legends = []
     monkeypatch.setattr(Figure, "legend", lambda *_, handles, **__: legends.extend(handles))
     floor = np.sqrt(3) * in_room.measurement.std
-    figures.draw_errors(tmp_path / "errors.png", in_room)
+    shown = [figures.errors_figure(in_room), figures.pose_errors_figure(in_room)]
     assert f"noise alone {millimetres(floor)}" in [item.get_label() for item in legends]
-    for chart in (errors_chart(in_room), poses_chart(in_room)):
-        (line,) = (item for item in chart.center if isinstance(item, Span))
-        assert line.location == pytest.approx(1e3 * floor)
+    for drawing in shown:
+        (line,) = (item for item in drawing.axes[0].lines if item.get_color() == BLACK)
+        assert line.get_xdata() == pytest.approx([1e3 * floor] * 2)
     row = f"noise alone ({in_room.measurement.std_source})"
     assert f"{row} {millimetres(floor)}" in said(in_room)
     assert f"{row}  {1e3 * floor:.3g} mm" in outcome_text(in_room)

@@ -9,10 +9,10 @@ from test_figures import EFFECT, LOAD
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.report.page_data import page_data, stage_rows
+from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.terminal import print_summary
-from dlo_casadi.report.text_findings import separation_text, structure_lines
+from dlo_casadi.report.text_findings import separation_text, stage_rows, structure_lines
 from dlo_casadi.report.text_parameters import describe, plus_minus, unidentified
 from dlo_casadi.session.outcome import BranchShape, ParameterEstimate
 
@@ -145,7 +145,7 @@ def test_poses_on_another_branch_have_a_row_and_a_fact(outcome):
     assert "243 mm" in text
     assert "on the measured branch 0.26 mm" in text
     assert "on the measured branch" not in said(outcome)
-    (row,) = [row for row in stage_rows(found) if row["label"] == "on the measured branch"]
+    (row,) = [row for row in stage_rows(found, "–") if row["label"] == "on the measured branch"]
     assert row["fit"] == "0.26 mm"
     assert name in row["note"]
     facts = {picture.name: picture.facts for picture in pictures(found)}[name]

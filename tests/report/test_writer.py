@@ -197,7 +197,7 @@ def test_files_of_the_same_names_from_elsewhere_are_not_replaced(tmp_path):
 
 
 def test_a_chart_that_cannot_be_drawn_does_not_lose_the_numbers(outcome, earlier, monkeypatch):
-    def broken(outcome):
+    def broken(outcome, drawn):
         raise ZeroDivisionError("no range")
 
     monkeypatch.setattr(writer, "report_page", broken)

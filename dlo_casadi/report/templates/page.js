@@ -1,48 +1,15 @@
 "use strict";
 
-// ---- charts -------------------------------------------------------------------------------------
-
-const embedded = [];
-if (window.Bokeh) {
-  Bokeh.set_log_level("warn");
-  for (const data of document.querySelectorAll(".chart-data")) {
-    embedded.push(Bokeh.embed.embed_item(JSON.parse(data.textContent), data.dataset.place));
-  }
-}
-const charts = Promise.all(embedded);
-
-function model(name) {
-  for (const part of Bokeh.documents) {
-    const found = part.get_model_by_name(name);
-    if (found) return found;
-  }
-  return null;
-}
-
-// A printer's page is narrower than the screen: shrink the charts while it prints.
-const PAPER = { wide: 680, square: 480 }; // px, A4 within its margins
-addEventListener("beforeprint", () => {
-  for (const chart of document.querySelectorAll(".chart")) {
-    const room = chart.classList.contains("square") ? PAPER.square : PAPER.wide;
-    chart.style.zoom = Math.min(1, room / chart.offsetWidth);
-  }
-});
-addEventListener("afterprint", () => {
-  for (const chart of document.querySelectorAll(".chart")) chart.style.zoom = "";
-});
-
 // ---- residuals: the chosen pose -----------------------------------------------------------------
 
 const choice = document.getElementById("pose-choice");
 
 function choosePose(value) {
   choice.value = value;
-  for (const kind of ["before", "after"]) {
-    const all = model(`all-${kind}`);
-    if (!all) continue;
-    const k = value === "" ? -1 : Number(value);
-    const none = k < 0;
-    model(`chosen-${kind}`).data = none ? { s: [], r: [] } : { s: all.data.s[k], r: all.data.r[k] };
+  document.getElementById("chart-residuals").classList.toggle("choosing", value !== "");
+  for (const line of document.querySelectorAll("[id^=residual-]")) {
+    line.classList.toggle("chosen", line.id.split("-")[2] === value);
+    if (line.matches(".chosen")) line.parentNode.append(line); // above all others
   }
   const facts = value === "" ? null : document.querySelector(`#pose-${value} .facts`);
   document.getElementById("pose-said").textContent = facts === null ? "" :
@@ -56,26 +23,19 @@ function stepPose(by) {
 }
 
 if (choice) {
-  charts.then(() => {
-    choosePose("");
-    choice.addEventListener("change", () => choosePose(choice.value));
-    document.getElementById("pose-previous").addEventListener("click", () => stepPose(-1));
-    document.getElementById("pose-next").addEventListener("click", () => stepPose(1));
-    for (const link of document.querySelectorAll("[data-choose]")) {
-      link.addEventListener("click", () => choosePose(link.dataset.choose));
-    }
-    for (const name of ["errors-0", "errors-1"]) {
-      const selected = model(name)?.selected;
-      selected?.properties.indices.change.connect(() => {
-        if (selected.indices.length === 0) return;
-        choosePose(String(selected.indices[0]));
-        document.getElementById("residuals").scrollIntoView();
-      });
-    }
-    document.documentElement.dataset.ready = "yes";
-  });
-} else {
-  document.documentElement.dataset.ready = "yes";
+  choosePose(""); // a browser may remember another choice
+  choice.addEventListener("change", () => choosePose(choice.value));
+  document.getElementById("pose-previous").addEventListener("click", () => stepPose(-1));
+  document.getElementById("pose-next").addEventListener("click", () => stepPose(1));
+  for (const link of document.querySelectorAll("[data-choose]")) {
+    link.addEventListener("click", () => choosePose(link.dataset.choose));
+  }
+  for (const row of document.querySelectorAll("[id^=choose-]")) {
+    row.addEventListener("click", () => {
+      choosePose(row.id.split("-")[1]);
+      document.getElementById("residuals").scrollIntoView();
+    });
+  }
 }
 
 // ---- pictures: what they show -------------------------------------------------------------------

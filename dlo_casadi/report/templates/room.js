@@ -78,18 +78,3 @@ addEventListener("click", (event) => {
   event.preventDefault();
   event.stopPropagation();
 }, true);
-
-// ---- residuals: the second direction follows the first ------------------------------------------
-
-if (choice) {
-  charts.then(() => {
-    for (const kind of ["before", "after"]) {
-      const [first, second, all] =
-        [`chosen-${kind}`, `chosen-${kind}-z`, `all-${kind}-z`].map(model);
-      first?.properties.data.change.connect(() => {
-        const k = choice.value;
-        second.data = k === "" ? { s: [], r: [] } : { s: all.data.s[k], r: all.data.r[k] };
-      });
-    }
-  });
-}
