@@ -46,7 +46,7 @@ def test_what_can_be_one_is_said_so(tmp_path):
     assert "of 1 pose did" in _message(Algorithm1Status.CONVERGED, [1.0, 2.0], 0.1, 1, 1)
     assert implausible_quaternion([1.0]).endswith("not 1 number")
     assert "<title>0 sessions</title>" in overview_html([], tmp_path)
-    counter = Counter(Console(), "pose")
+    counter = Counter(Console(), noun="pose")
     assert counter._text(Tally(1, 0, 1, 0.0, None)) == "1 of 1 pose"
     assert counter._text(Tally(1200, 0, 2400, 0.0, None)) == "1 200 of 2 400 poses"
 

@@ -323,7 +323,7 @@ MISTAKES: list[tuple[Callable[[Path], Session], list[str]]] = [
     (mass_in_grams, ["mass: 200 kg for 0.55 m: units are SI, did you mean 0.2?"]),
     (points_with_y_down, ["but do", "with y pointing down", "x to the right and y up"]),
     (points_with_rows_of_a_picture, ["with y pointing down", "rows count downwards"]),
-    (points_with_y_down_between_ends_of_one_height, ["y pointing up in the points"]),
+    (points_with_y_down_between_ends_of_one_height, ["with y pointing down instead of up"]),
     (gravity_with_y_down, ["does not hang along gravity (0, 9.81)", "with gravity (0, -9.81)"]),
     (
         gravity_upwards_on_a_clamped_loop,

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from rich.console import Console
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, configuration, console, print_json
+from dlo_casadi.cli.options import add_config, command, configuration, console, parsed, print_json
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.session.camera import calibrate_session, summary
 from dlo_casadi.vision import Calibration
@@ -26,10 +25,8 @@ def main(argv: Sequence[str]) -> int:
         "(Zhang's method), tell how well they are known and how to do better. Nothing is written.",
         EXAMPLES,
     )
-    parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of text")
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    chosen = parser.parse_args(argv)
+    add_config(parser)
+    chosen = parsed(parser, argv, "print JSON instead of text")
 
     config = configuration(chosen.config)
     with Watch(Console(stderr=True), chosen.quiet) as watch:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK
-from dlo_casadi.cli.options import command, configuration, console, print_json
+from dlo_casadi.cli.options import add_config, command, configuration, console, parsed, print_json
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
@@ -35,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
         EXAMPLES,
         "2 is also a mistake that was found",
     )
-    parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
+    add_config(parser)
     parser.add_argument(
         "--show",
         type=Path,
@@ -43,9 +43,7 @@ def main(argv: Sequence[str]) -> int:
         help="write pictures of each photograph there: rectified work-plane, contrast, strands, "
         "and the line with its direction",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    chosen = parser.parse_args(argv)
+    chosen = parsed(parser, argv)
 
     config = configuration(chosen.config)
     with Watch(Console(stderr=True), chosen.quiet) as watch:

@@ -5,59 +5,35 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
 from dlo_casadi.cli.guard import signals
+from dlo_casadi.cli.watch import PATIENCE, Shown
 from dlo_casadi.errors import counted
 from dlo_casadi.runtime.parallel import Tally
 
-# Without a terminal: no more than one line in so many seconds.
-_PATIENCE = 10.0
-
 
 @dataclass
-class Counter:
+class Counter(Shown):
     """Shows a tally: a bar on a terminal, a line now and then elsewhere.
 
     Parameters
     ----------
-    console : Console
-        Not the one of the results.
     noun : str
         What is counted.
-    quiet : bool
     size : int
         How many of them a task holds.
     count : int, optional
         All of them: the last task may hold fewer.
     """
 
-    console: Console
-    noun: str
-    quiet: bool = False
+    noun: str = "task"
     size: int = 1
     count: int | None = None
-    _bar: Progress | None = None
-    _task: TaskID | None = None
-    _spoken: float = 0.0
 
     def __enter__(self) -> Counter:
-        self._spoken = time.perf_counter()
-        if not self.quiet and self.console.is_terminal:
-            self._bar = Progress(
-                BarColumn(bar_width=30),
-                TextColumn("{task.description}"),
-                TimeElapsedColumn(),
-                console=self.console,
-            )
-            self._task = self._bar.add_task(self.noun, total=None)
-            self._bar.start()
+        self.begin(BarColumn(bar_width=30), TextColumn("{task.description}"), TimeElapsedColumn())
         return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
 
     def show(self, tally: Tally) -> None:
         """Show how far the tasks have come."""
@@ -65,17 +41,13 @@ class Counter:
         if self.quiet:
             return
         now = time.perf_counter()
-        if self._bar is not None and self._task is not None:
+        if self.bars is not None:
+            task = self.bars.task_ids[0] if self.bars.task_ids else self.bars.add_task(self.noun)
             text = self._text(tally)
-            self._bar.update(self._task, completed=tally.done, total=tally.total, description=text)
-        elif tally.done == tally.total or now - self._spoken > _PATIENCE:
+            self.bars.update(task, completed=tally.done, total=tally.total, description=text)
+        elif tally.done == tally.total or now - self.spoken > PATIENCE:
             self.message(f"{self._text(tally)}; {duration(tally.elapsed)} so far")
-            self._spoken = now
-
-    def message(self, text: str) -> None:
-        """Something worth a line."""
-        if not self.quiet:
-            self.console.print(text, highlight=False, soft_wrap=True, markup=False)
+            self.spoken = now
 
     def _text(self, tally: Tally) -> str:
         done, total = self.size * tally.done, self.size * (tally.total or tally.done)

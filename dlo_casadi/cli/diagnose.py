@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from dlo_casadi.cli.fit import fit_session
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import (
+    add_config,
     add_jobs,
     command,
     configuration,
-    session_executor,
+    parsed,
     session_jobs,
 )
 
@@ -30,18 +32,13 @@ def main(argv: Sequence[str]) -> int:
         "configuration asks for it; print every effect that was tried, ranked.",
         EXAMPLES,
     )
-    parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
+    add_config(parser)
     parser.add_argument("--output", type=Path, metavar="DIR", help="write the results there")
     add_jobs(parser, session_jobs())
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
-    chosen = parser.parse_args(argv)
+    chosen = parsed(parser, argv)
 
     config = configuration(chosen.config)
     options = config.diagnosis.model_copy(update={"enabled": True})
     config = replace(config, diagnosis=options)
-    with session_executor(chosen.jobs) as executor:
-        from dlo_casadi.cli.session import fit_and_show  # beside the other process's imports
-
-        fit_and_show(chosen, config, chosen.output, executor, keys=KEYS, candidates=True)
+    fit_session(chosen, config, chosen.output, keys=KEYS, candidates=True)
     return OK

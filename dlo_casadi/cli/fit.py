@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import argparse
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import (
+    add_config,
     add_jobs,
     command,
     configuration,
-    session_executor,
+    parsed,
     session_jobs,
 )
+from dlo_casadi.config import Config
+from dlo_casadi.runtime.parallel import begin, open_executor
 
 EXAMPLES = """\
 dlo fit configs/cable.yaml                       writes results/cable/
@@ -31,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
         EXAMPLES,
         "on 2 and 130 earlier results are kept",
     )
-    parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
+    add_config(parser)
     parser.add_argument(
         "--output",
         type=Path,
@@ -39,20 +45,30 @@ def main(argv: Sequence[str]) -> int:
         help="folder of the results; default results/<config name>/",
     )
     add_jobs(parser, session_jobs())
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument("--json", action="store_true", help="print report.json instead of tables")
     parser.add_argument(
         "--no-diagnosis", action="store_true", help="do not search for missing effects"
     )
-    chosen = parser.parse_args(argv)
+    chosen = parsed(parser, argv, "print report.json instead of tables")
 
     config = configuration(chosen.config)
     if chosen.no_diagnosis:
         diagnosis = config.diagnosis.model_copy(update={"enabled": False})
         config = replace(config, diagnosis=diagnosis)
     output = chosen.output or Path("results") / config.name
-    with session_executor(chosen.jobs) as executor:
+    fit_session(chosen, config, output)
+    return OK
+
+
+def fit_session(
+    chosen: argparse.Namespace, config: Config, output: Path | None, **shown: Any
+) -> None:
+    """Fit and show one session, see `fit_and_show`: here, and in `--jobs` - 1 processes.
+
+    The first of them is begun at once.
+    """
+    libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
+    with open_executor(chosen.jobs, here=True, libraries=libraries) as executor:
+        begin(executor, os.getpid)
         from dlo_casadi.cli.session import fit_and_show  # beside the other process's imports
 
-        fit_and_show(chosen, config, output, executor)
-    return OK
+        fit_and_show(chosen, config, output, executor, **shown)

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from dlo_casadi.cli.counter import Counter
 from dlo_casadi.cli.guard import BAD_INPUT, OK
-from dlo_casadi.cli.options import add_jobs, command, console, print_json
+from dlo_casadi.cli.options import add_jobs, command, console, parsed, print_json
 from dlo_casadi.errors import counted
 from dlo_casadi.fleet import FleetResult, Options, find_sessions, fit_fleet
 from dlo_casadi.fleet.outliers import judge
@@ -48,9 +48,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "--retry-failed", action="store_true", help="try sessions again that have failed"
     )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
-    chosen = parser.parse_args(argv)
+    chosen = parsed(parser, argv, "print the rows as JSON")
 
     base, sessions = find_sessions(chosen.where)
     output = chosen.output or Path("results") / f"fleet-{base.name}"
@@ -59,10 +57,8 @@ def main(argv: Sequence[str]) -> int:
     make_folder(logs)
     try:
         with (
-            Counter(Console(stderr=True), "sessions", chosen.quiet) as counter,
+            Counter(Console(stderr=True), chosen.quiet, "session") as counter,
             open_executor(chosen.jobs, chosen.scheduler, logs) as executor,
-            Counter(Console(stderr=True), "session", chosen.quiet) as counter,
-            open_executor(chosen.jobs, chosen.scheduler, output / "logs") as executor,
         ):
 
             def begin(taken_over: int, left: int) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, print_json
+from dlo_casadi.cli.options import add_parameters, command, parsed, print_json
 from dlo_casadi.codegen import generate
+from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.rod.chain import ELEMENTS
@@ -26,21 +28,13 @@ def main(argv: Sequence[str]) -> int:
         "example.c.",
         EXAMPLES,
     )
-    parser.add_argument("parameters", type=Path, help="parameters.yaml of a fit, or its folder")
+    add_parameters(parser)
     parser.add_argument("--output", type=Path, required=True, help="folder for the C files")
     parser.add_argument("--prefix", default="dlo", help="begins all public names (dlo)")
-    parser.add_argument("--elements", type=int, help="number of elements, instead of the fit's")
-    parser.add_argument("--element", choices=ELEMENTS, help="instead of the fit's")
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument("--json", action="store_true", help="print files and hash as JSON")
-    chosen = parser.parse_args(argv)
+    add_mesh(parser)
+    chosen = parsed(parser, argv, "print files and hash as JSON")
 
-    model, p, rest, metadata = load_parameters(chosen.parameters)
-    if chosen.elements or chosen.element:
-        if model.has_state:
-            raise DloError("the state of a drifting cable belongs to the fit's own elements")
-        model = model.with_mesh(chosen.elements or model.n, chosen.element)
-        rest = model.rest_basis @ metadata.coefficients
+    model, p, rest, _ = with_mesh(load_parameters(chosen.parameters), chosen)
     solver = generate(model, p, rest, chosen.prefix)
     written = solver.write(chosen.output)
     if chosen.json:
@@ -48,3 +42,23 @@ def main(argv: Sequence[str]) -> int:
     elif not chosen.quiet:
         print(*written, f"model hash {solver.hash}", sep="\n")
     return OK
+
+
+def add_mesh(parser: argparse.ArgumentParser) -> None:
+    """Add `--elements` and `--element`, see `with_mesh`."""
+    parser.add_argument("--elements", type=int, help="number of elements, instead of the fit's")
+    parser.add_argument(
+        "--element",
+        choices=ELEMENTS,
+        help="instead of the fit's; arcs are several times faster than quadratic elements",
+    )
+
+
+def with_mesh(cable: FittedCable, chosen: argparse.Namespace) -> FittedCable:
+    """The cable on the mesh that is chosen, see `add_mesh`."""
+    if not (chosen.elements or chosen.element):
+        return cable
+    if cable.model.has_state:
+        raise DloError("the state of a drifting cable belongs to the fit's own elements")
+    model = cable.model.with_mesh(chosen.elements or cable.model.n, chosen.element)
+    return cable._replace(model=model, rest=model.rest_basis @ cable.metadata.coefficients)

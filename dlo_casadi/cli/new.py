@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, print_json
+from dlo_casadi.cli.options import command, parsed, print_json
 from dlo_casadi.config.schema import schema_text
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import DloError, counted
@@ -39,9 +39,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "--space", action="store_true", help="a cable that leaves the plane, held by grippers"
     )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
-    chosen = parser.parse_args(argv)
+    chosen = parsed(parser, argv, "print what was written as JSON")
 
     target: Path = chosen.file
     if target.suffix not in (".yaml", ".yml"):

@@ -7,9 +7,7 @@ import json
 import multiprocessing
 import os
 import sys
-from collections.abc import Iterator
-from concurrent.futures import Executor
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,6 @@ from rich.console import Console
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
-from dlo_casadi.runtime.parallel import begin, open_executor
 
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
@@ -41,6 +38,25 @@ def command(name: str, description: str, examples: str, codes: str = "") -> argp
     )
 
 
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """Add the configuration."""
+    parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
+
+
+def add_parameters(parser: argparse.ArgumentParser) -> None:
+    """Add the file of a fitted cable."""
+    parser.add_argument("parameters", type=Path, help="parameters.yaml of a fit, or its folder")
+
+
+def parsed(
+    parser: argparse.ArgumentParser, argv: Sequence[str], json: str = "print JSON instead of tables"
+) -> argparse.Namespace:
+    """Add `--quiet` and `--json`, of which `json` is the help, and parse."""
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.add_argument("--json", action="store_true", help=json)
+    return parser.parse_args(argv)
+
+
 def add_jobs(parser: argparse.ArgumentParser, default: int = 1) -> None:
     """Add `--jobs`."""
     text = "number of processes; default %(default)s"
@@ -61,18 +77,6 @@ def session_jobs() -> int:
     if multiprocessing.current_process().daemon:
         return 1
     return min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
-
-
-@contextmanager
-def session_executor(jobs: int) -> Iterator[Executor]:
-    """Open where one session is fitted and drawn: here, and in `jobs` - 1 processes.
-
-    The first of them is begun at once.
-    """
-    libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
-    with open_executor(jobs, here=True, libraries=libraries) as executor:
-        begin(executor, os.getpid)
-        yield executor
 
 
 def configuration(path: Path) -> Config:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dlo_casadi.api import PredictedShape, predict
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, console, print_json
+from dlo_casadi.cli.options import add_parameters, command, console, parsed, print_json
 from dlo_casadi.errors import DloError
 from dlo_casadi.report.canvas import save_figure
 from dlo_casadi.report.drawing import prediction_figure
@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> int:
         EXAMPLES,
         "2 is also a pose without an equilibrium",
     )
-    parser.add_argument("parameters", type=Path, help="parameters.yaml or its folder")
+    add_parameters(parser)
     for side, remark in (("end", "; not for a free end"), ("start", "")):
         parser.add_argument(
             f"--{side}",
@@ -57,10 +57,8 @@ def main(argv: Sequence[str]) -> int:
         "--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"
     )
     parser.add_argument("--branch", choices=("ccw", "cw"), help="which way the cable turns")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.add_argument("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}")
-    chosen = parser.parse_args(plain_numbers(argv))
+    chosen = parsed(parser, plain_numbers(argv))
 
     figure = chosen.figure
     if figure is not None and figure.suffix.lower() not in DRAWN:

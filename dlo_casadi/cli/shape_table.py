@@ -8,8 +8,9 @@ from pathlib import Path
 from rich.console import Console
 
 from dlo_casadi.cli.counter import Counter
+from dlo_casadi.cli.generate_solver import add_mesh, with_mesh
 from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import add_jobs, command, console, print_json
+from dlo_casadi.cli.options import add_jobs, add_parameters, command, console, parsed, print_json
 from dlo_casadi.cli.predict import plain_numbers
 from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.errors import DloError
@@ -19,7 +20,6 @@ from dlo_casadi.fleet.shape_table import shape_table
 from dlo_casadi.fleet.store import parquet_library
 from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
 
 EXAMPLES = """\
@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
         "say why in the column `status`.",
         EXAMPLES,
     )
-    parser.add_argument("parameters", type=Path, help="parameters.yaml or its folder")
+    add_parameters(parser)
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument(
         "--grid",
@@ -54,18 +54,11 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--start-heading", type=float, metavar="R", help="of all poses [rad]")
     parser.add_argument("--end-heading", type=float, metavar="R", help="of all poses [rad]")
     parser.add_argument("--branch", choices=("ccw", "cw"), help="which way the cable turns")
-    parser.add_argument("--elements", type=int, help="number of elements, instead of the fit's")
-    parser.add_argument(
-        "--element",
-        choices=ELEMENTS,
-        help="instead of the fit's; arcs are several times faster than quadratic elements",
-    )
+    add_mesh(parser)
     add_jobs(parser)
     parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead")
     parser.add_argument("--restart", action="store_true", help="replace what lies there")
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
-    chosen = parser.parse_args(plain_numbers(argv))
+    chosen = parsed(parser, plain_numbers(argv), "print the counts as JSON")
 
     if chosen.output.suffix.lower() != ".parquet":
         raise DloError(
@@ -73,18 +66,13 @@ def main(argv: Sequence[str]) -> int:
             f"  Try: --output {chosen.output.with_suffix('.parquet')}"
         )
     cable = load_parameters(chosen.parameters)
-    model, p, rest, metadata = cable
-    if model.in_space:
+    if cable.model.in_space:
         raise DloError(
-            f"{model.cable.name!r} is in space: tables hold shapes in a plane.\n"
+            f"{cable.model.cable.name!r} is in space: tables hold shapes in a plane.\n"
             "  Try: dlo predict, or dlo generate-solver for many shapes"
         )
     parquet_library()
-    if chosen.elements or chosen.element:
-        if model.has_state:
-            raise DloError("the state of a drifting cable belongs to the fit's own elements")
-        model = model.with_mesh(chosen.elements or model.n, chosen.element)
-        rest = model.rest_basis @ metadata.coefficients
+    model, p, rest, metadata = with_mesh(cable, chosen)
     fixed, needed = _ends(cable, chosen.start, chosen.start_heading, chosen.end_heading)
     poses: Poses
     if chosen.grid is not None:
@@ -94,7 +82,7 @@ def main(argv: Sequence[str]) -> int:
     output = chosen.output.resolve()
     plan = Plan(model, p, rest, chosen.branch, output.with_name(f"{output.name}.parts"))
     with (
-        Counter(Console(stderr=True), "pose", chosen.quiet, plan.chunk, poses.count) as counter,
+        Counter(Console(stderr=True), chosen.quiet, "pose", plan.chunk, poses.count) as counter,
         open_executor(chosen.jobs, chosen.scheduler) as executor,
     ):
         counts = shape_table(

@@ -2,94 +2,71 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 from dlo_casadi import __version__
+from dlo_casadi.session.outcome import StageName
+from dlo_casadi.session.progress import TIMED
 
 SCHEMA = "dlo-fleet/1"
 Row = dict[str, Any]
 
-STAGES = ("initial", "stiffness_only", "algorithm1", "batch", "closed")
-TIMES = ("vision", "algorithm1", "batch", "diagnosis", "total")
+STAGES = get_args(StageName)
+TIMES = (*TIMED, "total")
 # Begins the names of all columns that differ from run to run.
 TIME = "time_"
 
-# Column -> what it holds; empty (null) where a session has no such thing.
-COLUMNS: dict[str, str] = {
-    "session": "text",
-    "status": "text",
-    "message": "text",
-    "cable": "text",
-    "verdict": "text",
-    "effects": "effects",
-    "bending_stiffness": "number",
-    "bending_stiffness_std": "number",
-    "bending_stiffness_low_95": "number",
-    "bending_stiffness_high_95": "number",
-    "identifiable": "truth",
-    "torsional_stiffness": "number",
-    "torsional_stiffness_std": "number",
-    "parameters": "parameters",
-    "rest_curvature_s": "numbers",
-    "rest_curvature": "numbers",
-    "rest_curvature_std": "numbers",
-    "rest_curvature_z": "numbers",
-    "rest_curvature_z_std": "numbers",
-    **{
-        f"{stage}_{what}": "number"
-        for stage in STAGES
-        for what in ("rmse_fit", "rmse_held_out", "chi2_per_dof")
-    },
-    "unexplained_force_x": "number",
-    "unexplained_force_y": "number",
-    "unexplained_force_z": "number",
-    "unexplained_position": "number",
-    "noise_std": "number",
-    "noise_correlation_length": "number",
-    "kind": "text",
-    "poses_fit": "count",
-    "poses_held_out": "count",
-    "points": "count",
-    "elements": "count",
-    "discretization_error": "number",
-    "warnings": "texts",
-    "config_hash": "text",
-    "package_version": "text",
-    **{f"{TIME}{part}_s": "number" for part in TIMES},
-    f"{TIME}session_s": "number",
-}
+# What a stage tells beside its parameters.
+_ERRORS = {"rmse_fit": "m", "rmse_held_out": "m", "chi2_per_dof": ""}
 
-UNITS = {
-    "bending_stiffness": "N m^2",
-    "torsional_stiffness": "N m^2",
-    "torsional_stiffness_std": "N m^2",
-    **dict.fromkeys((name for name in COLUMNS if name.startswith("rest_curvature")), "1/m"),
-    **dict.fromkeys((name for name in COLUMNS if name.startswith("unexplained_force")), "N"),
-    **{
-        name: "m"
-        for name in COLUMNS
-        if name.endswith(("rmse_fit", "rmse_held_out", "_s", "position", "_error"))
-        or name.startswith("noise_")
-    },
-    **{f"bending_stiffness_{end}": "N m^2" for end in ("std", "low_95", "high_95")},
-    **{name: "s" for name in COLUMNS if name.startswith(TIME)},
+# Column -> what it holds, and in which unit; empty (null) where a session has no such thing.
+COLUMNS: dict[str, tuple[str, str]] = {
+    "session": ("text", ""),
+    "status": ("text", ""),
+    "message": ("text", ""),
+    "cable": ("text", ""),
+    "verdict": ("text", ""),
+    "effects": ("effects", ""),
+    "bending_stiffness": ("number", "N m^2"),
+    "bending_stiffness_std": ("number", "N m^2"),
+    "bending_stiffness_low_95": ("number", "N m^2"),
+    "bending_stiffness_high_95": ("number", "N m^2"),
+    "identifiable": ("truth", ""),
+    "torsional_stiffness": ("number", "N m^2"),
+    "torsional_stiffness_std": ("number", "N m^2"),
+    "parameters": ("parameters", ""),
+    "rest_curvature_s": ("numbers", "m"),
+    "rest_curvature": ("numbers", "1/m"),
+    "rest_curvature_std": ("numbers", "1/m"),
+    "rest_curvature_z": ("numbers", "1/m"),
+    "rest_curvature_z_std": ("numbers", "1/m"),
+    **{f"{stage}_{what}": ("number", _ERRORS[what]) for stage in STAGES for what in _ERRORS},
+    "unexplained_force_x": ("number", "N"),
+    "unexplained_force_y": ("number", "N"),
+    "unexplained_force_z": ("number", "N"),
+    "unexplained_position": ("number", "m"),
+    "noise_std": ("number", "m"),
+    "noise_correlation_length": ("number", "m"),
+    "kind": ("text", ""),
+    "poses_fit": ("count", ""),
+    "poses_held_out": ("count", ""),
+    "points": ("count", ""),
+    "elements": ("count", ""),
+    "discretization_error": ("number", "m"),
+    "warnings": ("texts", ""),
+    "config_hash": ("text", ""),
+    "package_version": ("text", ""),
+    **{f"{TIME}{part}_s": ("number", "s") for part in (*TIMES, "session")},
 }
 
 
 def empty_row(key: str, digest: str, status: str, message: str, seconds: float) -> Row:
     """Row of a session without results."""
-    return dict.fromkeys(COLUMNS) | {
+    lists = ("effects", "parameters", "numbers", "texts")
+    return {name: [] if kind in lists else None for name, (kind, _) in COLUMNS.items()} | {
         "session": key,
         "status": status,
         "message": message,
-        "effects": [],
-        "parameters": [],
-        "rest_curvature_s": [],
-        "rest_curvature": [],
-        "rest_curvature_std": [],
-        "rest_curvature_z": [],
-        "rest_curvature_z_std": [],
-        "warnings": [],
         "config_hash": digest,
         "package_version": __version__,
         f"{TIME}session_s": seconds,
@@ -117,31 +94,22 @@ def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: f
         "identifiable": stiffness["identifiable"],
         "torsional_stiffness": torsion.get("value"),
         "torsional_stiffness_std": torsion.get("std"),
-        "parameters": [
-            {"name": name, "value": item["value"], "std": item["std"], "unit": item["unit"]}
-            for name, item in last["parameters"].items()
-            if name != "rest_curvature"
-        ],
+        "parameters": _parameters(last["parameters"]),
         "rest_curvature_s": rest["s"],
         **_rest_columns(rest),
         **{f"unexplained_force_{axis}": value for axis, value in zip("xyz", force, strict=False)},
         "unexplained_position": pull.get("position"),
         "noise_std": measurement["std"],
         "noise_correlation_length": measurement["correlation_length_m"],
-        "kind": measurement["kind"],
-        "poses_fit": measurement["poses_fit"],
-        "poses_held_out": measurement["poses_held_out"],
-        "points": measurement["points"],
+        **{name: measurement[name] for name in ("kind", "poses_fit", "poses_held_out", "points")},
         "elements": mesh["n"],
         "discretization_error": mesh["error_m"],
         "warnings": report["warnings"],
     }
-    for stage in report["stages"]:
-        for what in ("rmse_fit", "rmse_held_out", "chi2_per_dof"):
-            row[f"{stage['name']}_{what}"] = stage[what]
-    for part in TIMES:
-        row[f"{TIME}{part}_s"] = report["timing_s"].get(part)
-    return row
+    row |= {
+        f"{stage['name']}_{what}": stage[what] for stage in report["stages"] for what in _ERRORS
+    }
+    return row | {f"{TIME}{part}_s": report["timing_s"].get(part) for part in TIMES}
 
 
 def _rest_columns(rest: dict[str, Any]) -> dict[str, Any]:
@@ -155,24 +123,27 @@ def _rest_columns(rest: dict[str, Any]) -> dict[str, Any]:
 
 
 def _effect(effect: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "name": effect["name"],
-        "p_value": effect["p_value"],
-        "rmse_cross_validated_before": effect["rmse_cross_validated_before"],
-        "rmse_cross_validated_after": effect["rmse_cross_validated_after"],
-        "indistinguishable_from": effect["indistinguishable_from"],
-        "parameters": [
-            {"name": name, "value": item["value"], "std": item["std"], "unit": item["unit"]}
-            for name, item in effect["parameters"].items()
-        ],
-    }
+    kept = (
+        "name",
+        "p_value",
+        "rmse_cross_validated_before",
+        "rmse_cross_validated_after",
+        "indistinguishable_from",
+    )
+    return {name: effect[name] for name in kept} | {"parameters": _parameters(effect["parameters"])}
+
+
+def _parameters(items: dict[str, Any]) -> list[dict[str, Any]]:
+    kept = ("value", "std", "unit")
+    return [
+        {"name": name} | {key: item[key] for key in kept}
+        for name, item in items.items()
+        if name != "rest_curvature"
+    ]
 
 
 def last_error(row: Row) -> float | None:
     """Error of the last stage [m]: of held-out poses where there are any."""
-    for stage in ("closed", "batch"):
-        for what in ("rmse_held_out", "rmse_fit"):
-            value: float | None = row[f"{stage}_{what}"]
-            if value is not None:
-                return value
-    return None
+    errors = ("rmse_held_out", "rmse_fit")
+    names = [f"{stage}_{what}" for stage in ("closed", "batch") for what in errors]
+    return next((row[name] for name in names if row[name] is not None), None)

@@ -45,20 +45,14 @@ def robust_z(values: Sequence[float | None]) -> list[float | None]:
     ----------
     Iglewicz and Hoaglin, How to detect and handle outliers, 1993.
     """
-    known = np.array([value for value in values if value is not None])
-    if len(known) < FEWEST:
+    known = np.array(values, dtype=float)
+    if np.isfinite(known).sum() < FEWEST:
         return [None] * len(values)
-    middle = float(np.median(known))
-    spread = float(np.median(np.abs(known - middle)))
-    scores: list[float | None] = []
-    for value in values:
-        if value is None:
-            scores.append(None)
-        elif spread > 0:
-            scores.append(float(np.clip(0.6745 * (value - middle) / spread, -LARGEST, LARGEST)))
-        else:
-            scores.append(float(np.sign(value - middle)) * LARGEST)
-    return scores
+    away = known - np.nanmedian(known)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scores = 0.6745 * away / np.nanmedian(np.abs(away))
+    scores = np.clip(np.where(away == 0, 0.0, scores), -LARGEST, LARGEST)
+    return [None if np.isnan(score) else float(score) for score in scores]
 
 
 def judge(rows: Sequence[Row]) -> list[Judged]:
@@ -79,24 +73,22 @@ def _log(value: float | None) -> float | None:
 def _reasons(row: Row, stiffness: float | None, error: float | None) -> tuple[str, ...]:
     if row["status"] != "done":
         return (str(row["status"]),)
-    reasons = []
-    if row["verdict"] == "unexplained":
-        reasons.append("unexplained")
-    if stiffness is not None and abs(stiffness) > OUTLYING:
-        reasons.append("stiffer" if stiffness > 0 else "softer")
-    # Of errors only large ones are odd.
-    if error is not None and error > OUTLYING:
-        reasons.append("larger error")
-    return tuple(reasons)
+    reasons = {
+        "unexplained": row["verdict"] == "unexplained",
+        "stiffer": stiffness is not None and stiffness > OUTLYING,
+        "softer": stiffness is not None and stiffness < -OUTLYING,
+        # Flag only large errors as outliers, never small ones.
+        "larger error": error is not None and error > OUTLYING,
+    }
+    return tuple(text for text, holds in reasons.items() if holds)
 
 
-def _order(item: Judged) -> tuple[int, float, str]:
-    group = 3
-    if item.row["status"] != "done":
-        group = 0
-    elif "unexplained" in item.reasons:
-        group = 1
-    elif item.reasons:
-        group = 2
+def _order(item: Judged) -> tuple[bool, bool, bool, float, str]:
     worst = max(abs(item.stiffness_z or 0.0), item.error_z or 0.0)
-    return group, -worst, str(item.row["session"])
+    return (
+        item.row["status"] == "done",
+        "unexplained" not in item.reasons,
+        not item.reasons,
+        -worst,
+        str(item.row["session"]),
+    )

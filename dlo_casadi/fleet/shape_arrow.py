@@ -16,37 +16,46 @@ if TYPE_CHECKING:
     import pyarrow
 
 
+_UNITS = {
+    "force": "N",
+    "moment": "N m",
+    "energy": "J",
+    "start_heading": "rad",
+    "end_heading": "rad",
+}
+
+
 def _pose_columns(model: CableModel) -> list[str]:
     """Columns of a pose that have a meaning for this boundary."""
-    meaningless = {
-        f"{side}_heading" for side in ("start", "end") if getattr(model, side) != "clamped"
+    held = {
+        "start": ("start_x", "start_y"),
+        "end": () if model.end == "free" else ("end_x", "end_y"),
     }
-    if model.end == "free":
-        meaningless |= {"end_x", "end_y"}
-    return [name for name in COLUMNS if name not in meaningless]
+    clamped = [f"{side}_heading" for side in held if getattr(model, side) == "clamped"]
+    return [name for name in COLUMNS if name in (*held["start"], *held["end"], *clamped)]
 
 
-def _result_columns(model: CableModel) -> dict[str, tuple[str, int | None]]:
+def _result_columns(model: CableModel) -> dict[str, tuple[str, Any]]:
     """Column -> field of a part and its component."""
-    columns: dict[str, tuple[str, int | None]] = {"energy": ("energy", None)}
-    for side in ("start", "end"):
-        for k, axis in enumerate("xy"):
-            columns[f"force_on_{side}_{axis}"] = (f"{side}_force", k)
-    for k, side in enumerate(("start", "end")):
-        if getattr(model, side) == "clamped":
-            columns[f"moment_on_{side}"] = ("moments", k)
-    columns["min_bend_radius"] = ("min_bend_radius", None)
-    return columns
+    sides = ("start", "end")
+    return {
+        "energy": ("energy", ...),
+        **{
+            f"force_on_{side}_{x}": (f"{side}_force", np.s_[:, k])
+            for side in sides
+            for k, x in enumerate("xy")
+        },
+        **{
+            f"moment_on_{side}": ("moments", np.s_[:, k])
+            for k, side in enumerate(sides)
+            if getattr(model, side) == "clamped"
+        },
+        "min_bend_radius": ("min_bend_radius", ...),
+    }
 
 
 def _unit(name: str) -> str:
-    if name.startswith("force"):
-        return "N"
-    if name.startswith("moment"):
-        return "N m"
-    if name.endswith("heading"):
-        return "rad"
-    return "J" if name == "energy" else "m"
+    return _UNITS.get(name) or _UNITS.get(name.split("_")[0], "m")
 
 
 def table_schema(model: CableModel, metadata: dict[str, Any]) -> pyarrow.Schema:
@@ -83,8 +92,7 @@ def table_of(part: NDArray[np.void], schema: pyarrow.Schema, model: CableModel) 
     }
     columns["status"] = pa.DictionaryArray.from_arrays(part["status"].copy(), list(STATUSES))
     for name, (field, k) in _result_columns(model).items():
-        values = part[field] if k is None else part[field][:, k]
-        columns[name] = pa.array(values.copy(), mask=lost)
+        columns[name] = pa.array(part[field][k].copy(), mask=lost)
     points = pa.array(part["points"].ravel())
     columns["points"] = pa.FixedSizeListArray.from_arrays(
         points, 2 * (model.n + 1), mask=pa.array(lost)

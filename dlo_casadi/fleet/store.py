@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from dlo_casadi import __version__
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet.columns import COLUMNS, SCHEMA, UNITS, Row
+from dlo_casadi.fleet.columns import COLUMNS, SCHEMA, Row
 from dlo_casadi.io.files import write_file
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def arrow_schema() -> pyarrow.Schema:
         ),
     }
     fields = [
-        pa.field(name, kinds[kind], metadata={"unit": UNITS[name]} if name in UNITS else None)
-        for name, kind in COLUMNS.items()
+        pa.field(name, kinds[kind], metadata={"unit": unit} if unit else None)
+        for name, (kind, unit) in COLUMNS.items()
     ]
     return pa.schema(fields, metadata={"schema": SCHEMA, "dlo_casadi": __version__})

@@ -9,25 +9,20 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.session.coarse import coarse_fit, some, spread, tells_weight
+from dlo_casadi.session.directions import wrong_directions
 from dlo_casadi.session.exchanged_ends import ends_exchanged
 from dlo_casadi.session.hanging import hangs_elsewhere
-from dlo_casadi.session.headings import wrong_headings
 from dlo_casadi.session.measure import line_without_end
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.plausibility import (
     Lines,
     Suspicion,
+    clamp_axes,
     repeated,
-    suspicions,
-)
-from dlo_casadi.session.plausibility_in_space import (
-    Clamped,
     stretched,
-    suspicions_in_space,
-    wrong_orientations,
+    suspicions,
 )
 from dlo_casadi.session.plausibility_of_readings import Compared, misread
 from dlo_casadi.thresholds import FITS, OUT_OF_STEP
@@ -94,15 +89,15 @@ def _reason(name: str, message: str) -> str:
 def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
     """Everything in a session that looks like a mistake, by `plausibility`."""
     read = [item for item in inputs if len(item.points)]
-    in_space = config.experiment.in_space
     lines = lines_of(config, inputs)
-    found = suspicions_in_space(lines) if in_space else suspicions(lines)
+    found = suspicions(lines)
     if not any(item.certain for item in found):
         doubtful = {item.pose for item in found}
         sound = [item for item in read if item.name not in doubtful]
         found += repeated([item.name for item in sound], [item.points for item in sound])
-        found += _stretched(config, sound)
-        found += (_wrong_orientations if in_space else wrong_headings)(config, sound)
+        marked = [(item.name, item.points, item.s) for item in sound if item.s is not None]
+        found += stretched(marked, config.cable.length)
+        found += wrong_directions(config, sound)
     if not any(item.certain for item in found):
         doubtful = {item.pose for item in found}
         sound = [item for item in read if item.name not in doubtful]
@@ -120,9 +115,8 @@ def _misread(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]
     fit = coarse_fit(config, shown) if shown else None
     if fit is None:
         return ()
-    model, measured = fit.model, fit.problem.measured
     seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
-    rows = reaction_rows(model.node)
+    rows = reaction_rows(fit.model.node)
     compared = []
     for name, at in rows.items():
         side, kind = name.split("_")
@@ -130,9 +124,8 @@ def _misread(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]
         if not own:
             continue
         frames = None
-        if getattr(model, side) == "clamped":
-            held = (measured[k].pose.frames[side == "end"] for k in own)
-            frames = np.array([_axes_of(model, frame) for frame in held])
+        if getattr(fit.model, side) == "clamped":
+            frames = np.array([clamp_axes(declared[shown[k].name], side) for k in own])
         forces = np.array([seen[k].readings[rows[f"{side}_force"]] for k in own])
         compared.append(
             Compared(
@@ -146,39 +139,6 @@ def _misread(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]
     return misread(compared, sized=tells_weight(fit))
 
 
-def _axes_of(model: CableModel, frame: FloatArray) -> FloatArray:
-    """Axes (d, d) of a clamp in the world, in columns."""
-    if model.in_space:
-        return model.node.to_world(frame, np.eye(3)).T
-    c, s = np.cos(frame[0]), np.sin(frame[0])
-    return np.array([[c, -s], [s, c]])
-
-
-def _stretched(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
-    """Markers that lie farther apart than the cable between them is long."""
-    marked = [(item.name, item.points, item.s) for item in read if item.s is not None]
-    names, points, s = zip(*marked, strict=True) if marked else ((), (), ())
-    return stretched(names, points, s, config.cable.length)
-
-
-def _wrong_orientations(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
-    """Orientations of clamps held against the lines beside them."""
-    poses = {pose.name: pose for pose in config.experiment.poses}
-    clamps = {}
-    for side, step in (("start", 1), ("end", -1)):
-        if getattr(config.experiment.boundary, side) == "clamped":
-            clamps[side] = [
-                Clamped(
-                    item.name,
-                    getattr(poses[item.name], f"{side}_orientation"),
-                    getattr(poses[item.name], side),
-                    item.points[::step],
-                )
-                for item in read
-            ]
-    return wrong_orientations(clamps, config.cable.length)
-
-
 def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
     """Measured lines beside their declared ends.
 
@@ -189,9 +149,7 @@ def lines_of(config: Config, inputs: Sequence[PoseInput]) -> Lines:
     points = {item.name: item.points for item in inputs if len(item.points)}
     known = {item.name: item.s for item in inputs if item.s is not None}
     lines = _lines(config, points, known)
-    experiment = config.experiment
-    photographs = experiment.measurement.kind == "images" and not experiment.in_space
-    if photographs and experiment.boundary.end != "free":
+    if config.experiment.boundary.end != "free":
         fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
         sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
         doubtful = [pose for pose in poses if pose.name not in sound and pose.paths[0].is_file()]

@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.session.coarse import Hypothesis, compare
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import Suspicion, clamp_axis
+from dlo_casadi.session.plausibility import Suspicion, clamp_axes
 from dlo_casadi.thresholds import HEADING_OFF
 
 # Poses that are fitted: a misfit of a twentieth of the length shows in two.
@@ -68,7 +68,7 @@ def _off(config: Config, read: Sequence[PoseInput]) -> float:
         pose = poses[item.name]
         first, sign = (0, 1.0) if side == "start" else (-1, -1.0)
         way = sign * (item.points[first] - getattr(pose, side))
-        axis = clamp_axis(pose, side)
-        assert axis is not None
-        cosines.append(float(way @ axis) / max(float(np.linalg.norm(way)), 1e-300))
+        axes = clamp_axes(pose, side)
+        assert axes is not None
+        cosines.append(float(way @ axes[:, 0]) / max(float(np.linalg.norm(way)), 1e-300))
     return float(np.arccos(np.clip(np.median(cosines), -1.0, 1.0)))

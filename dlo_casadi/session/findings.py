@@ -8,14 +8,24 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.diagnosis.diagnose import Diagnosis, separating_pose
-from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.diagnosis.pull import Pull
+from dlo_casadi.diagnosis.selection import AddedEffect, Ranked
 from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.result import Fit
 
 
-def effect_rows(diagnosis: Diagnosis) -> tuple[dict[str, Any], ...]:
-    """Effects that were added, as in report.json."""
-    return tuple(_effect_row(item, diagnosis.after) for item in diagnosis.added)
+def findings_of(diagnosis: Diagnosis) -> dict[str, Any]:
+    """What an outcome holds of a diagnosis, by its fields."""
+    structure = {"before": diagnosis.structure_before, "after": diagnosis.structure_after}
+    return {
+        "verdict": diagnosis.verdict,
+        "effects": tuple(_effect_row(item, diagnosis.after) for item in diagnosis.added),
+        "candidates": tuple(_candidate_row(row) for row in diagnosis.ranked),
+        "unexplained": None if diagnosis.pull is None else _unexplained_row(diagnosis.pull),
+        "structure": {when: asdict(tests) for when, tests in structure.items()},
+        "hidden_weight": None if diagnosis.weight is None else asdict(diagnosis.weight),
+        "diagnosis": diagnosis,
+    }
 
 
 def _effect_row(item: AddedEffect, fit: Fit) -> dict[str, Any]:
@@ -52,32 +62,20 @@ def effect_parameters(fit: Fit, effect: Effect) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def candidate_rows(diagnosis: Diagnosis) -> tuple[dict[str, Any], ...]:
-    """All candidates that were tried, ranked."""
-    return tuple(
-        {
-            "name": row.name,
-            "score": row.score,
-            "p_value": row.p_value,
-            "rmse_cross_validated": row.rmse_cross_validated,
-            "reason": row.reason or None,
-        }
-        for row in diagnosis.ranked
-    )
+def _candidate_row(row: Ranked) -> dict[str, Any]:
+    kept = ("name", "score", "p_value", "rmse_cross_validated")
+    return {key: getattr(row, key) for key in kept} | {"reason": row.reason or None}
 
 
-def unexplained_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
-    """The load that assumes no cause, or None."""
-    pull = diagnosis.pull
-    if pull is None:
-        return None
+def _unexplained_row(pull: Pull) -> dict[str, Any]:
+    """The load that assumes no cause."""
     problem = pull.fit.problem
     return {
         "force": [float(x) for x in pull.force_per_pose.mean(axis=0)],
         "force_per_pose": np.asarray(pull.force_per_pose).tolist(),
         "poses": [problem.measured[j].pose.name for j in problem.used],
         "position": pull.position,
-        "interval_95": [pull.interval[0], pull.interval[1]],
+        "interval_95": list(pull.interval),
     }
 
 
@@ -96,14 +94,3 @@ def next_pose_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
         # Of a sensor of forces and moments: in N or N m, and in standard deviations of one reading.
         "reading": asdict(pose.reading),
     }
-
-
-def hidden_weight_row(diagnosis: Diagnosis) -> dict[str, Any] | None:
-    """The weight that the fit would not notice, or None."""
-    return None if diagnosis.weight is None else asdict(diagnosis.weight)
-
-
-def structure_rows(diagnosis: Diagnosis) -> dict[str, dict[str, Any]]:
-    """Tests of the residual before and after effects were added; see `Structure`."""
-    pair = {"before": diagnosis.structure_before, "after": diagnosis.structure_after}
-    return {when: asdict(structure) for when, structure in pair.items()}

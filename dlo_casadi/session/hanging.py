@@ -12,7 +12,7 @@ from dlo_casadi.config import Config, Pose
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.session.coarse import Hypothesis, compare, tells_weight
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import Suspicion, clamp_axis, exchanges, read_as
+from dlo_casadi.session.plausibility import Suspicion, clamp_axes, exchanges, named
 from dlo_casadi.thresholds import FITS, HEADING_OFF
 
 FloatArray = NDArray[np.floating]
@@ -41,7 +41,7 @@ def hangs_elsewhere(config: Config, read: Sequence[PoseInput]) -> tuple[Suspicio
         weightless = (
             f"the lines show no weight, as if bending_stiffness were {least:.2g} N m^2 or more; "
         )
-    up = "[0.0, -9.81] with y up" if len(gravity) == 2 else "[0.0, 0.0, -9.81] with z up"
+    up = f"{[*np.zeros(len(gravity) - 1).tolist(), -9.81]} with {'xyz'[len(gravity) - 1]} up"
     return (
         Suspicion(
             f"the cable does not hang along gravity {_vector(gravity)} m/s^2: {weightless}"
@@ -85,7 +85,7 @@ def _otherwise(
                 replace(item, points=(item.points - start) @ axes.T + start)
                 for item, start in zip(read, starts, strict=True)
             ]
-            yield Hypothesis(_told(axes, gravity), config, inputs)
+            yield Hypothesis(named(axes), config, inputs)
 
 
 def _held(pose: Pose, length: float) -> FloatArray:
@@ -93,19 +93,9 @@ def _held(pose: Pose, length: float) -> FloatArray:
     kept: list[FloatArray] = [np.zeros(len(pose.start))]
     if pose.end is not None:
         kept.append((np.array(pose.end) - pose.start) / length)
-    axes = [clamp_axis(pose, side) for side in ("start", "end")]
-    kept += [axis for axis in axes if axis is not None]
+    axes = [clamp_axes(pose, side) for side in ("start", "end")]
+    kept += [own[:, 0] for own in axes if own is not None]
     return np.array(kept)
-
-
-def _told(axes: FloatArray, gravity: FloatArray) -> str:
-    """Exchanged axes of the points in words."""
-    up = int(np.abs(gravity).argmax())
-    mirrored = np.eye(len(gravity))
-    mirrored[up, up] = -1.0
-    if np.allclose(axes, mirrored):
-        return f"{'xyz'[up]} pointing up in the points, which now points down"
-    return f"the points read as {read_as(axes)}"
 
 
 def _vector(values: FloatArray) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -121,27 +122,21 @@ def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
 
     It ends where the cable does, and not where the configuration says.
     """
+    if _reader(config, pose) is not _read_image:
+        return None
     try:
         image = vision.read_image(pose.paths[0])
         free = pose.model_copy(update={"end": None})
-        return _extract(config, free, image, view_of(config, image)).points
+        view = view_of(config, image)
+        return vision.extract_centerline(image, view, **_held(config, free)).points
     except MeasurementError:
         return None
 
 
 def conditions(pose: DeclaredPose) -> Pose:
     """End conditions of a configured pose."""
-    return Pose(
-        start=pose.start,
-        end=pose.end,
-        start_heading=pose.start_heading,
-        end_heading=pose.end_heading,
-        start_orientation=pose.start_orientation,
-        end_orientation=pose.end_orientation,
-        turns=pose.turns,
-        branch=pose.branch,
-        name=pose.name,
-    )
+    names = [item.name for item in fields(Pose) if hasattr(pose, item.name)]
+    return Pose(**{name: getattr(pose, name) for name in names})
 
 
 def _reader(config: Config, pose: DeclaredPose) -> Callable[[Config, DeclaredPose], PoseInput]:
@@ -175,10 +170,7 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
         images,
         board_of(measurement),
         _camera(measurement.camera),
-        start=pose.start,
-        end=pose.end,
-        diameter=config.cable.diameter,
-        length=config.cable.length,
+        **_held(config, pose),
     )
     problems += views.problems.values()
     if not views.curves:
@@ -203,7 +195,7 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
     image = vision.read_image(pose.paths[0])
     try:
         view = view_of(config, image)
-        line = _extract(config, pose, image, view)
+        line = vision.extract_centerline(image, view, **_held(config, pose))
     except MeasurementError as error:
         hint = _turned(config, pose, image)
         raise MeasurementError(f"{error.message}{hint}") from None
@@ -226,22 +218,15 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
     )
 
 
-def _extract(
-    config: Config,
-    pose: DeclaredPose,
-    image: np.ndarray,
-    view: vision.View,
-    workings: vision.Workings | None = None,
-) -> vision.Centerline:
-    return vision.extract_centerline(
-        image,
-        view,
-        start=pose.start,
-        end=pose.end,
-        diameter=config.cable.diameter,
-        length=config.cable.length,
-        workings=workings,
-    )
+def _held(config: Config, pose: DeclaredPose) -> dict[str, Any]:
+    """What is known of the cable in a photograph, as `vision` takes it."""
+    cable = config.cable
+    return {
+        "start": pose.start,
+        "end": pose.end,
+        "diameter": cable.diameter,
+        "length": cable.length,
+    }
 
 
 def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
@@ -275,7 +260,7 @@ def _steps_in_plane(config: Config, pose: DeclaredPose, image: np.ndarray) -> di
     view, line, workings = None, None, vision.Workings()
     try:
         view = view_of(config, image)
-        line = _extract(config, pose, image, view, workings)
+        line = vision.extract_centerline(image, view, **_held(config, pose), workings=workings)
     except MeasurementError:  # the pictures show how far it came; the table says why
         pass
     pixels, gaps = (None, ()) if line is None else (line.pixels, line.gaps)
@@ -293,15 +278,8 @@ def _steps_in_space(config: Config, pose: DeclaredPose, image: np.ndarray) -> di
         viewpoint = vision.locate_camera(image, board_of(measurement), _camera(measurement.camera))
         distance = float(viewpoint.in_camera(fixtures)[:, 2].mean())
         view, flat = viewpoint.facing(distance), viewpoint.flattened(fixtures, distance)
-        pixels = vision.see_cable(
-            image,
-            viewpoint,
-            start=pose.start,
-            end=pose.end,
-            diameter=config.cable.diameter,
-            length=config.cable.length,
-            workings=workings,
-        ).pixels
+        held = _held(config, pose)
+        pixels = vision.see_cable(image, viewpoint, **held, workings=workings).pixels
     except MeasurementError:  # as above
         pass
     return vision.draw_steps(
@@ -321,7 +299,7 @@ def _turned(config: Config, pose: DeclaredPose, image: np.ndarray) -> str:
     for quarters, how in turns.items():
         turned = np.ascontiguousarray(np.rot90(image, quarters))
         try:
-            _extract(config, pose, turned, view_of(config, turned))
+            vision.extract_centerline(turned, view_of(config, turned), **_held(config, pose))
         except MeasurementError:
             continue
         return (

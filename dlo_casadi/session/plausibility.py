@@ -8,10 +8,10 @@ a list out of step as ends that fit another pose.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from itertools import permutations, product
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.config import Pose
+from dlo_casadi.errors import counted
 from dlo_casadi.thresholds import (
     CONTRADICTS,
     FITS,
@@ -26,14 +27,20 @@ from dlo_casadi.thresholds import (
     NEAR_UNIT,
     NEARLY_ALL,
     OUT_OF_STEP,
+    STRETCHED,
     TOO_LONG,
 )
 
 FloatArray = NDArray[np.floating]
 
+# A rotation so near to exchanged axes is told by their names [rad].
+_NAMED = 0.3
+# Fits of a frame, each followed by a new choice of which end of a line is which.
+_FITS_OF_FRAME = 4
+
 UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
 
-# What can have happened to the axes: measured -> declared, likeliest first.
+# Usual words for what can have happened to axes in a plane: measured -> declared.
 FRAMES: dict[str, FloatArray] = {
     "y pointing down instead of up": np.array([[1.0, 0.0], [0.0, -1.0]]),
     "x pointing left instead of right": np.array([[-1.0, 0.0], [0.0, 1.0]]),
@@ -48,24 +55,35 @@ def exchanges(d: int) -> list[FloatArray]:
     """All ways to exchange and turn round the axes of d dimensions, none first."""
     return [
         np.diag(signs) @ np.eye(d)[list(order)]
-        for order in itertools.permutations(range(d))
-        for signs in itertools.product((1.0, -1.0), repeat=d)
+        for order in permutations(range(d))
+        for signs in product((1.0, -1.0), repeat=d)
     ]
 
 
-def read_as(axes: FloatArray) -> str:
-    """Exchanged axes in words."""
+def named(axes: FloatArray) -> str:
+    """What can have happened to the points where axes are exchanged."""
+    for what, known in FRAMES.items():
+        if np.array_equal(axes, known):
+            return what
     names = "xyz"[: len(axes)]
     read = [("-" if row.min() < 0 else "") + names[int(np.abs(row).argmax())] for row in axes]
-    return f"{', '.join(names)} = {', '.join(read)}"
+    hand = ", mirrored (a left-handed frame)" if np.linalg.det(axes) < 0 else ""
+    up = " (y up in one, z up in the other?)" if np.all(np.diag(axes[1:, ::-1])) else ""
+    return f"the points read as {', '.join(names)} = {', '.join(read)}{hand}{up}"
 
 
-def clamp_axis(pose: Pose, side: str) -> FloatArray | None:
-    """Direction (d,) of the cable in a clamp, from start to end; None where there is none."""
-    heading, q = getattr(pose, f"{side}_heading"), getattr(pose, f"{side}_orientation")
-    if heading is not None:
-        return np.array([np.cos(heading), np.sin(heading)])
-    return None if q is None else np.asarray(Rotation.from_quat(q).as_matrix()[:, 0])
+def axes_of(value: float | Sequence[float]) -> FloatArray:
+    """Axes (d, d) of a clamp in columns, x along the cable; of a heading [rad] or a quaternion."""
+    if isinstance(value, float | int):
+        c, s = np.cos(value), np.sin(value)
+        return np.array([[c, -s], [s, c]])
+    return np.asarray(Rotation.from_quat(value).as_matrix())
+
+
+def clamp_axes(pose: Pose, side: str) -> FloatArray | None:
+    """Axes (d, d) of a pose's clamp, see `axes_of`; None where there is none."""
+    values = getattr(pose, f"{side}_heading"), getattr(pose, f"{side}_orientation")
+    return next((axes_of(value) for value in values if value is not None), None)
 
 
 class Suspicion(NamedTuple):
@@ -77,6 +95,11 @@ class Suspicion(NamedTuple):
     message: str
     certain: bool
     pose: str = ""
+
+    @classmethod
+    def of_pose(cls, name: str, text: str) -> Self:
+        """What looks like a mistake in a single pose."""
+        return cls(f"{name}: {text}", False, name)
 
 
 @dataclass(frozen=True)
@@ -197,35 +220,90 @@ def wrong_units(lines: Lines) -> Suspicion | None:
 
 
 def wrong_frame(lines: Lines) -> Suspicion | None:
-    """Ends that fit all fixtures once the axes are turned or mirrored, or the origin is moved."""
+    """Ends that fit all fixtures once the points are moved, turned or mirrored as a whole."""
     own = overall(lines.misfit(lines.measured, lines.declared))
-    if own < CONTRADICTS or not lines.whole:
+    enough = min(FITS, MUCH_BETTER * own)
+    if own < FITS:
         return None
-    shifted, shift = _moved(lines, lines.measured)
-    if shifted < min(FITS, MUCH_BETTER * own):
-        return Suspicion(
-            f"all lines lie ({shift[0]:.4g}, {shift[1]:.4g}) m away from their start and end. Try: "
-            "measure fixtures and lines from the same origin; subtract this from the points, or "
-            "add it to start and end.",
-            True,
-        )
-    for what, axes in FRAMES.items():
-        turned = lines.measured @ axes.T
-        in_place = overall(lines.misfit(turned, lines.declared))
-        moved, shift = _moved(lines, turned)
-        if len(lines.names) < 3:  # of so few ends, some turn and some origin fit any
-            moved = np.inf
-        if min(in_place, moved) > min(FITS, MUCH_BETTER * own):
-            continue
-        away = "" if in_place < FITS else f" and moved by ({shift[0]:.4g}, {shift[1]:.4g}) m"
-        return Suspicion(
-            f"the lines do not end at start and end of their poses ({own * lines.length:.4g} m "
-            f"RMS), but do ({min(in_place, moved) * lines.length:.4g} m) with {what}{away}. "
-            "Try: points, start and end in one frame, x to the right and y up; in pictures rows "
-            "count downwards.",
-            True,
-        )
+    several = len(lines.names) > 2  # to the ends of fewer, some turn and some origin fit
+    if own > CONTRADICTS:
+        shifted, shift = _moved(lines, lines.measured)
+        if shifted < enough:
+            return Suspicion(
+                f"all lines lie {_at(shift, '.4g')} m away from their start and end. Try: measure "
+                "fixtures and lines from the same origin; subtract this from the points, or add "
+                "it to start and end.",
+                True,
+            )
+        origins = (True, False) if several else (True,)
+        for in_place, axes in product(origins, exchanges(len(shift))[1:]):
+            turned, what = lines.measured @ axes.T, named(axes)
+            misfit, shift = _moved(lines, turned)
+            if in_place:
+                misfit = overall(lines.misfit(turned, lines.declared))
+            else:
+                what += f" and moved by {_at(-shift, '.4g')} m"
+            if misfit < enough:
+                return _in_frame(lines, own, misfit, what)
+    if several and np.all(np.isfinite(lines.declared)):
+        found = [_fitted(lines, axes) for axes in exchanges(lines.declared.shape[2])]
+        misfit, turn, shift = min(found, key=lambda item: item[0])
+        if misfit < enough:
+            return _in_frame(lines, own, misfit, _told(turn, shift))
     return None
+
+
+def _in_frame(lines: Lines, own: float, misfit: float, what: str) -> Suspicion:
+    return Suspicion(
+        f"the lines do not end at start and end of their poses ({own * lines.length:.3g} m RMS), "
+        f"but do ({misfit * lines.length:.3g} m) with {what}. Try: points, start, end, "
+        "orientations and gravity in one frame, right-handed, in a plane x to the right and y up; "
+        "in pictures rows count downwards; a camera's points by its calibration.",
+        own > CONTRADICTS,
+    )
+
+
+def _fitted(lines: Lines, turn: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Misfit, rotation (d, d) and translation (d,) [m] of the frame that fits best, from a first.
+
+    Declared = rotation measured + translation, least squares (Kabsch 1976), of the handedness of
+    the first one; the middle of both ends needs no order of a line.
+    """
+    d, hand = len(turn), np.sign(np.linalg.det(turn))
+    shift = np.median(lines.declared.mean(axis=1) - lines.measured.mean(axis=1) @ turn.T, axis=0)
+    for _ in range(_FITS_OF_FRAME):
+        moved = lines.measured @ turn.T + shift
+        given, other = (
+            np.linalg.norm(ends - lines.declared, axis=(1, 2)) for ends in (moved, moved[:, ::-1])
+        )
+        swapped = ~lines.ordered & (other < given)
+        source = np.where(swapped[:, None, None], lines.measured[:, ::-1], lines.measured)
+        source, goal = source.reshape(-1, d), lines.declared.reshape(-1, d)
+        centres = source.mean(axis=0), goal.mean(axis=0)
+        u, _, v = np.linalg.svd((goal - centres[1]).T @ (source - centres[0]))
+        turn = u @ np.diag([*np.ones(d - 1), hand * np.sign(np.linalg.det(u @ v))]) @ v
+        shift = centres[1] - turn @ centres[0]
+    moved = lines.measured @ turn.T + shift
+    return overall(lines.misfit(moved, lines.declared)), turn, shift
+
+
+def _told(turn: FloatArray, shift: FloatArray) -> str:
+    """A frame in words: exchanged axes by their names, else how far it is turned and moved."""
+    moved = f"moved by {_at(shift, '.3g')} m"
+    near = min(exchanges(len(turn)), key=lambda axes: float(np.linalg.norm(turn - axes)))
+    if np.linalg.norm(turn - near) < _NAMED * np.sqrt(2) and not np.allclose(
+        near, np.eye(len(turn))
+    ):
+        return f"{named(near)} and {moved}"
+    hand = np.sign(np.linalg.det(turn))
+    whole = hand * np.eye(3)
+    whole[: len(turn), : len(turn)] = turn
+    vector = Rotation.from_matrix(hand * whole).as_rotvec()
+    angle = float(np.linalg.norm(vector))
+    return (
+        f"the points {'mirrored, ' if hand < 0 else ''}turned by {np.degrees(angle):.3g} degrees "
+        f"about {_at(vector / max(angle, 1e-12), '.2g')} and {moved}"
+    )
 
 
 def out_of_step(lines: Lines) -> Suspicion | None:
@@ -271,11 +349,10 @@ def counted_from_the_end(lines: Lines) -> Suspicion | None:
 def too_long(lines: Lines) -> tuple[Suspicion, ...]:
     """Single poses whose points, in their order, run to and fro."""
     return tuple(
-        Suspicion(
-            f"{lines.names[i]}: from point to point its line is {lines.lengths[i]:.4g} m long, the "
-            f"cable {lines.length:.4g} m. Try: are its points in order along the cable?",
-            False,
+        Suspicion.of_pose(
             lines.names[i],
+            f"from point to point its line is {lines.lengths[i]:.4g} m long, the cable "
+            f"{lines.length:.4g} m. Try: are its points in order along the cable?",
         )
         for i in np.flatnonzero(lines.lengths > TOO_LONG * lines.length)
     )
@@ -293,11 +370,10 @@ def exchanged(lines: Lines) -> tuple[Suspicion, ...]:
     if regular.sum() < 3 * turned.sum():
         return ()
     return tuple(
-        Suspicion(
-            f"{lines.names[i]}: its end {_at(ends[i], 'g')} m is where the other "
-            "poses have their start. Try: are start and end exchanged?",
-            False,
+        Suspicion.of_pose(
             lines.names[i],
+            f"its end {_at(ends[i], 'g')} m is where the other poses have their start. Try: are "
+            "start and end exchanged?",
         )
         for i in np.flatnonzero(turned)
     )
@@ -307,12 +383,11 @@ def far_ends(lines: Lines) -> tuple[Suspicion, ...]:
     """Single poses whose line ends far from the fixtures."""
     own = lines.misfit(lines.measured, lines.declared)
     return tuple(
-        Suspicion(
-            f"{lines.names[i]}: its line runs from {_at(lines.measured[i, 0])} to "
-            f"{_at(lines.measured[i, 1])} m, {own[i] * lines.length:.3g} m RMS away from the "
-            "declared ends. Try: start and end of this pose, and whether it is the right file.",
-            False,
+        Suspicion.of_pose(
             lines.names[i],
+            f"its line runs from {_at(lines.measured[i, 0])} to {_at(lines.measured[i, 1])} m, "
+            f"{own[i] * lines.length:.3g} m RMS away from the declared ends. Try: start and end "
+            "of this pose, and whether it is the right file.",
         )
         for i in np.flatnonzero(own > CONTRADICTS)
     )
@@ -335,6 +410,29 @@ def repeated(names: Sequence[str], points: Sequence[FloatArray]) -> tuple[Suspic
             )
         seen.setdefault(key, name)
     return tuple(found)
+
+
+def stretched(
+    marked: Sequence[tuple[str, FloatArray, FloatArray]], length: float
+) -> tuple[Suspicion, ...]:
+    """Markers farther apart than the cable between them; pose, points (K, d) and s (K,) [m]."""
+    texts = {}
+    for name, place, along in marked:
+        chords = np.linalg.norm(np.diff(place, axis=0), axis=1)
+        beyond = chords - np.diff(along)
+        k = int(beyond.argmax()) if len(beyond) else 0
+        if len(beyond) and beyond[k] > STRETCHED * length:
+            texts[name] = (
+                f"its markers at s_m {along[k]:g} and {along[k + 1]:g} are {chords[k]:.4g} m "
+                f"apart, the cable between them is {along[k + 1] - along[k]:.4g} m long"
+            )
+    advice = ". Try: s_m in metres along the cable, each beside its own point."
+    if texts and 2 * len(texts) > len(marked):
+        name = next(iter(texts))
+        told = f"{len(texts)} of {counted(len(marked), 'pose')}"
+        said = f"s_m contradicts the points of {told}. {name}: "
+        return (Suspicion(said + texts[name] + advice, True),)
+    return tuple(Suspicion.of_pose(name, text + advice) for name, text in texts.items())
 
 
 def _all_near(ratio: FloatArray, factor: float) -> bool:

@@ -28,14 +28,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.findings import (
-    candidate_rows,
-    effect_rows,
-    hidden_weight_row,
-    next_pose_row,
-    structure_rows,
-    unexplained_row,
-)
+from dlo_casadi.session.findings import findings_of, next_pose_row
 from dlo_casadi.session.fitting import (
     confirmed,
     first_mesh,
@@ -124,8 +117,14 @@ def fit_session(
     progress.step("fit the declared model", 1, 1)
 
     progress.step("compare with simpler fits", 0, 1)
-    reported = _declared_names(config, fit.model)
-    own = _declared_stage(config, fit, measured, reported)
+    reported = _parameters_of({item.name for item in config.model.effects}, fit.model)
+
+    def staged(fit: Fit) -> Stage:
+        # A diagnosis that finds nothing replaces this stage; intervals are taken after it.
+        intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
+        return fit_stage("batch", fit, measured, intervals, reported)
+
+    own = staged(fit)
     simpler, stages = compared()
     if fit.model.n != n:
         stages = simpler.stages(measured, fit.model.n)
@@ -134,12 +133,12 @@ def fit_session(
     clock.add("batch", found.seconds)
     best = confirmed(fit, found)
     if best.point is not fit.point:
-        own = _declared_stage(config, best, measured, reported)
+        own = staged(best)
     fit = not_worse(best, [*stages, own])
     if not config.diagnosis.enabled:
         fit = as_measured(fit)
     if fit is not best:
-        own = _declared_stage(config, fit, measured, reported)
+        own = staged(fit)
     progress.step("compare with simpler fits", 1, 1)
     clock.lap("fit")
     outcome = Outcome(
@@ -211,12 +210,18 @@ def close_the_loop(
         error = mesh_error(fit)
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
-    if diagnosis.added:
-        confirming = begin(executor, minimum_by_ipopt, fit)
-        next_pose = next_pose_row(diagnosis)
-        stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
+    confirming = begin(executor, minimum_by_ipopt, fit) if diagnosis.added else None
+    next_pose = next_pose_row(diagnosis) if diagnosis.added else None
+    if diagnosis.added or diagnosis.unexplained:
+        parameters = fitted_parameters(outcome.fit, profile_intervals(outcome.fit), reported)
+        stages[-1] = replace(stages[-1], parameters=parameters)
+    else:
+        # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
+        fit = as_measured(fit)
+        stages[-1] = fit_stage("batch", fit, measured, profile_intervals(fit), reported)
+    if confirming is not None:
         labels = {item.candidate.effect.label for item in diagnosis.added}
-        names = [*reported, *(name for name in fit.model.names if name.split(".")[0] in labels)]
+        names = [*reported, *_parameters_of(labels, fit.model)]
         own = fit_stage("closed", fit, measured, profile_intervals(fit), names)
         found = confirming()
         clock.add("batch", found.seconds)
@@ -225,14 +230,6 @@ def close_the_loop(
             own = fit_stage("closed", best, measured, profile_intervals(best), names)
         fit = best
         stages.append(own)
-    elif diagnosis.unexplained:
-        next_pose = None
-        stages[-1] = with_intervals(stages[-1], outcome.fit, reported)
-    else:
-        next_pose = None
-        # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
-        fit = as_measured(fit)
-        stages[-1] = fit_stage("batch", fit, measured, profile_intervals(fit), reported)
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
     clock.lap("diagnosis")
@@ -244,29 +241,10 @@ def close_the_loop(
         discretization=mesh,
         repeatability=Repeatability.of(fit),
         timing=clock.total(),
-        verdict=diagnosis.verdict,
-        effects=effect_rows(diagnosis),
-        candidates=candidate_rows(diagnosis),
-        unexplained=unexplained_row(diagnosis),
         next_pose=next_pose,
-        structure=structure_rows(diagnosis),
-        hidden_weight=hidden_weight_row(diagnosis),
-        diagnosis=diagnosis,
+        **findings_of(diagnosis),
     )
     return judged(closed)
-
-
-def _declared_stage(
-    config: Config, fit: Fit, measured: Sequence[MeasuredPose], reported: Sequence[str]
-) -> Stage:
-    # A diagnosis that finds nothing replaces this stage; intervals are taken after it.
-    intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
-    return fit_stage("batch", fit, measured, intervals, reported)
-
-
-def with_intervals(stage: Stage, fit: Fit, reported: Sequence[str]) -> Stage:
-    """A stage of a fit, with the intervals that it was made without."""
-    return replace(stage, parameters=fitted_parameters(fit, profile_intervals(fit), reported))
 
 
 def versions() -> dict[str, str]:
@@ -279,8 +257,8 @@ def _center(inputs: Sequence[PoseInput]) -> tuple[float, float] | None:
     centers = [item.center for item in inputs if item.center is not None]
     if not centers:
         return None
-    middle = np.mean(centers, axis=0)
-    return float(middle[0]), float(middle[1])
+    x, y = np.mean(centers, axis=0).tolist()
+    return x, y
 
 
 def _pixel(inputs: Sequence[PoseInput]) -> float | None:
@@ -288,9 +266,8 @@ def _pixel(inputs: Sequence[PoseInput]) -> float | None:
     return float(np.median(sizes)) if sizes else None
 
 
-def _declared_names(config: Config, model: CableModel) -> list[str]:
-    """Qualified parameters of the effects that the configuration declares."""
-    labels = {item.name for item in config.model.effects}
+def _parameters_of(labels: set[str], model: CableModel) -> list[str]:
+    """Qualified parameters of the effects with these labels."""
     return [name for name in model.names if name.split(".")[0] in labels]
 
 

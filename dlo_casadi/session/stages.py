@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,34 +91,87 @@ def _branch_shape(found: MeasuredBranch, item: MeasuredPose) -> BranchShape:
     return BranchShape(_rmse(found.prediction, item), found.branch, found.turns)
 
 
-def _either_side(
-    model: CableModel,
-    p: FloatArray,
-    item: MeasuredPose,
-    known: Prediction,
-    measured: MeasuredBranch | None,
-    uncertainty: Uncertainty,
-) -> EitherSide | None:
-    """A held-out pose on both sides, see `EitherSide`; None where there is but one."""
-    if not (item.held_out and item.readable):
-        return None
-    if measured is not None and measured.other_side:
-        other: Prediction | None = measured.prediction
-    else:
-        other = predict_other_side(model, p, item.pose, known)
-    if other is None:
-        return None
-    pair = known.equilibrium, other.equilibrium
-    if measured is not None and not on_other_side(model, item.pose, pair[0].x, pair[1].x[None])[0]:
-        predicted = BranchShape(_rmse(known, item), None)
-        return EitherSide(predicted, _branch_shape(measured, item), None)
-    ways = sides_of(model, item.pose, *pair)
-    shapes = [
-        BranchShape(_rmse(one, item), way.branch, way.turns or None)
-        for one, way in zip((known, other), ways, strict=True)
-    ]
-    tipping = tipping_of(model, p, known.rest, item.pose, *pair, uncertainty)
-    return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
+@dataclass(frozen=True)
+class _Fitted:
+    """What is known of a fitted model, to say of its predictions what they let expect."""
+
+    model: CableModel
+    p: FloatArray
+    uncertainty: Uncertainty
+    noise: float
+
+    def told(
+        self, item: MeasuredPose, known: Prediction, other: MeasuredBranch | None, shape: PoseShape
+    ) -> PoseShape:
+        """A predicted pose with all that the uncertainty tells of it."""
+        either = self._either_side(item, known, other)
+        undecided = other is not None and self._undecided(item, known, other)
+        shape = self._expected(item, known, shape)
+        return replace(shape, either_side=either, undecided=undecided)
+
+    def _either_side(
+        self, item: MeasuredPose, known: Prediction, measured: MeasuredBranch | None
+    ) -> EitherSide | None:
+        """A held-out pose on both sides, see `EitherSide`; None where there is but one."""
+        if not (item.held_out and item.readable):
+            return None
+        if measured is not None and measured.other_side:
+            other: Prediction | None = measured.prediction
+        else:
+            other = predict_other_side(self.model, self.p, item.pose, known)
+        if other is None:
+            return None
+        pair = known.equilibrium, other.equilibrium
+        if (
+            measured is not None
+            and not on_other_side(self.model, item.pose, pair[0].x, pair[1].x[None])[0]
+        ):
+            predicted = BranchShape(_rmse(known, item), None)
+            return EitherSide(predicted, _branch_shape(measured, item), None)
+        ways = sides_of(self.model, item.pose, *pair)
+        shapes = [
+            BranchShape(_rmse(one, item), way.branch, way.turns or None)
+            for one, way in zip((known, other), ways, strict=True)
+        ]
+        tipping = tipping_of(self.model, self.p, known.rest, item.pose, *pair, self.uncertainty)
+        return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
+
+    def _expected(self, item: MeasuredPose, known: Prediction, shape: PoseShape) -> PoseShape:
+        """A predicted pose with what the next hanging of it lets expect."""
+        places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
+        both = np.concatenate([places, shape.s])
+        eq = known.equilibrium
+        curve, moved = displacements(
+            self.model, self.p, known.rest, item.pose, eq, self.uncertainty, both
+        )
+        spread = spread_across(curve, places, moved[: len(places)])
+        expected: FloatArray = np.zeros(0)
+        missed = expected
+        if len(shape.s):
+            line = item.traced
+
+            def distances(moved: FloatArray) -> FloatArray:
+                """Lengths (K,) [m] of displacements (K, d, q) as the sensor compares points."""
+                rows = line.components(curve, shape.s, moved)[line.on_points]
+                return np.asarray(np.sqrt(np.bincount(line.point_of, (rows**2).sum(axis=1))))
+
+            missed = distances(shape.gap[..., None])
+            expected = np.hypot(distances(moved[len(places) :]), self.noise * line.noise_distances)
+        return replace(shape, spread=spread.squeeze(), expected=expected, missed=missed)
+
+    def _undecided(self, item: MeasuredPose, known: Prediction, other: MeasuredBranch) -> bool:
+        """Whether the uncertain parameters leave open in which equilibrium a pose is."""
+        std = np.sqrt(np.maximum(np.diag(self.uncertainty.covariance), 1e-300))
+        by_p, by_rest = self.uncertainty.unknowns_in(self.model)
+        gap = EnergyGap.between(
+            self.model,
+            item.pose,
+            (other.prediction.equilibrium, known.equilibrium),
+            (self.p, known.rest),
+            (by_p * std, by_rest * std),
+            self.uncertainty.covariance / np.outer(std, std),
+        )
+        return gap.value < UNSEEN * gap.std
 
 
 def _reading_errors(
@@ -161,7 +214,7 @@ def _stage(
     measured: Sequence[MeasuredPose],
     parameters: dict[str, ParameterEstimate],
     rest_curvature: RestCurvatureEstimate,
-    chi2_per_dof: float | None,
+    chi2_per_dof: float | None = None,
     note: str = "",
     uncertainty: Uncertainty | None = None,
     fitted: Mapping[str, FloatArray] | None = None,
@@ -183,16 +236,10 @@ def _stage(
         if prediction is not None
     }
     if uncertainty is not None:
+        fit = _Fitted(model, p, uncertainty, noise)
         for item, known, other in zip(measured, predictions, others, strict=True):
             if known is not None:
-                shape = shapes[item.pose.name]
-                shape = _expected(model, p, item, known, shape, uncertainty, noise)
-                either = _either_side(model, p, item, known, other, uncertainty)
-                undecided = other is not None and _undecided(
-                    model, p, item, known, other, uncertainty
-                )
-                shape = replace(shape, either_side=either, undecided=undecided)
-                shapes[item.pose.name] = shape
+                shapes[item.pose.name] = fit.told(item, known, other, shapes[item.pose.name])
     lost = [item for item in measured if item.pose.name not in shapes]
     if lost:
         names = ", ".join(item.pose.name for item in lost)
@@ -218,62 +265,9 @@ def _stage(
     )
 
 
-def _expected(
-    model: CableModel,
-    p: FloatArray,
-    item: MeasuredPose,
-    known: Prediction,
-    shape: PoseShape,
-    uncertainty: Uncertainty,
-    noise: float,
-) -> PoseShape:
-    """A predicted pose with what the next hanging of it lets expect."""
-    places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
-    both = np.concatenate([places, shape.s])
-    eq = known.equilibrium
-    curve, moved = displacements(model, p, known.rest, item.pose, eq, uncertainty, both)
-    spread = spread_across(curve, places, moved[: len(places)])
-    expected: FloatArray = np.zeros(0)
-    missed = expected
-    if len(shape.s):
-        line = item.traced
-
-        def distances(moved: FloatArray) -> FloatArray:
-            """Lengths (K,) [m] of displacements (K, d, q) as the sensor compares points."""
-            rows = line.components(curve, shape.s, moved)[line.on_points]
-            return np.asarray(np.sqrt(np.bincount(line.point_of, (rows**2).sum(axis=1))))
-
-        missed = distances(shape.gap[..., None])
-        expected = np.hypot(distances(moved[len(places) :]), noise * line.noise_distances)
-    band = np.asarray(spread if model.in_space else spread[:, 0])
-    return replace(shape, spread=band, expected=expected, missed=missed)
-
-
-def _undecided(
-    model: CableModel,
-    p: FloatArray,
-    item: MeasuredPose,
-    known: Prediction,
-    other: MeasuredBranch,
-    uncertainty: Uncertainty,
-) -> bool:
-    """Whether the uncertain parameters leave open in which equilibrium a pose is."""
-    std = np.sqrt(np.maximum(np.diag(uncertainty.covariance), 1e-300))
-    by_p, by_rest = uncertainty.unknowns_in(model)
-    gap = EnergyGap.between(
-        model,
-        item.pose,
-        (other.prediction.equilibrium, known.equilibrium),
-        (p, known.rest),
-        (by_p * std, by_rest * std),
-        uncertainty.covariance / np.outer(std, std),
-    )
-    return gap.value < UNSEEN * gap.std
-
-
 def _no_rest(model: CableModel) -> RestCurvatureEstimate:
     s = np.linspace(0.0, model.cable.length, _REST_POINTS)
-    none = np.zeros((2, len(s))) if model.in_space else np.zeros(len(s))
+    none = np.zeros((len(model.node.curvatures), len(s))).squeeze()
     return RestCurvatureEstimate(s, none, none)
 
 
@@ -284,16 +278,7 @@ def initial_stage(model: CableModel, measured: Sequence[MeasuredPose]) -> Stage:
         for k in model.stiffness_indices
     }
     rest = np.zeros(model.chain.n_rests)
-    return _stage(
-        "initial",
-        model,
-        model.nominal,
-        rest,
-        measured,
-        stiffness,
-        _no_rest(model),
-        None,
-    )
+    return _stage("initial", model, model.nominal, rest, measured, stiffness, _no_rest(model))
 
 
 def stiffness_stage(
@@ -309,16 +294,8 @@ def stiffness_stage(
     stiffness = ParameterEstimate(
         found.EI, spread, "N m^2", (interval[0], interval[1]), bool(known)
     )
-    return _stage(
-        "stiffness_only",
-        model,
-        p,
-        np.zeros(model.chain.n_rests),
-        measured,
-        {"bending_stiffness": stiffness},
-        _no_rest(model),
-        None,
-    )
+    rest, parameters = np.zeros(model.chain.n_rests), {"bending_stiffness": stiffness}
+    return _stage("stiffness_only", model, p, rest, measured, parameters, _no_rest(model))
 
 
 def algorithm1_stage(
@@ -341,8 +318,7 @@ def algorithm1_stage(
         measured,
         {"bending_stiffness": ParameterEstimate(result.EI, 0.0, "N m^2")},
         RestCurvatureEstimate(s, value, np.zeros_like(s)),
-        None,
-        result.message,
+        note=result.message,
     )
 
 
@@ -423,5 +399,4 @@ def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
     variance = np.einsum("ik,kl,il->i", scaled, fit.inflated_covariance[tail, tail], scaled)
     std = np.sqrt(np.maximum(variance, 0))
     value = basis @ fit.coefficients
-    shape = (axes, len(s)) if model.in_space else (len(s),)
-    return RestCurvatureEstimate(s, value.reshape(shape), std.reshape(shape))
+    return RestCurvatureEstimate(s, *np.reshape([value, std], (2, axes, len(s))).squeeze())

@@ -18,7 +18,7 @@ pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-cas
 import pyarrow.parquet as pq
 from tiny_sessions import QUICK, without_times, write_fleet
 
-from dlo_casadi.cli import main
+from dlo_casadi.cli import fit_many, main
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet import find_sessions, fit_fleet
 from dlo_casadi.fleet.columns import COLUMNS, empty_row, row_of
@@ -77,6 +77,19 @@ def test_a_session_without_results_is_told_by_the_exit_code(tmp_path, capsys):
         assert main([*command, "--quiet"]) == 2
         (row,) = json.loads(capsys.readouterr().out)
         assert row["status"] == "failed"
+
+
+def test_a_run_opens_one_pool_of_workers(tmp_path, monkeypatch, capsys):
+    (tmp_path / "broken.yaml").write_text("cable: {lenght: 1.0}\nexperiment: {}\n")
+    opened = []
+
+    def opens(*options):
+        opened.append(options)
+        return open_executor(*options)
+
+    monkeypatch.setattr(fit_many, "open_executor", opens)
+    assert main(["fit-many", str(tmp_path), "--output", str(tmp_path / "out"), "--quiet"]) == 2
+    assert len(opened) == 1
 
 
 def test_a_killed_worker_of_the_pool_changes_nothing(fleet, expected, tmp_path):

@@ -1,5 +1,7 @@
 """Headings of clamps against the directions of the lines, on arcs of known ends."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import write_points
 from dlo_casadi.session.checks import lines_of, without_implausible
-from dlo_casadi.session.headings import wrong_headings
+from dlo_casadi.session.directions import wrong_directions
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import suspicions
 
@@ -56,7 +58,7 @@ def test_a_clamp_that_is_a_little_askew_is_no_mistake(turn, askew, tmp_path):
         pose["start_heading"] += askew
         pose["end_heading"] -= askew
 
-    assert wrong_headings(*session(tmp_path, change, turn)) == ()
+    assert wrong_directions(*session(tmp_path, change, turn)) == ()
 
 
 @pytest.mark.parametrize(
@@ -77,6 +79,17 @@ def test_headings_of_most_poses_are_refused(side, meant, words, tmp_path):
         without_implausible(*session(tmp_path, change))
     assert words in caught.value.message
     assert "rad, the line" in caught.value.message
+
+
+def test_the_heading_of_a_pinned_side_is_not_used(tmp_path):
+    def change(pose, k):
+        pose["start_heading"] += 2.0
+
+    config, inputs = session(tmp_path, change)
+    assert wrong_directions(config, inputs)
+    boundary = config.experiment.boundary.model_copy(update={"start": "pinned"})
+    experiment = config.experiment.model_copy(update={"boundary": boundary})
+    assert wrong_directions(replace(config, experiment=experiment), inputs) == ()
 
 
 def test_one_wrong_heading_leaves_its_pose_out(tmp_path):
@@ -100,8 +113,8 @@ def test_a_full_turn_more_than_the_line_has_is_a_mistake(tmp_path):
 @pytest.mark.parametrize("apart", [50, 133, 399])
 def test_points_far_apart_do_not_show_the_direction_of_a_clamp(apart, tmp_path):
     """A third of the cable on, arcs have turned by radians."""
-    assert wrong_headings(*session(tmp_path, turn=13.0, apart=apart)) == ()
-    assert wrong_headings(*session(tmp_path, turn=-6.0, apart=apart)) == ()
+    assert wrong_directions(*session(tmp_path, turn=13.0, apart=apart)) == ()
+    assert wrong_directions(*session(tmp_path, turn=-6.0, apart=apart)) == ()
 
 
 @pytest.mark.parametrize("apart", [5, 100, 133])

@@ -98,6 +98,14 @@ def test_every_frame_is_recognised(what, shift):
     assert ("moved by (" in found.message) == any(shift)
 
 
+def test_a_frame_a_little_off_is_a_doubt():
+    lines = session()
+    c, s = np.cos(0.15), np.sin(0.15)
+    found = wrong_frame(replace(lines, measured=lines.measured @ [[c, s], [-s, c]]))
+    assert not found.certain
+    assert "with the points turned by 8." in found.message
+
+
 def test_another_origin_is_recognised():
     lines = session()
     (found,) = suspicions(replace(lines, measured=lines.measured + np.array([0.3, -0.2])))
