@@ -104,8 +104,9 @@ def wrong_directions(config: Config, read: Sequence[PoseInput]) -> tuple[Suspici
             f"{' and '.join(keys)} contradict{'s' * (len(keys) == 1)} {len(wrong)} of "
             f"{counted(len(common), 'line')}. {wrong[0].name}: {wrong[0]}{_try(common)}"
         )
-        # Certain only where another reading explains what the declared one does not.
-        found.insert(0, Suspicion(text, bool(_meant(common))))
+        # A frame is certainly wrong only where another reading of it explains the lines.
+        certain = np.ndim(wrong[0].value) == 0 or bool(_meant(common))
+        found.insert(0, Suspicion(text, certain))
     return tuple(found)
 
 
