@@ -103,6 +103,11 @@ def test_the_top_holds_rooms_and_little_else():
     assert at_the_top == {"__init__.py", "api.py", "errors.py", "thresholds.py"}
 
 
+def test_no_file_is_longer_than_450_lines():
+    long = {name(file): len(file.read_text().splitlines()) for file in FILES}
+    assert {file: lines for file, lines in long.items() if lines > 450} == {}
+
+
 @pytest.mark.parametrize(
     ("library", "room"), [("yaml", "config"), ("pydantic", "config"), ("cv2", "vision")]
 )

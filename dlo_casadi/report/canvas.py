@@ -15,6 +15,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from dlo_casadi.io.files import write_file
@@ -162,3 +163,9 @@ def label_of(stage: Stage, outcome: Outcome) -> str:
 def millimetres(value: float | None) -> str:
     """A length [m] as text in mm, with three digits; a dash for none."""
     return "-" if value is None else f"{1e3 * value:.3g} mm"
+
+
+def dot(label: str, marker: str, color: str, fill: str = "") -> Line2D:
+    """A marker in a legend."""
+    fill = fill or ("white" if marker == "D" else color)
+    return Line2D([], [], ls="none", ms=7, marker=marker, color=color, mfc=fill, label=label)

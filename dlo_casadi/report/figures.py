@@ -29,16 +29,15 @@ from dlo_casadi.report.canvas import (
     WIDTH,
     before_after,
     compared,
+    dot,
     headline,
     label_of,
     millimetres,
     save_figure,
     styled,
 )
-from dlo_casadi.report.figures_room import STYLES, draw_marks, frame
+from dlo_casadi.report.figures_scene import next_pose_figure, unexplained_figure
 from dlo_casadi.report.geometry import directions, residual_along, residual_range, rest_about
-from dlo_casadi.report.room import Mark, Room
-from dlo_casadi.report.scene import Board, next_marks, pull_marks, scene_of
 from dlo_casadi.report.text_findings import cross_validated, finding_of
 from dlo_casadi.session.outcome import Outcome, PoseInput
 from dlo_casadi.thresholds import NORMAL_95
@@ -127,7 +126,7 @@ def errors_figure(outcome: Outcome) -> Figure:
         ]
         names = [textwrap.fill(label_of(stage, outcome), 18) for stage in outcome.stages]
         axes.set_yticks(middles, names)
-        handles = [_dot(kind, *_KINDS[kind]) for kind in shown]
+        handles = [dot(kind, *_KINDS[kind]) for kind in shown]
         drawing.legend(handles=[*handles, _floor(floor)], loc="outside lower center", ncols=2)
         headline(drawing, f"{outcome.config.cable.name}: error of each stage")
     return drawing
@@ -155,10 +154,10 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
             row.set(gid=f"choose-{k}", label="; ".join([_name(pose), *said]))
         axes.set_yticks(range(0, -len(outcome.poses), -1), [_short(x.name) for x in outcome.poses])
         axes.set_ylim(0.6 - len(outcome.poses), 0.6)
-        handles = [_dot(label, marker, color) for _, label, color, marker in stages]
+        handles = [dot(label, marker, color) for _, label, color, marker in stages]
         handles.append(_floor(floor))
         if any(pose.role == "held_out" for pose in outcome.poses):
-            handles.append(_dot("hollow: held out", "o", GREY, fill="white"))
+            handles.append(dot("hollow: held out", "o", GREY, fill="white"))
         drawing.legend(handles=handles, loc="outside lower center", ncols=1)
         headline(drawing, f"{outcome.config.cable.name}: error of each pose")
     return drawing
@@ -183,11 +182,6 @@ def _error_axis(
     axes.grid(visible=False, axis="y")
     axes.axvline(1e3 * floor, color=BLACK, ls="--", lw=1.2, zorder=0.9)
     return low, high
-
-
-def _dot(label: str, marker: str, color: str, fill: str = "") -> Line2D:
-    fill = fill or ("white" if marker == "D" else color)
-    return Line2D([], [], ls="none", ms=7, marker=marker, color=color, mfc=fill, label=label)
 
 
 def _floor(floor: float) -> Line2D:
@@ -409,49 +403,3 @@ def candidates_figure(outcome: Outcome) -> Figure:
 
 
 # ---- the board ---------------------------------------------------------------------------------
-
-
-def unexplained_figure(outcome: Outcome) -> Figure:
-    """Where the cable is pulled, and how, in each fit pose."""
-    load = outcome.unexplained
-    assert load is not None
-    low, high = load["interval_95"]
-    size = float(np.linalg.norm(load["force"]))
-    handles = [
-        _line_of("taken", "measured"),
-        _line_of("pulled", f"pulled at {low:.3f} to {high:.3f} m (95 %)"),
-        _line_of("pull", f"force in each pose, on average {size:.3g} N"),
-    ]
-    said = "unexplained, pulled by something that is not in the model"
-    return _scene_figure(outcome, pull_marks, handles, said)
-
-
-def next_pose_figure(outcome: Outcome) -> Figure:
-    """Where to hold the end in the next pose, among those that were taken."""
-    handles = [
-        _line_of("taken", "measured"),
-        _dot("next end", "P", VERMILLION),
-        _dot("starts", "s", BLACK),
-        _dot("ends", "o", BLACK),
-    ]
-    return _scene_figure(outcome, next_marks, handles, "which pose to measure next")
-
-
-def _scene_figure(
-    outcome: Outcome,
-    marks: Callable[[Outcome, Room | Board], list[Mark]],
-    handles: list[Line2D],
-    said: str,
-) -> Figure:
-    with styled((WIDTH, 4.6)) as drawing:
-        place, under = scene_of(outcome)
-        axes = drawing.subplots()
-        draw_marks(axes, [*under, *marks(outcome, place)])
-        frame(axes, place)
-        drawing.legend(handles=handles, loc="outside lower center", ncols=1 + len(handles) // 4)
-        headline(drawing, f"{outcome.config.cable.name}: {said}")
-    return drawing
-
-
-def _line_of(kind: str, label: str) -> Line2D:
-    return Line2D([], [], **STYLES[kind], label=label)

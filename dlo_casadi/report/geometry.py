@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.session.outcome import (
-    Outcome,
-    PoseInput,
-    PoseShape,
-    RestCurvatureEstimate,
-    Stage,
-)
+from dlo_casadi.session.outcome import Outcome, PoseInput, RestCurvatureEstimate, Stage
+from dlo_casadi.session.pose_shape import PoseShape
 
 FloatArray = NDArray[np.floating]
 

@@ -24,7 +24,8 @@ from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds, fla
 from dlo_casadi.report.room import Mark, Room, around
 from dlo_casadi.report.scene import next_marks, pull_marks, scene_of
 from dlo_casadi.report.text_findings import branch_text
-from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, PoseShape
+from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput
+from dlo_casadi.session.pose_shape import PoseShape
 
 FloatArray = NDArray[np.floating]
 

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.report.arrows import arrow
-from dlo_casadi.session.outcome import PoseInput, PoseShape, Stage
+from dlo_casadi.session.outcome import PoseInput, Stage
+from dlo_casadi.session.pose_shape import PoseShape
 
 FloatArray = NDArray[np.floating]
 

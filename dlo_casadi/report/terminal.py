@@ -31,7 +31,8 @@ from dlo_casadi.report.text_parameters import (
     rest_rows,
     vector,
 )
-from dlo_casadi.session.outcome import BranchShape, Outcome, ReadingErrors
+from dlo_casadi.session.outcome import Outcome, ReadingErrors
+from dlo_casadi.session.pose_shape import BranchShape
 
 # Distances [m] that the table of a prediction shows.
 _SHOWN = 5e-6

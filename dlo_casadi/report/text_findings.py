@@ -10,7 +10,8 @@ import numpy as np
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.canvas import NOISE_ALONE, compared, label_of, millimetres
 from dlo_casadi.report.text_parameters import plus_minus, vector
-from dlo_casadi.session.outcome import BranchShape, EitherSide, Outcome, Stage, StageName
+from dlo_casadi.session.outcome import Outcome, Stage, StageName
+from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 from dlo_casadi.thresholds import APART, NOTABLE
 
 # The errors of a stage, of which some poses were measured in another equilibrium.

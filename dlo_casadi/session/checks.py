@@ -13,17 +13,11 @@ from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.session.coarse import coarse_fit, some, spread, tells_weight
 from dlo_casadi.session.directions import wrong_directions
 from dlo_casadi.session.exchanged_ends import ends_exchanged
+from dlo_casadi.session.frames import clamp_axes
 from dlo_casadi.session.hanging import hangs_elsewhere
 from dlo_casadi.session.measure import line_without_end
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import (
-    Lines,
-    Suspicion,
-    clamp_axes,
-    repeated,
-    stretched,
-    suspicions,
-)
+from dlo_casadi.session.plausibility import Lines, Suspicion, repeated, stretched, suspicions
 from dlo_casadi.session.plausibility_of_readings import Compared, misread
 from dlo_casadi.thresholds import FITS, OUT_OF_STEP
 

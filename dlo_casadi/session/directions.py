@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.errors import counted
+from dlo_casadi.session.frames import axes_of
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import Suspicion, axes_of
+from dlo_casadi.session.plausibility import Suspicion
 from dlo_casadi.thresholds import FITS, HEADING_NEAR, HEADING_OFF, NEARLY_ALL
 
 FloatArray = NDArray[np.floating]

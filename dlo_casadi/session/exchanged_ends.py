@@ -10,8 +10,9 @@ import numpy as np
 
 from dlo_casadi.config import Config
 from dlo_casadi.session.coarse import Hypothesis, compare
+from dlo_casadi.session.frames import clamp_axes
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import Suspicion, clamp_axes
+from dlo_casadi.session.plausibility import Suspicion
 from dlo_casadi.thresholds import HEADING_OFF
 
 # Poses that are fitted: a misfit of a twentieth of the length shows in two.

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.session.coarse import Hypothesis, compare, tells_weight
+from dlo_casadi.session.frames import clamp_axes, exchanges, named
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import Suspicion, clamp_axes, exchanges, named
+from dlo_casadi.session.plausibility import Suspicion
 from dlo_casadi.thresholds import FITS, HEADING_OFF
 
 FloatArray = NDArray[np.floating]

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from dlo_casadi.config import Config
-from dlo_casadi.equilibrium.pose import PoseBranch
-from dlo_casadi.equilibrium.spread import COVERED
-from dlo_casadi.equilibrium.tipping import Tipping
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.sensing.pixels import ViewInput
+from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 from dlo_casadi.thresholds import DIFFERENT
 
 FloatArray = NDArray[np.floating]
@@ -66,125 +62,6 @@ class RestCurvatureEstimate:
     s: FloatArray
     value: FloatArray
     std: FloatArray
-
-
-@dataclass(frozen=True)
-class BranchShape:
-    """The stable equilibrium in which a pose was measured, where it is not the predicted one.
-
-    Parameters
-    ----------
-    rmse : float [m]
-        Root mean square distance of the measured points to it.
-    branch : "ccw", "cw", "previous" or None
-        What the pose has to name for it to be predicted; None if no name does.
-    turns : 0.5, -0.5 or None
-        Or tell, see `Pose`.
-    """
-
-    rmse: float
-    branch: PoseBranch | None
-    turns: float | None = None
-
-    @property
-    def chosen_by(self) -> str | None:
-        """What a pose has to hold for it to be predicted, as in a configuration."""
-        if self.turns:
-            return f"turns: {self.turns:g}"
-        return f"branch: {self.branch}" if self.branch else None
-
-
-@dataclass(frozen=True)
-class EitherSide:
-    """A pose on both of the sides on which its cable may hang, see `CableModel.tipped_by`.
-
-    Parameters
-    ----------
-    predicted, other : BranchShape
-        On the predicted side, and on the other one.
-    tipping : Tipping or None
-        How near the clamp is to where both are equally low; None where no angle of it makes them
-        so, to first order: `turns` may also tell between arcs to different sides.
-    """
-
-    predicted: BranchShape
-    other: BranchShape
-    tipping: Tipping | None
-
-    @property
-    def told(self) -> bool:
-        """Whether the pose was measured on the other side, or nobody knows the lower one."""
-        near = self.tipping is not None and self.tipping.either
-        return near or self.other.rmse < self.predicted.rmse
-
-
-@dataclass(frozen=True)
-class PoseShape:
-    """One pose as one stage sees it.
-
-    Parameters
-    ----------
-    curve : (M, d) [m]
-        Predicted from the end conditions alone, as the camera would see it.
-    rmse : float or None [m]
-        Root mean square distance of the measured points to it; None without points.
-    s : (K,) [m]
-        Arc lengths of the measured points.
-    gap : (K, d) [m]
-        Measured minus predicted points.
-    residual : (K,) or (K, 2) [m]
-        Distance of the measured points across the prediction: in the plane to its left, in space
-        along two normals, which at the start are the axes y and z of the cable's frame there and
-        are carried along without twist.
-    energy : float [J]
-    stable : bool
-    forces : (2, d) [N]
-        Of the cable on what holds its start and its end.
-    readings : mapping
-        Forces [N] and moments [N m] on the fixtures that were measured, by their names: measured,
-        and as a sensor would show the predicted ones.
-    spread : (M,) or (M, 2) or None [m]
-        Standard deviation across the curve of the next hanging, as the residual; None if it was
-        not computed.
-    missed, expected : (K,) or None [m]
-        Distance of each measured point from the prediction in the directions in which it is
-        compared, and its RMS that the noise and the next hanging let expect; None if they were not
-        computed.
-    measured_branch : BranchShape or None
-        Where the pose was measured in another stable equilibrium than the predicted one.
-    undecided : bool
-        Whether the uncertain parameters leave open that that one is the lowest.
-    measured_side : BranchShape or None
-        Of a fit pose that is compared on the side where it was measured, not the lower one.
-    either_side : EitherSide or None
-        Of a held-out pose that tells no side, where there are two; None if it was not computed.
-    """
-
-    curve: FloatArray
-    rmse: float | None
-    s: FloatArray
-    gap: FloatArray
-    residual: FloatArray
-    energy: float
-    stable: bool
-    forces: FloatArray
-    measured_branch: BranchShape | None = None
-    undecided: bool = False
-    measured_side: BranchShape | None = None
-    either_side: EitherSide | None = None
-    spread: FloatArray | None = None
-    missed: FloatArray | None = None
-    expected: FloatArray | None = None
-    readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-
-    def inside_band(self, length: float, noise: float) -> NDArray[np.bool_]:
-        """Whether each measured point (K,) lies in its 90 % band, noise included."""
-        assert self.spread is not None
-        places = np.linspace(0.0, length, len(self.spread))
-        spread = self.spread.reshape((len(places), -1))
-        std = np.stack([np.interp(self.s, places, column) for column in spread.T], axis=1)
-        score = (self.residual.reshape(std.shape) / np.hypot(std, noise)) ** 2
-        return np.asarray(score.sum(axis=1) <= float(chdtri(std.shape[1], 1 - COVERED)))
 
 
 @dataclass(frozen=True)

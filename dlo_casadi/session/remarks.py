@@ -15,7 +15,8 @@ from dlo_casadi.errors import counted
 from dlo_casadi.estimation.mesh import allowed_mesh_error
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.session.outcome import SIMPLER, PoseInput, PoseShape, Stage
+from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
+from dlo_casadi.session.pose_shape import PoseShape
 from dlo_casadi.thresholds import FIXTURES, UNSEEN
 
 FloatArray = NDArray[np.floating]

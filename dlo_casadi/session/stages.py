@@ -32,15 +32,13 @@ from dlo_casadi.rod.node import Frame
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import (
     MASS,
-    BranchShape,
-    EitherSide,
     ParameterEstimate,
-    PoseShape,
     ReadingErrors,
     RestCurvatureEstimate,
     Stage,
     StageName,
 )
+from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, UNSEEN
 
 FloatArray = NDArray[np.floating]

@@ -11,13 +11,8 @@ from dlo_casadi.equilibrium.tipping import Tipping
 from dlo_casadi.report.json_report import all_warnings, finite, report_dict, report_text
 from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.text_findings import verdict_lines
-from dlo_casadi.session.outcome import (
-    BranchShape,
-    EitherSide,
-    ParameterEstimate,
-    RestCurvatureEstimate,
-    Stage,
-)
+from dlo_casadi.session.outcome import ParameterEstimate, RestCurvatureEstimate, Stage
+from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 
 KEYS = {
     "schema": str,

@@ -14,7 +14,8 @@ from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.report.text_findings import separation_text, stage_rows, structure_lines
 from dlo_casadi.report.text_parameters import describe, plus_minus, unidentified
-from dlo_casadi.session.outcome import BranchShape, ParameterEstimate
+from dlo_casadi.session.outcome import ParameterEstimate
+from dlo_casadi.session.pose_shape import BranchShape
 
 
 def said(outcome):

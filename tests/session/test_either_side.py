@@ -19,7 +19,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import RestScatter
 from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.session.outcome import BranchShape
+from dlo_casadi.session.pose_shape import BranchShape
 from dlo_casadi.session.remarks import doubts_of
 
 CABLE = Cable(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03, straight=True)

@@ -14,7 +14,8 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.report.page_failure import failure_page
 from dlo_casadi.report.page_views import view_pictures
 from dlo_casadi.session.measure import draw_steps, measured_poses, read_inputs
-from dlo_casadi.session.outcome import PoseShape, Stage
+from dlo_casadi.session.outcome import Stage
+from dlo_casadi.session.pose_shape import PoseShape
 
 SESSION = Path(__file__).parents[1] / "data/space/space_photos"
 TRUTH = SESSION.parents[1] / "space_truth/space_photos/truth_shapes.npz"

@@ -8,9 +8,9 @@ import pytest
 
 from dlo_casadi.config import load_config
 from dlo_casadi.session.checks import find_suspicions
+from dlo_casadi.session.frames import FRAMES
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import (
-    FRAMES,
     Lines,
     exchanged,
     far_ends,
