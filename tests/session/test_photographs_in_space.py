@@ -71,7 +71,7 @@ def test_the_true_curve_projected_into_the_photographs(inputs):
     stage = Stage("batch", 0.0, None, None, {}, None, {"pose_01": shape})
     one, other = view_pictures(inputs[:1], [("after", "the truth", stage)])
     assert one.name == "pose_01_a"
-    assert one.photograph.startswith("data:image/jpeg")
+    assert one.behind.photograph.startswith("data:image/jpeg")
     for picture in (one, other):
         assert [line.kind for line in picture.lines] == ["after", "measured"]
         (_, label, text), _ = picture.facts
