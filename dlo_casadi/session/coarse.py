@@ -102,7 +102,7 @@ class Comparison(NamedTuple):
         if self.own is not None and tells_weight(self.own):
             return False
         own, other = self.misfits
-        if other > UNEXPLAINED * self.length:
+        if other > BEYOND_EFFECTS * self.length:
             return False
         # Difference of the BIC of two models with the same unknowns.
         return bool(2 * self.other.problem.n_residuals * np.log(own / other) > BIC_APART)

@@ -1,6 +1,7 @@
 """Gravity held against the lines of cables between ball joints in space, drawn from the model."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.hanging import load_over_stiffness, shown_pull
 from dlo_casadi.session.measure import conditions, read_inputs
 
+CONFIGS = Path(__file__).parents[2] / "configs"
 LENGTH, STIFFNESS, NOISE = 0.8, 0.02, 3e-4  # m, N m^2, m
 # Ends: chords of nine tenths of the cable, in nearly one vertical plane.
 ENDS = LENGTH * np.array(
@@ -127,3 +129,13 @@ def test_a_loop_of_which_only_the_ends_were_measured_is_no_mistake(tmp_path):
     (tmp_path / "loop.yaml").write_text(dump_yaml(data))
     config = load_config(tmp_path / "loop.yaml")
     assert checks.find_suspicions(config, read_inputs(config, lambda *_: None)) == ()
+
+
+def test_gravity_upwards_is_named_of_a_wire_that_does_not_repeat():
+    """Its trials differ by a hundredth of its length, whichever way gravity points."""
+    config = load_config(CONFIGS / "black_wire.yaml")
+    inputs = read_inputs(config, lambda *_: None)
+    assert checks.find_suspicions(config, inputs) == ()
+    (found,) = checks.find_suspicions(under(config, (0.0, 9.81)), inputs)
+    assert "its shapes show no weight" in found.message
+    assert not found.certain
