@@ -243,7 +243,7 @@ def predict(
 
 
 def _shown(shape: CableShape) -> PredictedShape:
-    """The same shape, and its other side if it has one, as those that show themselves."""
+    """The same shape and its other side, if it has one, with `plot` and a printed form."""
     values = {field.name: getattr(shape, field.name) for field in fields(shape)}
     if shape.other_side is not None:
         values["other_side"] = _shown(shape.other_side)

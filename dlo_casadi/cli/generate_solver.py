@@ -59,6 +59,9 @@ def with_mesh(cable: FittedCable, chosen: argparse.Namespace) -> FittedCable:
     if not (chosen.elements or chosen.element):
         return cable
     if cable.model.has_state:
-        raise DloError("the state of a drifting cable belongs to the fit's own elements")
+        raise DloError(
+            f"{cable.model.cable.name!r} has a rest shape that changed from pose to pose, which is "
+            "known on the fit's elements alone: leave out --elements and --element"
+        )
     model = cable.model.with_mesh(chosen.elements or cable.model.n, chosen.element)
     return cable._replace(model=model, rest=model.rest_basis @ cable.metadata.coefficients)

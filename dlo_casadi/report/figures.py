@@ -110,7 +110,7 @@ def errors_figure(outcome: Outcome) -> Figure:
             at = float(np.clip(1e3 * value, left, right))
             fill = "white" if kind == "cross-validated" else color
             axes.plot(at, y, marker, color=color, mfc=fill, ms=7)
-            # Beyond the line of the noise, not on it.
+            # The number stands right of the noise line, which would cross it.
             beside = max(at, 1e3 * floor) if at > 500 * floor else at
             axes.annotate(
                 millimetres(value),

@@ -112,7 +112,9 @@ def _cure(chosen_by: str | None) -> str:
 def _undecided(found: Iterable[str]) -> str:
     """That the parameters do not tell which equilibrium of some poses is lower."""
     names = ", ".join(found)
-    return f". The fit is too uncertain to tell which of both is lower in {names}" if names else ""
+    return (
+        f". The fit is too uncertain to tell which of the two is lower in {names}" if names else ""
+    )
 
 
 def weight_warning(weight: Mapping[str, Any], expected: float) -> str:
