@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import VisionError
+from dlo_casadi.vision.camera import Array, Camera, View, Viewpoint
 from dlo_casadi.vision.image import spoilt
-from dlo_casadi.vision.view import Array, Camera, View, Viewpoint
 
 MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
 LEAST_MARKERS = 3  # for the pose of a camera: fewer span no more than a line of the board

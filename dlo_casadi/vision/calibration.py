@@ -17,7 +17,7 @@ from dlo_casadi.vision.board import (
     Board,
     detect_markers,
 )
-from dlo_casadi.vision.view import Array, Camera
+from dlo_casadi.vision.camera import Array, Camera
 
 _LEAST_PHOTOGRAPHS = 3  # each gives two equations for the five numbers of the matrix
 _GOOD_FOCAL = 0.005  # relative std of the focal length: 0.5 % of every length along the view

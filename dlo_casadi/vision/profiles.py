@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
 
-from dlo_casadi.vision.curve import SmoothCurve
-from dlo_casadi.vision.view import Array, View
+from dlo_casadi.vision.camera import Array, View
+from dlo_casadi.vision.curves import SmoothCurve
 
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
 _BESIDE = 2.2  # where the surroundings begin, in blurs beyond the edge

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.view import Array, View
+from dlo_casadi.vision.camera import Array, View
 
 CABLE_PX = 6.0  # width of the cable in this picture
 _MAX_PIXELS = 3.0e6

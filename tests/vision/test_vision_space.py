@@ -18,9 +18,8 @@ from dlo_casadi.vision import (
     project_outline,
     see_cable,
 )
-from dlo_casadi.vision.agreement import agreeing_fit
 from dlo_casadi.vision.image_curve import loops_either_way
-from dlo_casadi.vision.space_line import _unsure
+from dlo_casadi.vision.space_line import _unsure, agreeing_fit
 
 CURVES = {"bow": bow(), "loop": loop()}
 

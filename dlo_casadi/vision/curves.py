@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 from scipy.sparse import csr_array, diags_array
 
-from dlo_casadi.vision.view import Array
+from dlo_casadi.vision.camera import Array
 
 _DEGREE = 3
 
