@@ -15,8 +15,8 @@ import dlo_casadi as dlo
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import EFFECTS, Cable, Effect, Fitted, PointForce, PointLoad, Setup
+from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import Params, PointForceAt
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError

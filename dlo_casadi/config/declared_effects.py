@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from dlo_casadi.config.limits import Range
 from dlo_casadi.config.problems import Place, Problem, did_you_mean
 from dlo_casadi.effects import EFFECTS, Cable, Setup
-from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.effects.cable import Parameter
 
 if TYPE_CHECKING:
     from dlo_casadi.config.options import DeclaredEffect

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from dlo_casadi.config.problems import Place, Problem
-from dlo_casadi.effects.parameter import STIFFNESS_BOUNDS
+from dlo_casadi.effects.cable import STIFFNESS_BOUNDS
 from dlo_casadi.errors import counted
 
 

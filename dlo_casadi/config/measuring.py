@@ -20,7 +20,7 @@ from dlo_casadi.config.limits import (
 from dlo_casadi.config.problems import did_you_mean
 from dlo_casadi.config.values import NonNegative, Number, Positive, Row, Section, Vector, within
 from dlo_casadi.errors import counted
-from dlo_casadi.model.tolerances import Tolerances as Known
+from dlo_casadi.model.cable_model import Tolerances as Known
 
 _STANDARD = Known()
 

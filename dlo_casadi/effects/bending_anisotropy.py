@@ -7,9 +7,8 @@ from math import atan2, copysign, hypot, pi
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Effect, Params, SectionLaw
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
 # Ratios of the stiffnesses: a ribbon of the width w and thickness t has (w / t)^2.

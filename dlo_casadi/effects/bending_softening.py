@@ -7,9 +7,8 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Params, SectionLaw
-from dlo_casadi.effects.parameter import Parameter
 
 # Gauss-Legendre on [0, 1]; ten points integrate the law to 1e-9 for |k|/c up to 5.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)

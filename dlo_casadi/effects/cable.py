@@ -1,9 +1,16 @@
-"""What is declared of a cable."""
+"""What is declared of a cable, and the parameters of its models."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import pi
+from dataclasses import dataclass, replace
+from math import inf, isfinite, pi
+
+from dlo_casadi.errors import DloError
+
+# Bounds of a bending stiffness [N m^2]: below a carbon fibre's, above a steel bar's.
+STIFFNESS_BOUNDS = (1e-12, 1e9)
+# So many typical changes from its nominal value a parameter without bounds may be declared.
+_FARTHEST = 1e6
 
 
 @dataclass(frozen=True)
@@ -43,3 +50,57 @@ class Cable:
     def curvature_scale(self) -> float:
         """One full turn over the length [1/m]."""
         return 2 * pi / self.length
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One scalar parameter of a model.
+
+    Parameters
+    ----------
+    name : str
+        Name within its effect; the model prefixes it with the effect's label.
+    unit : str
+        SI unit, "" for a pure number.
+    nominal : float
+        Value at which the effect vanishes, or the prior mean [unit].
+    scale : float
+        Typical size of a change [unit], > 0; solvers work in value / scale.
+    lower, upper : float
+        Physical bounds [unit].
+    prior_std : float
+        Standard deviation of a Gaussian prior about `nominal`; inf = flat [unit, or
+        natural logarithm if `log`].
+    log : bool
+        Estimated as its natural logarithm (positive, uncertain by decades).
+    """
+
+    name: str
+    unit: str = ""
+    nominal: float = 0.0
+    scale: float = 1.0
+    lower: float = -inf
+    upper: float = inf
+    prior_std: float = inf
+    log: bool = False
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.scale) and self.scale > 0):
+            raise DloError(f"parameter {self.name}: scale {self.scale} must be positive")
+        if not self.lower <= self.nominal <= self.upper:
+            raise DloError(
+                f"parameter {self.name}: nominal {self.nominal} {self.unit} lies outside its "
+                f"bounds [{self.lower}, {self.upper}]"
+            )
+        if self.log and self.nominal <= 0:
+            raise DloError(f"parameter {self.name}: a logarithmic parameter must be positive")
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """From where to where a declared value may lie: finite, where a bound is not."""
+        away = _FARTHEST * self.scale
+        return max(self.lower, self.nominal - away), min(self.upper, self.nominal + away)
+
+    def with_prior(self, std: float) -> Parameter:
+        """Return the same parameter with a prior of this standard deviation."""
+        return replace(self, prior_std=std)

@@ -6,9 +6,8 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
 # Harmonics of the cable's direction: light from one side shifts all of its picture, which is the

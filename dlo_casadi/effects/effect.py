@@ -16,8 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.effects.cable import Cable
-from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.errors import counted
 from dlo_casadi.rod.element import Cell

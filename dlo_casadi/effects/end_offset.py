@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vector
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
 

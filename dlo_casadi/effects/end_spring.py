@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import BoundaryEffect, Fitted, Params, Scan
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
 # Directions in which a pin may hold the cable, relative to the mean heading there [rad].

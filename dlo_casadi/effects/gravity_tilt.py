@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import LoadAcrossGravity, Params
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.rod.node import rotated, rotation
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Fitted, Params, PointForceAt, PointLoad
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.thresholds import ALONG_GRAVITY
 
 

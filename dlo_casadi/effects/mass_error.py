@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Load, Params
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
 # Qualified name of its parameter.

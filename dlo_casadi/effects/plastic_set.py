@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Params, Scan, StateEffect
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
 # A kink max(x, 0) is rounded to (x + sqrt(x^2 + d^2)) / 2 with d this share of one turn per length:

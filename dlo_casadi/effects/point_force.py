@@ -1,12 +1,11 @@
-"""A constant force at one place of the cable."""
+"""Forces at one place of the cable: a constant one, and one that is free in every pose."""
 
 from __future__ import annotations
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Params, PointForceAt, PointLoad, vector
-from dlo_casadi.effects.parameter import Parameter
 
 
 class PointForce(PointLoad):
@@ -38,3 +37,42 @@ class PointForce(PointLoad):
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force."""
         return (PointForceAt(vector(params, "f"), params["position"]),)
+
+
+class UnknownPull(PointLoad):
+    """A force at one place of the cable that may be another one in every pose.
+
+        V_j = - (f + f_j) . r(s)                                      [J]
+
+    It assumes no cause: it tells where and how the cable is pulled when no effect explains the
+    residual. The forces are unknowns of the poses, not parameters of the cable, so that nothing
+    can be predicted from them.
+
+    Parameters
+    ----------
+    fx, fy (, fz) : scalar [N]
+        Mean over the poses, at most ten weights; f_j is what each deviates from it.
+    position : scalar [m], in [0, L]
+    """
+
+    name = "unknown_pull"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the mean force and its place."""
+        scale = 9.81 * cable.mass
+        return (
+            *(
+                Parameter(f"f{axis}", "N", scale=scale, lower=-10 * scale, upper=10 * scale)
+                for axis in cable.axes
+            ),
+            self.position(cable),
+        )
+
+    def per_pose(self, cable: Cable) -> tuple[str, ...]:
+        """f_j."""
+        return tuple(f"pull_{axis}" for axis in cable.axes)
+
+    def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
+        """The force of this pose."""
+        force = vector(params, "f") + vector(params, "pull_")
+        return (PointForceAt(force, params["position"]),)

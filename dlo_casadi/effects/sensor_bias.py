@@ -8,9 +8,8 @@ from typing import Self
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.ends import REACTIONS
 

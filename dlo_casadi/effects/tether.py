@@ -7,9 +7,8 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Effect, Params, PointLoad, SpringAt, vector
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
 
 # How far an anchor may lie from the board's origin, in lengths of the cable: the force of one

@@ -24,9 +24,8 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.starting_points import DECADES, ROLLS, starting_points
 from dlo_casadi.estimation.transfer import carried_projections, carried_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.cable_model import END_ROLL, CableModel
+from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
 from dlo_casadi.model.rest_curvature import RestScatter
-from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 from dlo_casadi.thresholds import DIFFERENT

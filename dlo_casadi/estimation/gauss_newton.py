@@ -27,9 +27,9 @@ from dlo_casadi.equilibrium.spread import modes_in
 from dlo_casadi.estimation.linearization import Linearization, Normal, Point, Values
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes, Tangents
+from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.rest_curvature import MODES, RestScatter
-from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.band import Vector
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel

@@ -30,7 +30,7 @@ from dlo_casadi.config import (
     show,
 )
 from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
-from dlo_casadi.effects.parameter import Parameter
+from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.equilibrium.fitted_cable import FittedCable, Metadata
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import ConfigError, DloError, counted

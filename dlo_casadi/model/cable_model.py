@@ -1,4 +1,4 @@
-"""CableModel: a cable, its mesh, its boundaries and its effects, and what follows by counting."""
+"""CableModel: a cable, its mesh, boundaries and effects; and how well declared values are known."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.effects import Cable, Effect, Kinematics, Load, SectionLaw, StateEffect
-from dlo_casadi.effects.parameter import STIFFNESS_BOUNDS, Parameter
+from dlo_casadi.effects.cable import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.rest_curvature import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
@@ -305,3 +305,26 @@ class CableModel:
         used += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
         used += [name for effect in self.effects for name in effect.per_pose(self.cable)]
         return tuple(used)
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How well the declared values are known, one standard deviation."""
+
+    length: float = 5e-4
+    end: float = 2e-4
+    heading: float = 1e-2
+    scale: float = 3e-4
+    rotation: float = 5e-3
+    roll: float = 1.0
+    camera_rotation: float = 2e-3
+    camera_translation: float = 1e-3
+    force_bias: float = 0.02
+    moment_bias: float = 2e-3
+
+    def deviation(self, node: type[Node]) -> FloatArray:
+        """Standard deviations of a pose's deviations, see `deviation_names`; pulls are free."""
+        turn = self.heading if node.increment == 1 else self.rotation
+        sizes = (self.end, turn, np.inf)
+        counts = (node.dimension, 2 * node.increment, node.dimension)
+        return np.repeat(sizes, counts)

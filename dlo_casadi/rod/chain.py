@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.rod.arc import Arc
 from dlo_casadi.rod.element import Element, Layout
-from dlo_casadi.rod.helix import BowedHelix, Helix
-from dlo_casadi.rod.link import Link
-from dlo_casadi.rod.quadratic import Quadratic
+from dlo_casadi.rod.elements import Arc, BowedHelix, Helix, Link, Quadratic
 
 FloatArray = NDArray[np.floating]
 

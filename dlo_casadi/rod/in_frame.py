@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.rod.element import Element
-from dlo_casadi.rod.helix import inverse_of
+from dlo_casadi.rod.elements import inverse_of
 from dlo_casadi.rod.node import conjugate, quaternion_product
 
 FloatArray = NDArray[np.floating]

@@ -13,8 +13,7 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.measure import conditions

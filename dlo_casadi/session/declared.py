@@ -11,8 +11,7 @@ from dlo_casadi.config import Config, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
 from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError
-from dlo_casadi.model.cable_model import END_ROLL, CableModel
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
 
 # Elements of the declared model's mesh; refined from the data.
 MESH = 40

@@ -17,7 +17,7 @@ from dlo_casadi.estimation.profile import (
     threshold,
 )
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.paper.algorithm1 import gravity_slopes, run_algorithm1
 from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from dlo_casadi.runtime.parallel import map_in_order

@@ -27,7 +27,7 @@ from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.report.canvas import BLACK, BLUE
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading

@@ -25,7 +25,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from paper import published

@@ -14,8 +14,7 @@ from dlo_casadi.effects import Cable, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 NOISE = 3e-4

@@ -8,7 +8,7 @@ import pytest
 from dlo_casadi.diagnosis.next_pose import _separation, next_reading
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise

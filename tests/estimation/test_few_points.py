@@ -14,9 +14,8 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.profile import threshold
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.rest_curvature import RestScatter
-from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.session.declared import nuisances
 from dlo_casadi.session.remarks import fit_warnings
 

@@ -30,8 +30,7 @@ from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose

@@ -14,8 +14,7 @@ from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 

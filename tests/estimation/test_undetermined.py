@@ -9,8 +9,7 @@ from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_acr
 from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.report.json_report import finite
 from dlo_casadi.report.text_parameters import describe
 from dlo_casadi.sensing.measured_pose import MeasuredPose

@@ -14,8 +14,7 @@ from dlo_casadi.estimation.prediction import (
     predict_poses,
     predicted_shapes,
 )
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler

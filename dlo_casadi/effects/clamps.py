@@ -1,4 +1,4 @@
-"""A clamp that holds the cable in another direction than declared."""
+"""Clamps that hold the cable in another direction than declared, or that give way."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
-from dlo_casadi.effects.cable import Cable
+import casadi as ca
+
+from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Fitted, Params
-from dlo_casadi.effects.parameter import Parameter
 from dlo_casadi.effects.setup import Setup
+from dlo_casadi.rod.node import quaternion_product, rotation
 
 
 @dataclass(frozen=True)
@@ -88,3 +90,64 @@ class ClampAngle(ClampTurn):
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Turn the clamps."""
         return ends.turned(params.get("start_heading_error"), params.get("end_heading_error"))
+
+
+class ClampRotation(ClampTurn):
+    """True minus declared orientation of the clamps in space, the same in all poses.
+
+        R' = R exp(0, y, z)
+
+    The rotation vector is about the clamp's own axes. Its part about x, along the cable, is
+    `end_roll`: rolls of the two clamps act by their difference alone.
+
+    Parameters
+    ----------
+    start_y, start_z, end_y, end_z : scalar [rad]
+        Vanish at 0. Only those of clamped ends are declared.
+    """
+
+    name = "clamp_rotation"
+    in_plane = False
+    errors = ("y", "z")
+    tolerances: ClassVar = dict.fromkeys(("start_y", "start_z", "end_y", "end_z"), "rotation")
+
+    def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
+        """Turn the clamps."""
+        if self.start:
+            ends = ends.changed(start_frame=_turned(ends.start_frame, "start", params))
+        if self.end:
+            ends = ends.changed(end_frame=_turned(ends.end_frame, "end", params))
+        return ends
+
+
+def _turned(frame: ca.SX, side: str, params: Params) -> ca.SX:
+    turn = rotation(ca.vertcat(0, params[f"{side}_y"], params[f"{side}_z"]))
+    return ca.vertcat(*quaternion_product(ca.vertsplit(frame), ca.vertsplit(turn)))
+
+
+class ClampCompliance(ClampEffect):
+    """A clamp turns with the moment of the cable on it.
+
+        heading of the cable in the clamp = heading of the clamp + compliance * moment
+
+    In space by the rotation vector compliance * moment about the clamp's axes, its twist, too
+    (of second order: the increment is 2 tan(angle / 2) about the axis).
+
+    Parameters
+    ----------
+    start, end : scalar [rad/(N m)], >= 0
+        Vanish at 0. Only those of clamped ends are declared.
+    """
+
+    name = "clamp_compliance"
+    gives = True
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the compliances of the clamped ends."""
+        # A tenth of what the whole cable turns by under an even moment.
+        scale = 0.1 * cable.length / cable.bending_stiffness
+        return tuple(Parameter(side, "rad/(N m)", scale=scale, lower=0.0) for side in self.sides)
+
+    def compliance(self, params: Params) -> tuple[ca.SX | float, ca.SX | float]:
+        """Compliances of the clamps."""
+        return params.get("start", 0.0), params.get("end", 0.0)
