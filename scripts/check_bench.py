@@ -79,8 +79,8 @@ def compare(name: str, outcome: Outcome) -> dict:
         "session": name,
         "verdict": outcome.verdict,
         "true": sorted(true_effects(name)),
-        "found": [effect["name"] for effect in outcome.effects],
-        "ties": {e["name"]: e["indistinguishable_from"] for e in outcome.effects},
+        "found": [effect.name for effect in outcome.effects],
+        "ties": {e.name: e.indistinguishable_from for e in outcome.effects},
         "EI_true": truth["bending_stiffness"],
         "EI": stiffness.value,
         "EI_interval_95": stiffness.interval_95,
@@ -96,14 +96,14 @@ def compare(name: str, outcome: Outcome) -> dict:
         "parameters": {},
     }
     for effect in outcome.effects:
-        for key, true in true_effects(name).get(effect["name"], {}).items():
-            found = effect["parameters"][key]
-            row["parameters"][f"{effect['name']}.{key}"] = {
+        for key, true in true_effects(name).get(effect.name, {}).items():
+            found = effect.parameters[key]
+            row["parameters"][f"{effect.name}.{key}"] = {
                 "true": true,
-                "value": found["value"],
-                "std": found["std"],
-                "deviations": (found["value"] - true) / found["std"],
-                "relative": (found["value"] - true) / true if true else None,
+                "value": found.value,
+                "std": found.std,
+                "deviations": (found.value - true) / found.std,
+                "relative": (found.value - true) / true if true else None,
             }
     if "tether" in truth["effects"] and outcome.unexplained:
         row["pull"] = _pull(name, truth["effects"]["tether"], outcome)
@@ -136,20 +136,20 @@ def _pull(name: str, tether: list[float], outcome: Outcome) -> dict:
     s, k, x, y = tether
     shapes = np.load(TRUTH / name / "truth_shapes.npz")
     length = outcome.config.cable.length
-    assert outcome.unexplained is not None
-    estimate = np.array(outcome.unexplained["force_per_pose"])
+    load = outcome.unexplained
+    assert load is not None
     true = []
-    for pose in outcome.unexplained["poses"]:
+    for pose in load.poses:
         curve = shapes[pose]
         places = np.linspace(0.0, length, len(curve))
         at = [np.interp(s, places, curve[:, i]) for i in (0, 1)]
         true.append([k * (x - at[0]), k * (y - at[1])])
     force = np.array(true)
-    sizes = np.hypot(*estimate.T) / np.hypot(*force.T)
-    angles = np.arctan2(estimate[:, 1], estimate[:, 0]) - np.arctan2(force[:, 1], force[:, 0])
+    sizes = np.hypot(*load.force_per_pose.T) / np.hypot(*force.T)
+    angles = np.arctan2(*load.force_per_pose.T[::-1]) - np.arctan2(force[:, 1], force[:, 0])
     angles = np.degrees(np.abs((angles + np.pi) % (2 * np.pi) - np.pi))
     return {
-        "position": outcome.unexplained["position"],
+        "position": load.position,
         "position_true": s,
         "median_size_error": float(np.median(np.abs(sizes - 1))),
         "median_angle_deg": float(np.median(angles)),

@@ -146,7 +146,7 @@ def take_through(session: Session, results: Path, row: Row) -> None:
         return
     result = dlo.fit(session.path)
     row.verdict = str(result.verdict)
-    row.added = [effect["name"] for effect in result.effects]
+    row.added = [effect.name for effect in result.effects]
     row.doubts = list(result.doubts)
     judge_stiffness(result, session.stiffness, row)
     result.write(results)

@@ -36,16 +36,16 @@ HIDDEN = {
 
 def found_effect(outcome: Outcome, truth: dict[str, Any]) -> tuple[str, bool]:
     """What was named, and whether it is what was hidden, or tied with it."""
-    named = [effect["name"] for effect in outcome.effects]
+    named = [effect.name for effect in outcome.effects]
     text = "+".join(named) or "-"
     wanted = {HIDDEN[key][0] for key in truth["effects"]}
-    tied = {other for effect in outcome.effects for other in effect["indistinguishable_from"]}
+    tied = {other for effect in outcome.effects for other in effect.indistinguishable_from}
     right = wanted <= {*named, *tied} and len(named) == len(wanted)
     for key, value in truth["effects"].items():
         label, parameter, meaning = HIDDEN[key]
         for effect in outcome.effects:
-            if effect["name"] == label and parameter in effect["parameters"]:
-                gap = effect["parameters"][parameter]["value"] - meaning(value)
+            if effect.name == label and parameter in effect.parameters:
+                gap = effect.parameters[parameter].value - meaning(value)
                 text += f" ({gap:+.3f})"
                 right = right and (key != "clamp_error" or abs(gap) < ANGLE)
     return text, right

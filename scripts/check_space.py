@@ -51,18 +51,18 @@ STDS, SHARE = 3.0, 0.25
 
 def effects(outcome: Outcome, truth: dict[str, Any]) -> tuple[str, bool]:
     """What was named, and whether it is what was hidden, or tied with it, and as large."""
-    named = [effect["name"] for effect in outcome.effects]
-    tied = {other for effect in outcome.effects for other in effect["indistinguishable_from"]}
+    named = [effect.name for effect in outcome.effects]
+    tied = {other for effect in outcome.effects for other in effect.indistinguishable_from}
     right, text = len(named) == len(truth["effects"]), "+".join(named) or "-"
     for key, value in truth["effects"].items():
         label, meaning = HIDDEN[key]
         right = right and label in {*named, *tied}
         for effect in outcome.effects:
-            for name, exact in meaning(value).items() if effect["name"] == label else ():
-                own = effect["parameters"][name]
-                off = abs(own["value"] - exact)
-                text += f" {name} {own['value']:.4g} ({exact:g})"
-                right = right and (off <= STDS * own["std"] or off <= SHARE * abs(exact))
+            for name, exact in meaning(value).items() if effect.name == label else ():
+                own = effect.parameters[name]
+                off = abs(own.value - exact)
+                text += f" {name} {own.value:.4g} ({exact:g})"
+                right = right and (off <= STDS * own.std or off <= SHARE * abs(exact))
     return text, right
 
 

@@ -116,7 +116,7 @@ def run(config: Config) -> Row:
     estimate = stage.parameters["bending_stiffness"]
     return Row(
         str(outcome.verdict),
-        tuple(effect["name"] for effect in outcome.effects),
+        tuple(effect.name for effect in outcome.effects),
         (estimate.value, *(estimate.interval_95 or (None, None))),
         stage.rmse_fit,
         any(f"than stage {stage.name}" in text for text in worse_than_simpler(outcome.stages)),

@@ -61,7 +61,7 @@ def main() -> None:
                 row[stage.name] = stage.rmse_held_out
             row.setdefault("closed", row["batch"])
             table.append(row)
-            effects = ",".join(effect["name"] for effect in outcome.effects) or "-"
+            effects = ",".join(effect.name for effect in outcome.effects) or "-"
             cells = "  ".join(
                 f"{key} {1e3 * value:6.2f}" for key, value in row.items() if value is not None
             )

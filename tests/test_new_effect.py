@@ -117,10 +117,10 @@ def result(known, tmp_path_factory):
 def test_the_diagnosis_finds_it(result):
     assert result.verdict == "effect_found"
     (row,) = result.effects
-    assert row["name"] == "balloon"
+    assert row.name == row["name"] == "balloon"
     for name, true in (("lift", LIFT), ("position", PLACE)):
-        assert abs(row["parameters"][name]["value"] - true) < 3 * row["parameters"][name]["std"]
-    assert row["parameters"]["compliance"]["value"] == 1 / row["parameters"]["lift"]["value"]
+        assert abs(row.parameters[name].value - true) < 3 * row.parameters[name].std
+    assert row.parameters["compliance"].value == 1 / row.parameters["lift"].value
 
 
 def test_the_results_tell_of_it(result, tmp_path):
@@ -147,7 +147,7 @@ def test_the_generated_solver_knows_it(result):
 
 def test_it_stands_behind_what_acts_like_it(known, tmp_path):
     result = dlo.fit(write(tmp_path, tried=(PointForce.name,)))
-    assert "balloon" in result.effects[0]["indistinguishable_from"]
+    assert "balloon" in result.effects[0].indistinguishable_from
 
 
 def test_it_can_be_declared(known, tmp_path):

@@ -138,8 +138,8 @@ def diagnose(
     )
 
 
-def separating_pose(diagnosis: Diagnosis) -> tuple[NextPose, tuple[str, str]] | None:
-    """Pose that separates an added effect from its closest rival, and their names.
+def separating_pose(diagnosis: Diagnosis) -> NextPose | None:
+    """Pose that separates an added effect from its closest rival.
 
     Both as fits on the mesh of the search.
     """
@@ -147,5 +147,6 @@ def separating_pose(diagnosis: Diagnosis) -> tuple[NextPose, tuple[str, str]] | 
         if item.rivals:
             rival = item.rivals[0]
             found = next_pose(diagnosis.after, rival.fit)
-            return None if found is None else (found, (item.candidate.name, rival.candidate.name))
+            names = (item.candidate.name, rival.candidate.name)
+            return None if found is None else replace(found, separates=names)
     return None

@@ -59,12 +59,15 @@ class NextPose:
         fit of either rival could adapt to is not taken off.
     reading : NextReading
         What a sensor at a fixture would tell there.
+    separates : tuple of str
+        Names of the rivals.
     """
 
     end: tuple[float, ...]
     difference: float
     separation: float
     reading: NextReading
+    separates: tuple[str, ...] = ()
 
 
 def next_pose(first: Fit, second: Fit) -> NextPose | None:

@@ -48,6 +48,8 @@ class Pull:
     gain : float
         Decrease of twice the objective against the fit without it.
     fit : Fit
+    poses : tuple of str
+        Names of the fit poses.
     """
 
     force_per_pose: FloatArray
@@ -55,6 +57,12 @@ class Pull:
     interval: tuple[float, float]
     gain: float
     fit: Fit
+    poses: tuple[str, ...] = ()
+
+    @property
+    def force(self) -> FloatArray:
+        """Mean (d,) [N] over the poses."""
+        return np.asarray(self.force_per_pose.mean(axis=0))
 
 
 def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
@@ -98,7 +106,8 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
     half = NORMAL_95 * max(best.std(name), 1e-4 * length)
     interval = (float(max(0.0, position - half)), float(min(length, position + half)))
     gain = 2 * (base.point.objective - best.point.objective)
-    return Pull(forces, position, interval, gain, best)
+    names = tuple(best.problem.measured[j].pose.name for j in best.problem.used)
+    return Pull(forces, position, interval, gain, best, names)
 
 
 @dataclass(frozen=True)

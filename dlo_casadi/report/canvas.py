@@ -156,7 +156,7 @@ def compared(outcome: Outcome) -> list[Compared]:
 def label_of(stage: Stage, outcome: Outcome) -> str:
     """What to call a stage in a figure."""
     if stage.name == "closed" and outcome.effects:
-        return "with " + " and ".join(effect["name"] for effect in outcome.effects)
+        return "with " + " and ".join(effect.name for effect in outcome.effects)
     return STAGE_LABELS[stage.name]
 
 

@@ -359,25 +359,25 @@ def moment_figure(outcome: Outcome) -> Figure | None:
 
 def candidates_figure(outcome: Outcome) -> Figure:
     """Candidates for a missing effect: score, and cross-validated error where refitted."""
-    added = {effect["name"] for effect in outcome.effects}
-    tied = {name for effect in outcome.effects for name in effect["indistinguishable_from"]}
+    added = {effect.name for effect in outcome.effects}
+    tied = {name for effect in outcome.effects for name in effect.indistinguishable_from}
     rows = list(outcome.candidates)
-    scores = [row["score"] or 0.0 for row in rows]
+    scores = [row.score for row in rows]
     with styled((8.5, 1.9 + 0.36 * len(rows))) as drawing:
         axes = drawing.subplots()
         for k, (row, score) in enumerate(zip(rows, scores, strict=True)):
-            tried = row["reason"] or row["rmse_cross_validated"] is not None
+            tried = row.reason or row.rmse_cross_validated is not None
             lost = GREY if tried else _UNTRIED
-            known = BLUE if row["name"] in added else lost
-            color = ORANGE if row["name"] in tied else known
+            known = BLUE if row.name in added else lost
+            color = ORANGE if row.name in tied else known
             axes.barh(-k, score, height=0.5, color=color)
             if color == GREY:
                 axes.text(0, -k - 0.38, f" {finding_of(outcome, row)[1]}", va="center", fontsize=7)
-            error = row["rmse_cross_validated"]
+            error = row.rmse_cross_validated
             text = f" {score:,.0f}" if score >= 100 else f" {score:.2g}"
             text += "" if error is None else f"   cross-validated {millimetres(error)}"
             axes.text(score, -k, text, va="center", fontsize=9)
-        axes.set_yticks([-k for k in range(len(rows))], [row["name"] for row in rows])
+        axes.set_yticks([-k for k in range(len(rows))], [row.name for row in rows])
         axes.set_xlim(0, 1.55 * max([*scores, 1e-9]))
         axes.set_ylim(0.5 - len(rows), 0.5)
         axes.grid(visible=False, axis="y")
@@ -389,7 +389,7 @@ def candidates_figure(outcome: Outcome) -> Figure:
             Patch(color=GREY, label="refitted, not added"),
             Patch(color=_UNTRIED, label="not refitted"),
         ]
-        refitted = [bool(row["reason"]) or row["rmse_cross_validated"] is not None for row in rows]
+        refitted = [bool(row.reason) or row.rmse_cross_validated is not None for row in rows]
         shown = [bool(added), bool(tied), sum(refitted) > len(added | tied), not all(refitted)]
         handles = [handle for handle, show in zip(handles, shown, strict=True) if show]
         drawing.legend(handles=handles, loc="outside lower center", ncols=2)

@@ -26,8 +26,8 @@ def unexplained_figure(outcome: Outcome) -> Figure:
     """Where the cable is pulled, and how, in each fit pose."""
     load = outcome.unexplained
     assert load is not None
-    low, high = load["interval_95"]
-    size = float(np.linalg.norm(load["force"]))
+    low, high = load.interval
+    size = float(np.linalg.norm(load.force))
     handles = [
         _line_of("taken", "measured"),
         _line_of("pulled", f"pulled at {low:.3f} to {high:.3f} m (95 %)"),

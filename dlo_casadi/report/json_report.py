@@ -28,7 +28,8 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
 
     Every key of the schema is present; what is not known is None, never NaN.
     """
-    measurement = outcome.measurement
+    measurement, load, proposal = outcome.measurement, outcome.unexplained, outcome.next_pose
+    tests = outcome.structure
     names: list[StageName] = list(ALWAYS)
     if outcome.stage("closed") is not None:
         names.append("closed")
@@ -63,14 +64,28 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
             "element": outcome.discretization.element,
             "error_m": outcome.discretization.error,
         },
-        "effects": list(outcome.effects),
-        "candidates": list(outcome.candidates),
+        "effects": list(map(asdict, outcome.effects)),
+        "candidates": [asdict(row) | {"reason": row.reason or None} for row in outcome.candidates],
         "verdict": outcome.verdict,
         "either_side": {name: asdict(found) for name, found in outcome.either_side.items()},
-        "unexplained": outcome.unexplained,
-        "next_pose": outcome.next_pose,
-        "structure": outcome.structure,
-        "hidden_weight": outcome.hidden_weight,
+        "unexplained": load
+        and {
+            "force": load.force,
+            "force_per_pose": load.force_per_pose,
+            "poses": load.poses,
+            "position": load.position,
+            "interval_95": load.interval,
+        },
+        "next_pose": proposal
+        and {
+            "end": proposal.end,
+            "separates": proposal.separates,
+            "expected_difference_m": proposal.difference,
+            "expected_difference_std": proposal.separation,
+            "reading": asdict(proposal.reading),
+        },
+        "structure": tests and dict(zip(("before", "after"), map(asdict, tests), strict=True)),
+        "hidden_weight": outcome.hidden_weight and asdict(outcome.hidden_weight),
     }
     plain: dict[str, Any] = finite(document)
     return plain

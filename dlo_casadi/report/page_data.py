@@ -6,6 +6,7 @@ import inspect
 from typing import Any
 
 from dlo_casadi.config import Config
+from dlo_casadi.diagnosis.next_pose import NextPose
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.errors import counted
 from dlo_casadi.report.canvas import NOISE_ALONE, before_after, label_of, millimetres
@@ -81,9 +82,9 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _said_of(proposal: dict[str, Any]) -> str:
+def _said_of(proposal: NextPose) -> str:
     """What a pose that is proposed would tell: by its shape, and by a reading."""
-    return f"{sentence(separation_text(proposal))} {reading_text(proposal['reading'])}"
+    return f"{sentence(separation_text(proposal))} {reading_text(proposal.reading)}"
 
 
 def sentence(line: str) -> str:
@@ -130,23 +131,19 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
 
 def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
     """Candidates for a missing effect, as ranked, with what could not be told apart."""
-    largest = max([row["score"] or 0.0 for row in outcome.candidates], default=0.0)
+    largest = max([row.score for row in outcome.candidates], default=0.0)
     rows = []
     for row in outcome.candidates:
-        name, score, p = row["name"], row["score"], row["p_value"]
+        name, score = row.name, row.score
         status, said = finding_of(outcome, row)
         rows.append(
             {
                 "name": name,
                 "meaning": meaning(name),
-                "score": NOTHING
-                if score is None
-                else f"{score:,.0f}"
-                if score >= 100
-                else f"{score:.2g}",
-                "share": 0.0 if not score or largest <= 0 else max(score, 0.0) / largest,
-                "p_value": NOTHING if p is None else f"{p:.2g}",
-                "validated": _mm(row["rmse_cross_validated"]),
+                "score": f"{score:,.0f}" if score >= 100 else f"{score:.2g}",
+                "share": max(score, 0.0) / largest if largest > 0 else 0.0,
+                "p_value": f"{row.p_value:.2g}",
+                "validated": _mm(row.rmse_cross_validated),
                 "status": status,
                 "said": said,
             }

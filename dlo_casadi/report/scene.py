@@ -57,11 +57,11 @@ class Board:
 def scene_of(outcome: Outcome) -> tuple[Room | Board, list[Mark]]:
     """A place for all poses, with its ground and the measured lines."""
     load = outcome.unexplained
-    pulls = np.array([] if load is None else load["force_per_pose"], dtype=float)
+    pulls = np.zeros(0) if load is None else load.force_per_pose
     place: Room | Board
     if outcome.config.experiment.in_space:
         proposal = outcome.next_pose
-        ends = [] if proposal is None else [np.array([proposal["end"]])]
+        ends = [] if proposal is None else [np.array([proposal.end])]
         place = common_room(outcome.config, outcome.poses, ends, pulls.reshape(-1, 3))
     else:
         place = _board(outcome, pulls.reshape(-1, 2))
@@ -86,17 +86,13 @@ def pull_marks(outcome: Outcome, place: Room | Board) -> list[Mark]:
     """Where the cable is pulled (95 %), and the force in each fit pose."""
     load = outcome.unexplained
     assert load is not None
-    names = load.get("poses") or [
-        pose.name for pose in outcome.poses if pose.role == "fit" and len(pose.points)
-    ]
     marks = []
-    for name, force in zip(names, np.array(load["force_per_pose"], dtype=float), strict=False):
+    for name, force in zip(load.poses, load.force_per_pose, strict=True):
         line = measured_line(outcome, name)
         if line is None:
             continue
         places, points = line
-        low, high = load["interval_95"]
-        pulled = np.array([*np.linspace(low, high, 9), load["position"]])
+        pulled = np.array([*np.linspace(*load.interval, 9), load.position])
         part = place.points(np.column_stack([np.interp(pulled, places, x) for x in points.T]))
         marks += [Mark("pulled", part[:-1]), Mark("pull", place.force(part[-1], force).points)]
     return marks
@@ -113,7 +109,7 @@ def next_marks(outcome: Outcome, place: Room | Board) -> list[Mark]:
                 marks.append(
                     Mark(f"fixture {kind}", np.concatenate([at, at + 1e-3 * place.length]))
                 )
-    at = place.points(np.array(outcome.next_pose["end"]))
+    at = place.points(np.array(outcome.next_pose.end))
     size, axes = _CROSS * place.length, np.eye(at.shape[1])
     arms = size * np.concatenate([[sign * axis, 0 * axis] for axis in axes for sign in (1, -1)])
     return [

@@ -149,12 +149,11 @@ def candidate_table(outcome: Outcome) -> Table:
         table.add_column(column, justify="right")
     table.add_column("finding")
     for row in outcome.candidates:
-        p = row["p_value"]
         table.add_row(
-            row["name"],
-            f"{row['score']:.1f}",
-            "-" if p is None else f"{p:.2g}",
-            millimetres(row["rmse_cross_validated"]),
+            row.name,
+            f"{row.score:.1f}",
+            f"{row.p_value:.2g}",
+            millimetres(row.rmse_cross_validated),
             finding_of(outcome, row)[1],
         )
     return table

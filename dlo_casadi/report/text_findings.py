@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
+from dlo_casadi.diagnosis.next_pose import NextPose, NextReading
+from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.report.canvas import NOISE_ALONE, compared, label_of, millimetres
 from dlo_casadi.report.text_parameters import plus_minus, vector
+from dlo_casadi.session.findings import EffectParameter, FoundEffect
 from dlo_casadi.session.outcome import Outcome, Stage, StageName
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 from dlo_casadi.thresholds import APART, NOTABLE
@@ -34,12 +36,11 @@ def branch_text(found: BranchShape) -> str:
 def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
     """Cross-validated errors [m] of the stages for which the diagnosis has computed them."""
     if not outcome.effects:
-        searched = outcome.diagnosis
-        known = searched is not None and searched.validation_after.complete
-        return {"batch": searched.validation_after.rmse} if known else {}
+        known = outcome.cross_validated
+        return {} if known is None else {"batch": known}
     return {
-        "batch": outcome.effects[0]["rmse_cross_validated_before"],
-        "closed": outcome.effects[-1]["rmse_cross_validated_after"],
+        "batch": outcome.effects[0].rmse_cross_validated_before,
+        "closed": outcome.effects[-1].rmse_cross_validated_after,
     }
 
 
@@ -94,10 +95,10 @@ def verdict_lines(outcome: Outcome) -> list[str]:
         lines += _effect_lines(effect)
     load = outcome.unexplained
     if load is not None:
-        force, (low, high) = load["force"], load["interval_95"]
+        force, (low, high) = load.force, load.interval
         lines.append(
             f"  Without naming a cause: pulled by {vector(force, '.3g', 'N')} on average "
-            f"at {load['position']:.3f} m ({low:.3f} to {high:.3f} m) from the start."
+            f"at {load.position:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
         experiment = outcome.config.experiment
         if experiment.boundary.end == "free" and np.dot(force, experiment.gravity) < 0:
@@ -107,10 +108,10 @@ def verdict_lines(outcome: Outcome) -> list[str]:
             )
     if outcome.next_pose is not None:
         lines.append(
-            f"  To tell {' from '.join(outcome.next_pose['separates'])}: hold the end at "
-            f"{vector(outcome.next_pose['end'], '.3f', 'm')}; {separation_text(outcome.next_pose)}"
+            f"  To tell {' from '.join(outcome.next_pose.separates)}: hold the end at "
+            f"{vector(outcome.next_pose.end, '.3f', 'm')}; {separation_text(outcome.next_pose)}"
         )
-        lines.append(f"  {reading_text(outcome.next_pose['reading'])}")
+        lines.append(f"  {reading_text(outcome.next_pose.reading)}")
     return lines
 
 
@@ -133,11 +134,11 @@ def _either_side(name: str, found: EitherSide) -> str:
 MOST_REPEATS = 20
 
 
-def separation_text(proposal: dict[str, Any]) -> str:
+def separation_text(proposal: NextPose) -> str:
     """How far rivals differ in a proposed pose, and how often it has to be measured."""
-    z = proposal["expected_difference_std"]
+    z = proposal.separation
     text = (
-        f"they differ there by {millimetres(proposal['expected_difference_m'])} RMS, {z:.2g} "
+        f"they differ there by {millimetres(proposal.difference)} RMS, {z:.2g} "
         "standard deviations of the noise of one whole line: "
     )
     repeats = math.ceil(min((APART / max(z, 1e-9)) ** 2, 1e9))
@@ -148,16 +149,16 @@ def separation_text(proposal: dict[str, Any]) -> str:
     return text + f"even {MOST_REPEATS} measurements would not tell them apart."
 
 
-def reading_text(proposal: dict[str, Any]) -> str:
+def reading_text(reading: NextReading) -> str:
     """What a reading of force or moment in the proposed pose would tell of rivals."""
-    unit = "N m" if proposal["name"].endswith("moment") else "N"
+    unit = "N m" if reading.name.endswith("moment") else "N"
     text = (
-        f"A reading of {proposal['name']} there differs by {proposal['difference']:.2g} {unit}, "
-        f"{proposal['separation']:.2g} standard deviations of one: "
+        f"A reading of {reading.name} there differs by {reading.difference:.2g} {unit}, "
+        f"{reading.separation:.2g} standard deviations of one: "
     )
-    if proposal["times"] is None or proposal["times"] > MOST_REPEATS:
+    times = reading.times
+    if times is None or times > MOST_REPEATS:
         return text + "it would not tell them apart."
-    times = proposal["times"]
     return text + ("one suffices." if times == 1 else f"read it {times} times.")
 
 
@@ -174,12 +175,12 @@ def structure_lines(outcome: Outcome) -> list[str]:
     """What the declared model's residual depends on, where it is not noise."""
     if outcome.structure is None or outcome.verdict == "complete":
         return []
-    before = outcome.structure["before"]
+    before, _ = outcome.structure
     plane = "picture" if outcome.measurement.kind == "images" else "plane"
     found = [
-        f"{text.format(plane=plane)} ({_score(key, before[key])})"
+        f"{text.format(plane=plane)} ({_score(key, score)})"
         for key, text in DEPENDENCES.items()
-        if abs(before[key]) > NOTABLE
+        if abs(score := getattr(before, key)) > NOTABLE
     ]
     if not found:
         return []
@@ -194,11 +195,11 @@ def _score(key: str, value: float) -> str:
 
 
 def _verdict(outcome: Outcome) -> str:
-    names = " and ".join(effect["name"] for effect in outcome.effects)
+    names = " and ".join(effect.name for effect in outcome.effects)
     if outcome.verdict == "unexplained":
-        after = outcome.structure["after"] if outcome.structure else None
-        if names and after and after["p_value"] >= outcome.config.diagnosis.significance:
-            error = outcome.effects[-1]["rmse_cross_validated_after"]
+        after = outcome.structure[1] if outcome.structure else None
+        if names and after and after.p_value >= outcome.config.diagnosis.significance:
+            error = outcome.effects[-1].rmse_cross_validated_after
             return (
                 f"Verdict: unexplained. With {names} every pose is fitted, but one that is left "
                 f"out is predicted {millimetres(error)} off "
@@ -211,41 +212,39 @@ def _verdict(outcome: Outcome) -> str:
     return "Verdict: complete. The declared model explains the shapes down to their noise."
 
 
-def _effect_lines(effect: dict[str, Any]) -> list[str]:
-    values = ", ".join(_quantity(name, row) for name, row in effect["parameters"].items())
-    line = f"  {effect['name']}: {values}"
-    if effect["p_value"] is not None:
+def _effect_lines(effect: FoundEffect) -> list[str]:
+    values = ", ".join(_quantity(name, row) for name, row in effect.parameters.items())
+    line = f"  {effect.name}: {values}"
+    if effect.p_value is not None:
         # Below the smallest double it is zero.
-        p_value = effect["p_value"]
-        line += f" (p = {p_value:.1g})" if p_value > 0 else " (p < 1e-307)"
+        line += f" (p = {effect.p_value:.1g})" if effect.p_value > 0 else " (p < 1e-307)"
     lines = [line]
-    rivals = effect["indistinguishable_from"]
+    rivals = effect.indistinguishable_from
     if rivals:
         lines.append(f"    These data cannot tell it from {' or '.join(rivals)}.")
     return lines
 
 
-def _quantity(name: str, row: dict[str, Any]) -> str:
-    if row["value"] is None:
+def _quantity(name: str, found: EffectParameter) -> str:
+    if found.value is None:
         return f"{name} unbounded"
-    return f"{name} {plus_minus(row['value'], row['std'] or 0.0)} {row['unit']}".strip()
+    return f"{name} {plus_minus(found.value, found.std or 0.0)} {found.unit}".strip()
 
 
 # How candidates are ordered; the score alone does not tell how well a refit does.
 CANDIDATE_ORDER = "first those that a refit confirms, by BIC, then other refits, the rest by score"
 
 
-def finding_of(outcome: Outcome, row: dict[str, Any]) -> tuple[str, str]:
+def finding_of(outcome: Outcome, row: Ranked) -> tuple[str, str]:
     """What a candidate has led to, and the sentence: added, tied, or neither (an empty word)."""
-    name = row["name"]
     for effect in outcome.effects:
-        if name == effect["name"]:
+        if row.name == effect.name:
             return "added", "added to the model"
-        if name in effect["indistinguishable_from"]:
-            return "tied", f"cannot be told apart from {effect['name']}"
-    if row["reason"]:
-        return "", str(row["reason"])
-    if row["rmse_cross_validated"] is None:
+        if row.name in effect.indistinguishable_from:
+            return "tied", f"cannot be told apart from {effect.name}"
+    if row.reason:
+        return "", row.reason
+    if row.rmse_cross_validated is None:
         return "", "not refitted"
     if outcome.verdict == "unexplained":
         return "", "withdrawn: it leaves the residual unexplained"

@@ -10,10 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
+from dlo_casadi.diagnosis.diagnose import Verdict
+from dlo_casadi.diagnosis.hidden_weight import HiddenWeight
+from dlo_casadi.diagnosis.next_pose import NextPose
+from dlo_casadi.diagnosis.pull import Pull
+from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.sensing.pixels import ViewInput
+from dlo_casadi.session.findings import FoundEffect
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 from dlo_casadi.thresholds import DIFFERENT
 
@@ -21,7 +28,6 @@ FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
 # Name of the cable's mass among a stage's parameters.
 MASS = "mass"
-Verdict = Literal["complete", "effect_found", "unexplained"]
 # Stages that a batch estimate must not be worse than.
 SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
 
@@ -292,21 +298,27 @@ class Outcome:
 
     Parameters
     ----------
-    effects, candidates, unexplained, next_pose
-        As in report.json ("dlo-report/1"), ready to be written.
     verdict : Verdict or None
         None where no diagnosis was made: nothing is claimed then.
     doubts : tuple of str
         Why the last stage's numbers do not hold, see `doubts_of`; with them no verdict is
         `complete` or `effect_found`.
-    structure : dict or None
-        Tests of the residual "before" and "after", see `diagnosis.structure.Structure`.
+    effects : tuple of FoundEffect
+        What was added to the declared model.
+    candidates : tuple of Ranked
+        All effects that were tried, the likely ones first.
+    unexplained : Pull or None
+        The load that assumes no cause.
+    next_pose : NextPose or None
+        The pose that separates rival explanations.
+    structure : (Structure, Structure) or None
+        Tests of the residual before and after.
+    cross_validated : float or None [m]
+        Error of the declared model where nothing was added and every left-out pose is predicted.
     fit : Fit
         The last stage's fit, from which parameters.yaml is written.
-    hidden_weight : dict or None
-        A weight that the shapes do not tell from stiffness, see `HiddenWeight`.
-    diagnosis : object or None
-        The diagnosis's own result, for figures.
+    hidden_weight : HiddenWeight or None
+        A weight that the shapes do not tell from stiffness.
     """
 
     config: Config
@@ -320,13 +332,13 @@ class Outcome:
     verdict: Verdict | None = None
     doubts: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    effects: tuple[dict[str, Any], ...] = ()
-    candidates: tuple[dict[str, Any], ...] = ()
-    unexplained: dict[str, Any] | None = None
-    next_pose: dict[str, Any] | None = None
-    structure: dict[str, dict[str, Any]] | None = None
-    hidden_weight: dict[str, Any] | None = None
-    diagnosis: Any = None
+    effects: tuple[FoundEffect, ...] = ()
+    candidates: tuple[Ranked, ...] = ()
+    unexplained: Pull | None = None
+    next_pose: NextPose | None = None
+    structure: tuple[Structure, Structure] | None = None
+    cross_validated: float | None = None
+    hidden_weight: HiddenWeight | None = None
     versions: dict[str, str] = field(default_factory=dict)
 
     def stage(self, name: StageName) -> Stage | None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import SkippedPose
+from dlo_casadi.diagnosis.hidden_weight import HiddenWeight
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.errors import counted
@@ -117,29 +117,27 @@ def _undecided(found: Iterable[str]) -> str:
     )
 
 
-def weight_warning(weight: Mapping[str, Any], expected: float) -> str:
+def weight_warning(weight: HiddenWeight, expected: float) -> str:
     """What a weight that nobody has declared would do, and what would tell.
 
     Parameters
     ----------
-    weight : mapping
-        See `HiddenWeight`.
     expected : float [m]
         Distance of a pose from its prediction if nothing is missing.
     """
-    low, high = weight["stiffness_95"]
+    low, high = weight.stiffness_95
     text = (
-        f"an undeclared weight is not told from stiffness: up to {weight['mass']:.2g} kg at "
-        f"{weight['position']:.2f} m would fit as well as none, and bending_stiffness may then be "
+        f"an undeclared weight is not told from stiffness: up to {weight.mass:.2g} kg at "
+        f"{weight.position:.2f} m would fit as well as none, and bending_stiffness may then be "
         f"{low:.3g} to {high:.3g} N m^2. To tell: weigh the cable with all that hangs on it, or "
-        f"measure the force on the start, which differs by up to {weight['force']:.2g} N"
+        f"measure the force on the start, which differs by up to {weight.force:.2g} N"
     )
-    if weight["heading"] is None:
+    if weight.heading is None or weight.difference is None:
         return text
-    far = weight["difference"] > UNSEEN * expected
+    far = weight.difference > UNSEEN * expected
     return text + (
         f"{', or a pose' if far else '. No pose would: even'} with start_heading "
-        f"{weight['heading']:.2f} the shapes differ by {1e3 * weight['difference']:.2g} mm RMS, "
+        f"{weight.heading:.2f} the shapes differ by {1e3 * weight.difference:.2g} mm RMS, "
         f"and a pose is measured {1e3 * expected:.2g} mm from its prediction"
     )
 

@@ -11,7 +11,7 @@ from importlib.metadata import version
 import numpy as np
 
 from dlo_casadi.config import Config
-from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.diagnosis.diagnose import diagnose, separating_pose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.branches import as_measured
 from dlo_casadi.estimation.fit import refine_mesh
@@ -28,7 +28,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.findings import findings_of, next_pose_row
+from dlo_casadi.session.findings import found_effects
 from dlo_casadi.session.fitting import (
     confirmed,
     first_mesh,
@@ -211,7 +211,7 @@ def close_the_loop(
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     confirming = begin(executor, minimum_by_ipopt, fit) if diagnosis.added else None
-    next_pose = next_pose_row(diagnosis) if diagnosis.added else None
+    next_pose = separating_pose(diagnosis) if diagnosis.added else None
     if diagnosis.added or diagnosis.unexplained:
         parameters = fitted_parameters(outcome.fit, profile_intervals(outcome.fit), reported)
         stages[-1] = replace(stages[-1], parameters=parameters)
@@ -232,6 +232,7 @@ def close_the_loop(
         stages.append(own)
     mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
+    validated = diagnosis.validation_after
     clock.lap("diagnosis")
     closed = replace(
         outcome,
@@ -241,8 +242,14 @@ def close_the_loop(
         discretization=mesh,
         repeatability=Repeatability.of(fit),
         timing=clock.total(),
+        verdict=diagnosis.verdict,
+        effects=found_effects(diagnosis),
+        candidates=diagnosis.ranked,
+        unexplained=diagnosis.pull,
         next_pose=next_pose,
-        **findings_of(diagnosis),
+        structure=(diagnosis.structure_before, diagnosis.structure_after),
+        cross_validated=validated.rmse if validated.complete and not diagnosis.added else None,
+        hidden_weight=diagnosis.weight,
     )
     return judged(closed)
 

@@ -13,11 +13,13 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 from small_sessions import small
+from test_figures import EFFECT
 
 import dlo_casadi as dlo
 from dlo_casadi import api
 from dlo_casadi.cli import main
 from dlo_casadi.cli import session as session_command
+from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.report import writer
 from dlo_casadi.report.terminal import candidate_table
 from dlo_casadi.session import Silent
@@ -144,16 +146,13 @@ def test_the_solver_of_a_folder_of_results(written, tmp_path, capsys):
 
 
 def test_the_candidates_are_printed_in_their_order(outcome):
-    row = {"score": 12.34, "p_value": 1e-9, "rmse_cross_validated": 2e-4, "reason": None}
-    weak = {"score": 0.5, "p_value": None, "rmse_cross_validated": None, "reason": None}
-    effect = {"name": "lumped_mass", "indistinguishable_from": ["point_force"]}
     diagnosed = dataclasses.replace(
         outcome,
-        effects=(effect,),
+        effects=(EFFECT,),
         candidates=(
-            {"name": "lumped_mass", **row},
-            {"name": "point_force", **row},
-            {"name": "side_load", **weak},
+            Ranked("lumped_mass", 12.34, 1e-9, 2e-4),
+            Ranked("point_force", 12.34, 1e-9, 2e-4),
+            Ranked("side_load", 0.5, 0.7, None),
         ),
     )
     printed = StringIO()
@@ -164,7 +163,7 @@ def test_the_candidates_are_printed_in_their_order(outcome):
     rows = [" ".join(line.split()) for line in printed.getvalue().splitlines()]
     assert "lumped_mass 12.3 1e-09 0.2 mm added to the model" in rows
     assert "point_force 12.3 1e-09 0.2 mm cannot be told apart from lumped_mass" in rows
-    assert "side_load 0.5 - - not refitted" in rows
+    assert "side_load 0.5 0.7 - not refitted" in rows
     order = [row.split()[0] for row in rows if "_" in row]
     assert order == ["lumped_mass", "point_force", "side_load"]
 

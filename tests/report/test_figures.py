@@ -7,36 +7,41 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from dlo_casadi.diagnosis.pull import Pull
+from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.report import figures, figures_poses, overlay
 from dlo_casadi.report.canvas import before_after, label_of, save_figure
 from dlo_casadi.report.drawing import prediction_figure
 from dlo_casadi.report.geometry import magnified
+from dlo_casadi.session.findings import EffectParameter, FoundEffect
 from dlo_casadi.session.outcome import PoseInput
 
 PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"
 CANDIDATES = tuple(
-    {"name": name, "score": score, "p_value": p, "rmse_cross_validated": error, "reason": None}
-    for name, score, p, error in (
+    Ranked(*row)
+    for row in (
         ("lumped_mass", 700.0, 0.0, 1e-4),
         ("point_force", 690.0, 0.0, 1.1e-4),
         ("end_offset", 0.0, 1.0, None),
     )
 )
-EFFECT = {
-    "name": "lumped_mass",
-    "parameters": {"mass": {"value": 0.05, "std": 0.002, "unit": "kg"}},
-    "p_value": 1e-9,
-    "rmse_cross_validated_before": 5e-4,
-    "rmse_cross_validated_after": 1e-4,
-    "indistinguishable_from": ["point_force"],
-}
-LOAD = {
-    "force": [0.0, 1.0],
-    "force_per_pose": [[0.0, 1.0], [0.1, 1.1]],
-    "poses": ["pose_01", "pose_02"],
-    "position": 0.3,
-    "interval_95": [0.28, 0.32],
-}
+EFFECT = FoundEffect(
+    name="lumped_mass",
+    parameters={"mass": EffectParameter(0.05, 0.002, "kg")},
+    p_value=1e-9,
+    rmse_cross_validated_before=5e-4,
+    rmse_cross_validated_after=1e-4,
+    indistinguishable_from=("point_force",),
+)
+
+
+def pull(*forces):
+    """A load of so much in the first poses."""
+    poses = tuple(f"pose_{k:02d}" for k in range(1, 1 + len(forces)))
+    return Pull(np.array(forces), 0.3, (0.28, 0.32), 0.0, None, poses)
+
+
+LOAD = pull((0.0, 1.0), (0.0, 1.0))
 
 
 @pytest.fixture

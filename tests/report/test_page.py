@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 from test_figures import CANDIDATES, EFFECT, LOAD, with_readings
 
+from dlo_casadi.diagnosis.next_pose import NextPose, NextReading
 from dlo_casadi.report import canvas, figures
 from dlo_casadi.report.geometry import beside
 from dlo_casadi.report.page import breakable, report_page, units
@@ -30,13 +31,13 @@ from dlo_casadi.report.text_findings import stage_rows
 from dlo_casadi.session.outcome import ParameterEstimate
 
 HOSTILE = "<img src=x onerror=alert(1)></script>"
-PROPOSAL = {
-    "end": [0.1, -0.2],
-    "separates": ["lumped_mass", "point_force"],
-    "expected_difference_m": 2.5e-3,
-    "expected_difference_std": 8.2,
-    "reading": {"name": "end_force", "difference": 0.3, "separation": 4.0, "times": 2},
-}
+PROPOSAL = NextPose(
+    end=(0.1, -0.2),
+    difference=2.5e-3,
+    separation=8.2,
+    reading=NextReading("end_force", 0.3, 4.0, 2),
+    separates=("lumped_mass", "point_force"),
+)
 
 
 def diagnosed(outcome, **changes):
@@ -95,14 +96,14 @@ def test_the_stages_have_their_errors_and_the_two_that_are_compared_their_marks(
 
 def test_candidates_keep_their_rank_and_rivals_are_named(outcome):
     rows = candidate_rows(diagnosed(outcome))
-    assert [row["name"] for row in rows] == [row["name"] for row in CANDIDATES]
+    assert [row["name"] for row in rows] == [row.name for row in CANDIDATES]
     assert [row["said"] for row in rows] == [
         "added to the model",
         "cannot be told apart from lumped_mass",
         "not refitted",
     ]
     why = "predicts what is left out worse: 3 mm instead of 2 mm"
-    again = tuple(row | {"rmse_cross_validated": 3e-3, "reason": why} for row in CANDIDATES)
+    again = tuple(replace(row, rmse_cross_validated=3e-3, reason=why) for row in CANDIDATES)
     assert candidate_rows(diagnosed(outcome, candidates=again))[2]["said"] == why
     assert why in report_page(diagnosed(outcome, candidates=again))
     assert rows[0]["share"] == 1.0

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from rich.console import Console
+from test_figures import pull
 from test_page import PROPOSAL, diagnosed
 
 from dlo_casadi.report.figures import figures_of, write_figures
@@ -18,19 +19,11 @@ from dlo_casadi.report.room import VIEWS, arrow, rooms, seen, upright
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.session.fitting import confirmed, minimum_by_ipopt
 
-LOAD = {
-    "force": [0.0, 0.1, 0.2],
-    "force_per_pose": [[0.0, 0.1, 0.2], [0.1, 0.0, 0.2]],
-    "poses": ["pose_01", "pose_02"],
-    "position": 0.3,
-    "interval_95": [0.28, 0.32],
-}
-
 
 def in_room_pulled(outcome):
     """The outcome as if something had pulled the cable, and a next pose were known."""
-    proposal = PROPOSAL | {"end": [0.6, -0.2, 0.3]}
-    return diagnosed(outcome, unexplained=LOAD, verdict="unexplained", next_pose=proposal)
+    proposal, load = replace(PROPOSAL, end=(0.6, -0.2, 0.3)), pull((0, 0, 0.2), (0, 0.2, 0.2))
+    return diagnosed(outcome, unexplained=load, verdict="unexplained", next_pose=proposal)
 
 
 def test_gravity_points_down_whichever_axis_it_has():

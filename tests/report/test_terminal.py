@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 from test_figures import EFFECT, LOAD
+from test_page import PROPOSAL
 
-from dlo_casadi.diagnosis.structure import LARGEST_SCORE
+from dlo_casadi.diagnosis.structure import LARGEST_SCORE, Structure
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.page_data import page_data
 from dlo_casadi.report.page_pictures import pictures
@@ -87,13 +88,6 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
     config = replace(
         outcome.config, diagnosis=outcome.config.diagnosis.model_copy(update={"enabled": True})
     )
-    proposal = {
-        "end": [0.1, -0.2],
-        "separates": ["lumped_mass", "point_force"],
-        "expected_difference_m": 2.5e-3,
-        "expected_difference_std": 8.2,
-        "reading": {"name": "end_force", "difference": 0.3, "separation": 4.0, "times": 2},
-    }
     text = said(
         replace(
             outcome,
@@ -101,7 +95,7 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
             stages=(*outcome.stages, closed),
             effects=(EFFECT,),
             verdict="effect_found",
-            next_pose=proposal,
+            next_pose=PROPOSAL,
         )
     )
 
@@ -129,7 +123,7 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
 )
 def test_a_proposal_says_how_often_to_measure(std, words):
     """Repeats average: n lines are sqrt(n) times as sharp as one."""
-    proposal = {"expected_difference_m": 1e-4, "expected_difference_std": std}
+    proposal = replace(PROPOSAL, separation=std)
 
     assert separation_text(proposal).endswith(words)
 
@@ -183,8 +177,18 @@ def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
 
 
 def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcome):
-    scores = {"order_z": 4.0, "span_z": -LARGEST_SCORE, "position_z": LARGEST_SCORE, "runs_z": -9.0}
-    found = replace(outcome, verdict="unexplained", structure={"before": scores})
+    before = Structure(
+        statistic=90.0,
+        dof=9,
+        p_value=0.0,
+        chi2_per_dof=10.0,
+        runs_z=-9.0,
+        order_z=4.0,
+        span_z=-LARGEST_SCORE,
+        position_z=LARGEST_SCORE,
+        per_pose={},
+    )
+    found = replace(outcome, verdict="unexplained", structure=(before, before))
     photographs = replace(outcome.measurement, kind="images")
 
     (line,) = structure_lines(found)

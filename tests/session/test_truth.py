@@ -64,7 +64,7 @@ def test_stiffness_and_effects_are_those_of_the_truth(name):
     for effect, parameters in true.items():
         rows = effect_parameters(fit, EFFECTS[effect]())
         for key, value in parameters.items():
-            found[f"{effect}.{key}"] = (rows[key]["value"], rows[key]["std"])
+            found[f"{effect}.{key}"] = (rows[key].value, rows[key].std)
             exact[f"{effect}.{key}"] = value
     off = {key: (found[key][0] - exact[key]) / found[key][1] for key in exact}
     # Thirty numbers in all: one beyond three standard deviations in ten runs of new noise.
