@@ -49,8 +49,7 @@ from dlo_casadi.model.rest_curvature import SMOOTHNESS, RestScatter
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.fitting import fit_declared
+from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.session.measure import conditions
 from dlo_casadi.session.stages import fit_stage
 

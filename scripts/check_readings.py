@@ -45,8 +45,7 @@ from dlo_casadi.io.files import write_file
 from dlo_casadi.report.canvas import BLUE, GREY, VERMILLION, save_figure, styled
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.fitting import fit_declared
+from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.session.measure import conditions
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -9,7 +9,7 @@ from rich.console import Console
 from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import add_config, command, configuration, console, parsed, print_json
 from dlo_casadi.cli.watch import Watch
-from dlo_casadi.session.camera import calibrate_session, summary
+from dlo_casadi.session.measure import calibrate_session, summary
 from dlo_casadi.vision import Calibration
 
 EXAMPLES = """\

@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 from dlo_casadi import __version__
 from dlo_casadi.session.outcome import StageName
-from dlo_casadi.session.progress import TIMED
+from dlo_casadi.session.run import TIMED
 
 SCHEMA = "dlo-fleet/1"
 Row = dict[str, Any]

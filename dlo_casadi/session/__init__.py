@@ -1,7 +1,6 @@
 """A session: what is declared and measured -> stages and findings -> one outcome."""
 
 from dlo_casadi.session.outcome import Outcome
-from dlo_casadi.session.progress import Progress, Silent
-from dlo_casadi.session.run import run_session
+from dlo_casadi.session.run import Progress, Silent, run_session
 
 __all__ = ["Outcome", "Progress", "Silent", "run_session"]

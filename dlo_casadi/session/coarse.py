@@ -15,7 +15,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import conditions
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import BEYOND_EFFECTS, BIC_APART, CONTRADICTS, MUCH_BETTER, UNEXPLAINED

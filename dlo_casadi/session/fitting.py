@@ -1,24 +1,144 @@
-"""Fit of the declared model on a mesh that is fine enough."""
+"""The declared model of a configuration, its fit, and the simpler fits beside it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dlo_casadi.config import Config
-from dlo_casadi.errors import EstimationError
+from dlo_casadi.config import Config, declared_setup, wrong_effects
+from dlo_casadi.config.options import EstimationOptions
+from dlo_casadi.diagnosis.candidates import setup_of
+from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
+from dlo_casadi.errors import ConfigError, EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
-from dlo_casadi.estimation.hyperparameters import first_reading_noise
+from dlo_casadi.estimation.gauss_newton import CONVERGED
+from dlo_casadi.estimation.hyperparameters import first_reading_noise, refine
 from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.mesh import fine_enough, mesh_error
+from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
+from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
+from dlo_casadi.paper.algorithm1 import Algorithm1Result, applies, run_algorithm1
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.declared import REST_COEFFICIENTS, Declared
+from dlo_casadi.session.outcome import SIMPLER, Stage
+from dlo_casadi.session.stages import algorithm1_stage, initial_stage, stiffness_stage
+
+# Elements of the declared model's mesh; refined from the data.
+MESH = 40
+REST_COEFFICIENTS = 13
+
+
+@dataclass(frozen=True)
+class Declared:
+    """The declared model and what of it is estimated.
+
+    Parameters
+    ----------
+    model : CableModel
+        Nominal values, priors of the nuisances within their tolerances.
+    values : dict
+        Starting values of declared effects' parameters by qualified name.
+    fixed : tuple of str
+        Parameters that keep their declared value.
+    tolerances : Tolerances
+    """
+
+    model: CableModel
+    values: dict[str, float]
+    fixed: tuple[str, ...]
+    tolerances: Tolerances
+
+    def start_values(self) -> NDArray[np.floating]:
+        """Parameter vector at the declared values."""
+        p = self.model.nominal.copy()
+        for name, value in self.values.items():
+            p[self.model.names.index(name)] = value
+        return p
+
+
+def nuisances(
+    model: CableModel,
+    tolerances: Tolerances,
+    pixel: float | None = None,
+    readings: tuple[str, ...] = (),
+) -> CableModel:
+    """Return the model with what is known of its effects before any shape as nuisances.
+
+    What lies within a declared tolerance gets a Gaussian prior with the tolerance as standard
+    deviation; photographs with pixels of the size `pixel` [m] also a bias of edges, `readings` one
+    of their sensors.
+    """
+    setup = setup_of(model, tolerances=asdict(tolerances), pixel=pixel, readings=readings)
+    present = {effect.label for effect in model.effects}
+    for kind in (*EFFECTS.values(), *NUISANCES.values()):
+        if kind.name in present or not kind.applies(setup):
+            continue
+        effect = kind.made_for(setup)
+        priors = {f"{effect.label}.{name}": std for name, std in effect.prior(setup).items()}
+        model = model.with_effect(effect, priors) if priors else model
+    return model
+
+
+def declared_model(
+    config: Config,
+    center: tuple[float, float] | None = None,
+    pixel: float | None = None,
+) -> Declared:
+    """Build the declared model.
+
+    Parameters
+    ----------
+    center : (float, float), optional [m]
+        Middle of the photographs in the board frame.
+    pixel : float, optional [m]
+        Size of a pixel on the board, for photographs.
+
+    Raises
+    ------
+    ConfigError
+        If a configuration that was changed since it was loaded names effects that cannot be.
+    """
+    if problems := wrong_effects(config):
+        raise ConfigError("; ".join(problem.message for problem in problems), config.path)
+    setup = replace(declared_setup(config), center=center)
+    experiment, options = config.experiment, config.model
+    coefficients = config.estimation.rest_curvature_coefficients
+    model = CableModel(
+        cable=setup.cable,
+        n=options.n or MESH,
+        element=options.element,
+        start=experiment.boundary.start,
+        end=experiment.boundary.end,
+        gravity=experiment.gravity,
+        n_rest=REST_COEFFICIENTS if coefficients is None else coefficients,
+    )
+    if END_ROLL in model.names:
+        model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
+    values: dict[str, float] = {}
+    fixed: list[str] = []
+    for item in options.effects:
+        model = model.with_effect(EFFECTS[item.name].made_for(setup))
+        for name, parameter in item.parameters.items():
+            values[f"{item.name}.{name}"] = parameter.value
+            if parameter.fixed:
+                fixed.append(f"{item.name}.{name}")
+    if config.cable.mass is None:
+        model = model.with_effect(UNKNOWN_MASS())
+    tolerances = Tolerances(**setup.tolerances)
+    model = nuisances(model, tolerances, pixel, setup.readings)
+    return Declared(model, values, tuple(fixed), tolerances)
+
+
+def straight(model: CableModel) -> CableModel:
+    """Return the model without rest curvature and without effects."""
+    return replace(model, cable=replace(model.cable, straight=True), effects=(), priors={})
+
 
 # The search over decades of stiffness runs on this mesh; in space, where an element takes 17
 # times the operations, on half of it.
@@ -133,3 +253,127 @@ def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:
         grown = np.sqrt(np.maximum(1.0, score / HUBER))
         out[k] = item.weighing(item.relative_std * grown)
     return tuple(out)
+
+
+@dataclass(frozen=True)
+class SimplerFits:
+    """Simpler fits of the same cable, straight at rest, without its effects.
+
+    Parameters
+    ----------
+    model : CableModel
+        On the mesh that the stiffness was searched on.
+    alone : StiffnessFit
+        The stiffness alone.
+    loop : Algorithm1Result, optional
+        Of the paper's loop.
+    missing : str
+        Why the loop did not run.
+    seconds : float [s]
+        That it took.
+    """
+
+    model: CableModel
+    alone: StiffnessFit
+    loop: Algorithm1Result | None
+    missing: str
+    seconds: float
+
+    def stages(self, measured: Sequence[MeasuredPose], n: int) -> list[Stage]:
+        """Prior, stiffness alone and the paper's loop as stages on a mesh of n elements."""
+        model = self.model.with_mesh(n)
+        return [
+            initial_stage(model, measured),
+            stiffness_stage(model, measured, self.alone),
+            algorithm1_stage(self.loop, measured, model, self.missing),
+        ]
+
+
+def simpler_fits(
+    options: EstimationOptions, declared: CableModel, measured: Sequence[MeasuredPose], n: int
+) -> tuple[SimplerFits, list[Stage]]:
+    """The simpler fits, and their stages on a mesh of n elements."""
+    # One number of a model that is far off by itself: a coarse mesh finds it.
+    model = straight(declared).with_mesh(min(n, first_mesh(declared)))
+    alone = fit_stiffness(model, measured)
+    missing, loop, seconds = _not_applicable(options, declared, measured), None, 0.0
+    if not missing:
+        began = time.perf_counter()
+        loop = run_algorithm1(
+            declared.cable,
+            [item for item in measured if item.readable and not item.held_out],
+            declared.gravity,
+            n=options.algorithm1_n,
+            inner=options.algorithm1_inner,
+        )
+        seconds = time.perf_counter() - began
+    found = SimplerFits(model, alone, loop, missing, seconds)
+    return found, found.stages(measured, n)
+
+
+def _not_applicable(
+    options: EstimationOptions, model: CableModel, measured: Sequence[MeasuredPose]
+) -> str:
+    """Why the paper's loop does not run; empty if it does."""
+    if not options.algorithm1:
+        return "switched off"
+    if not applies(model):
+        return "the paper's loop needs a plane and two pinned ends"
+    sensors = [sensor for item in measured for sensor in item.sensors]
+    if any(sensor.marked and sensor.per_point for sensor in sensors):
+        return "the paper's loop needs lines along the cable, not single markers"
+    return ""
+
+
+def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
+    """A fit, or a better one that starts from a simpler one.
+
+    A simpler fit is a start where its objective is smaller, where it predicts the fit poses
+    better, or where the fit has not converged.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+        The simpler ones, and at last the fit's own.
+    """
+    best, own = fit, stages[-1]
+    for stage in stages[:-1]:
+        if stage.name in SIMPLER:
+            better = not fit.converged or predicts_better(stage, own)
+            found = _from_simpler(fit, stage.parameters["bending_stiffness"].value, better)
+            best = max(best, found, key=lambda item: item.log_evidence)
+    return best
+
+
+def predicts_better(stage: Stage, other: Stage) -> bool:
+    """Whether a stage comes nearer to the fit poses, each on the branch where it was measured."""
+    errors = [
+        np.inf if item.rmse_fit_measured_branch is None else item.rmse_fit_measured_branch
+        for item in (stage, other)
+    ]
+    return bool(errors[0] < errors[1])
+
+
+def _from_simpler(fit: Fit, stiffness: float, better: bool) -> Fit:
+    """What a straight cable of a stiffness leads to if it is `better` or lower; else the fit."""
+    problem, model = fit.problem, fit.model
+    values = model.nominal.copy()
+    values[model.stiffness_indices] *= stiffness / values[0]
+    theta = problem.unknowns.pack(values, np.zeros(model.n_coefficients))
+    p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
+    shapes, known = problem.equilibria.settled(fit.point.shapes, p, rest)
+    if not known.all() and better:
+        predicted = predicted_shapes(problem, fit.point.shapes, p, rest)
+        shapes, known = problem.equilibria.settled(predicted, p, rest)
+    if not known.all():
+        return fit
+    point = problem.evaluate(theta, shapes, fit.point.projections)
+    if not better and point.objective >= fit.point.objective:
+        return fit
+    point, converged = problem.descend(point)
+    if point.objective > fit.point.objective - CONVERGED:
+        return fit
+    if fit.noise.source == "misfit":
+        return Fit(problem, point, converged)
+    problem, point, converged = refine(problem, point, estimate=not fit.noise.known)
+    return Fit(problem, point, converged)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import platform
+import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
+from typing import Protocol
 
 import numpy as np
 
@@ -25,18 +27,19 @@ from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.runtime.workers import one_thread
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.camera import calibrated
 from dlo_casadi.session.checks import without_implausible
-from dlo_casadi.session.declared import declared_model
 from dlo_casadi.session.findings import found_effects
 from dlo_casadi.session.fitting import (
     confirmed,
+    declared_model,
     first_mesh,
     fit_declared,
     minimum_by_ipopt,
+    not_worse,
     reweighted,
+    simpler_fits,
 )
-from dlo_casadi.session.measure import measured_poses, read_inputs
+from dlo_casadi.session.measure import calibrated, measured_poses, read_inputs
 from dlo_casadi.session.outcome import (
     Discretization,
     MeasurementSummary,
@@ -45,7 +48,6 @@ from dlo_casadi.session.outcome import (
     Repeatability,
     Stage,
 )
-from dlo_casadi.session.progress import Clock, Progress, Silent
 from dlo_casadi.session.remarks import (
     branch_warnings,
     doubts_of,
@@ -55,8 +57,58 @@ from dlo_casadi.session.remarks import (
     weight_warning,
     worse_than_simpler,
 )
-from dlo_casadi.session.simpler import not_worse, simpler_fits
 from dlo_casadi.session.stages import fit_stage, fitted_parameters
+
+
+class Progress(Protocol):
+    """Who wants to know how far a run has come."""
+
+    def step(self, name: str, done: int, total: int) -> None:
+        """`done` of `total` parts of the named work are finished."""
+
+    def message(self, text: str) -> None:
+        """Something worth a line."""
+
+
+@dataclass
+class Silent:
+    """Progress that nobody watches."""
+
+    lines: list[str] = field(default_factory=list)
+
+    def step(self, name: str, done: int, total: int) -> None:
+        """Ignore."""
+
+    def message(self, text: str) -> None:
+        """Keep the line."""
+        self.lines.append(text)
+
+
+class Clock:
+    """Wall-clock time per part of the run; parts that run beside one another both count."""
+
+    def __init__(self) -> None:
+        self._begin = time.perf_counter()
+        self.parts: dict[str, float] = {}
+        self._last = self._begin
+
+    def lap(self, name: str) -> None:
+        """Add the time since the last lap to the named part."""
+        now = time.perf_counter()
+        self.parts[name] = self.parts.get(name, 0.0) + now - self._last
+        self._last = now
+
+    def add(self, name: str, seconds: float) -> None:
+        """Add the time [s] that a named part has taken beside others."""
+        self.parts[name] = self.parts.get(name, 0.0) + seconds
+
+    def total(self) -> dict[str, float]:
+        """All parts and the total [s]."""
+        parts = {key: self.parts.get(key, 0.0) for key in TIMED}
+        return {**parts, "total": time.perf_counter() - self._begin}
+
+
+TIMED = ("vision", "algorithm1", "batch", "diagnosis")
 
 
 def run_session(

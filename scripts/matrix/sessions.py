@@ -20,7 +20,7 @@ from dlo_casadi.estimation.prediction import Prediction, predict_poses
 from dlo_casadi.io.points import write_points
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import conditions
 from matrix.cells import POSES, Cell
 

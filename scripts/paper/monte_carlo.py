@@ -34,7 +34,7 @@ from dlo_casadi.rod.node import Heading
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.session.declared import nuisances
+from dlo_casadi.session.fitting import nuisances
 from dlo_casadi.session.stages import rest_curvature_of
 from dlo_casadi.thresholds import NORMAL_95
 from paper import published

@@ -11,7 +11,7 @@ from dlo_casadi.config import load_config, read_yaml
 from dlo_casadi.effects import EFFECTS, ClampAngle
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, assembly_of
-from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import conditions
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")

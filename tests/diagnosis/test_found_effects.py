@@ -19,7 +19,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.declared import nuisances
+from dlo_casadi.session.fitting import nuisances
 
 CABLE = Cable(0.8, 0.2, 0.01, 0.1)
 ENDS = ((0.6, 0.0), (0.3, 0.1), (0.5, -0.3), (0.2, -0.2), (0.65, 0.2), (0.35, -0.45), (0.5, 0.35))

@@ -16,7 +16,7 @@ from dlo_casadi.estimation.profile import threshold
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.rest_curvature import RestScatter
-from dlo_casadi.session.declared import nuisances
+from dlo_casadi.session.fitting import nuisances
 from dlo_casadi.session.remarks import fit_warnings
 
 EI = 0.09  # N m^2

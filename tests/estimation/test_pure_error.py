@@ -20,8 +20,7 @@ from dlo_casadi.estimation.repeats import (
 from dlo_casadi.report.parameters_text import fit_dict
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.fitting import fit_declared
+from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.session.measure import measured_poses, read_inputs
 
 ROOT = Path(__file__).resolve().parents[2]

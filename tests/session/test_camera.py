@@ -9,7 +9,7 @@ import pytest
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.session.camera import calibrated, needs_camera
+from dlo_casadi.session.measure import calibrated, needs_camera
 
 SESSION = Path(__file__).parents[1] / "data/space/space_photos"
 FOCAL = 1080.0  # px, as rendered

@@ -9,7 +9,7 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
 from dlo_casadi.session.checks import find_suspicions
-from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import conditions, read_inputs
 
 LENGTH, NOISE = 0.8, 3e-4  # m

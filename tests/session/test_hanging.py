@@ -10,7 +10,7 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
 from dlo_casadi.session import checks, coarse
-from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hanging import load_over_stiffness, shown_pull
 from dlo_casadi.session.measure import conditions, read_inputs
 

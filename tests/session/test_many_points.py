@@ -12,8 +12,7 @@ from dlo_casadi.io.points import MeasuredPoints, write_points
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.session.declared import declared_model
-from dlo_casadi.session.fitting import fit_declared
+from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.session.measure import MOST_POINTS, conditions, read_poses
 from dlo_casadi.session.stages import fit_stage
 

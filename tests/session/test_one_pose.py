@@ -7,7 +7,7 @@ import yaml
 from dlo_casadi.config import load_config
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.session import run_session
-from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import conditions
 
 NOISE = 3e-4

@@ -14,7 +14,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.session.checks import find_suspicions
-from dlo_casadi.session.declared import declared_model, straight
+from dlo_casadi.session.fitting import declared_model, straight
 from dlo_casadi.session.measure import conditions, read_inputs
 from dlo_casadi.session.plausibility_of_readings import Compared, misread
 

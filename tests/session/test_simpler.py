@@ -6,9 +6,8 @@ import pytest
 
 from dlo_casadi.config import load_config
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import declared_model, simpler_fits
 from dlo_casadi.session.measure import read_poses
-from dlo_casadi.session.simpler import simpler_fits
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
 

@@ -16,9 +16,9 @@ from dlo_casadi.estimation.prediction import (
 )
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.session.fitting import not_worse
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler
-from dlo_casadi.session.simpler import not_worse
 from dlo_casadi.session.stages import fit_stage, initial_stage, pose_shape
 
 # Stiff beside its weight, EI / (w L^3) = 3: its bow is stable upwards, and lower downwards.

@@ -14,7 +14,7 @@ from dlo_casadi.effects import EFFECTS
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.declared import declared_model
+from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import conditions
 
 DATA = Path(__file__).resolve().parents[1] / "data"
