@@ -18,8 +18,7 @@ from threadpoolctl import threadpool_info
 from dlo_casadi.equilibrium.ipopt import run_ipopt
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.runtime import parallel
-from dlo_casadi.runtime.executors import InProcess
-from dlo_casadi.runtime.interrupts import interrupts_held
+from dlo_casadi.runtime.executors import InProcess, interrupts_held
 from dlo_casadi.runtime.parallel import (
     LostTaskError,
     Tally,

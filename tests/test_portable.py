@@ -21,7 +21,7 @@ for name in names:
 from pathlib import Path
 from dlo_casadi.io.files import only_run
 from dlo_casadi.errors import OutputError
-from dlo_casadi.runtime.workers import begin_worker, starting_processes
+from dlo_casadi.runtime.executors import begin_worker, starting_processes
 
 with starting_processes():
     pass

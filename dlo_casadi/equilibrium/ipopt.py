@@ -27,7 +27,7 @@ from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandMatrix, Vector
-from dlo_casadi.runtime.interrupts import interrupts_held
+from dlo_casadi.runtime.executors import interrupts_held
 
 FloatArray = NDArray[np.floating]
 

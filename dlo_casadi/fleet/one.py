@@ -13,7 +13,7 @@ from dlo_casadi.fleet.columns import Row, empty_row, row_of
 from dlo_casadi.fleet.discover import Session
 from dlo_casadi.fleet.store import write_row
 from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.runtime.workers import worker_log
+from dlo_casadi.runtime.executors import worker_log
 from dlo_casadi.session import run_session
 
 

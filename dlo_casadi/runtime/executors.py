@@ -1,45 +1,59 @@
 """Where tasks run: in this process, in a pool of processes, or on a Dask cluster.
 
 Each is a `concurrent.futures.Executor` that tells `parallel.py` how many `workers` do its tasks,
-how many tasks may be under way (`capacity`), whether this process does some of them (`here`), how
-a lost worker shows (`losses`), and where workers keep their `logs`.
+whether this process is one of them (`here`), the errors by which a killed worker shows (`losses`),
+and where workers keep their `logs`.
 """
 
 from __future__ import annotations
 
+import faulthandler
+import logging
 import multiprocessing
+import multiprocessing.connection
+import os
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+import platform
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from importlib import import_module
+from importlib.metadata import version
+from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 from weakref import WeakSet
 
+from threadpoolctl import threadpool_limits
+
 from dlo_casadi.errors import DloError
-from dlo_casadi.runtime.workers import (
-    THREADS,
-    begin_worker,
-    environment,
-    software,
-    starting_processes,
-)
 
 # How long a scheduler may take to answer, and to have a worker [s].
 PATIENCE = 30.0
 # How long a process that is told to end is waited for [s]: one that is just starting takes one.
 LAST_WORDS = 2.0
+# Read by BLAS, OpenMP and OpenCV when they are loaded.
+THREADS = dict.fromkeys(
+    (
+        *("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
+        *("VECLIB_MAXIMUM_THREADS", "OPENCV_FOR_THREADS_NUM"),
+    ),
+    "1",
+)
+# Signals by which a command is interrupted.
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+# Whether signals can be blocked, in processes that are started meanwhile, too: a matter of POSIX.
+BLOCKABLE = hasattr(signal, "pthread_sigmask")
 
 
 class InProcess(Executor):
     """Runs each task at once, in the process that submits it."""
 
-    workers = 1
-    capacity = 1
-    here = False
-    losses: tuple[type[BaseException], ...] = ()
-    logs: Path | None = None
+    here = True
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Run and return a finished future; an interrupt is raised here, not kept."""
@@ -52,56 +66,27 @@ class InProcess(Executor):
 
 
 class Pool(Executor):
-    """A pool of spawned processes that is started anew when one of them was killed.
-
-    Parameters
-    ----------
-    others : int
-        Processes that are started.
-    logs : Path, optional
-        Folder in which each process keeps a log of its own; a crash leaves its stack there.
-    here : bool
-        Whether the process that submits tasks is meant to do some of them, too.
-    libraries : sequence of str
-        Modules that a worker imports before it is asked for anything.
-    """
-
-    losses: tuple[type[BaseException], ...] = (BrokenExecutor,)
+    """Spawned processes, see `open_executor`; started anew when one of them was killed."""
 
     def __init__(
-        self,
-        others: int,
-        logs: Path | None = None,
-        here: bool = False,
-        libraries: Sequence[str] = (),
+        self, workers: int, logs: Path | None, here: bool, libraries: Sequence[str]
     ) -> None:
-        self.others, self.here = others, here
-        self.workers = others + here
-        self.capacity = 2 * others
-        self.logs, self.libraries = logs, tuple(libraries)
+        self.workers, self.logs, self.here, self._libraries = workers, logs, here, tuple(libraries)
         self._processes: set[BaseProcess] = set()
         self._tasks: WeakSet[Future[Any]] = WeakSet()
         self._inner = self._start()
 
     def _start(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(
-            self.others,
+            self.workers - self.here,
             # A forked copy of a process with threads and solvers in it may hang.
             mp_context=multiprocessing.get_context("spawn"),
             initializer=begin_worker,
-            initargs=(None if self.logs is None else str(self.logs), self.libraries),
+            initargs=(self.logs, self._libraries),
         )
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit to the pool, to a new one if a worker of the last was killed."""
-        try:
-            return self._submitted(fn, *args, **kwargs)
-        except BrokenExecutor:
-            self._inner.shutdown()
-            self._inner = self._start()
-            return self._submitted(fn, *args, **kwargs)
-
-    def _submitted(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         try:
             # The pool would pickle in a thread of its own, what is being worked on meanwhile.
             task = pickle.dumps((fn, args, kwargs))
@@ -109,6 +94,14 @@ class Pool(Executor):
             unsent: Future[Any] = Future()
             unsent.set_exception(error)
             return unsent
+        try:
+            return self._begun(task)
+        except BrokenExecutor:
+            self._inner.shutdown()
+            self._inner = self._start()
+            return self._begun(task)
+
+    def _begun(self, task: bytes) -> Future[Any]:
         before = set(multiprocessing.active_children())
         # Tasks start the processes, which inherit the environment and load libraries after that.
         with environment(THREADS), starting_processes():
@@ -135,30 +128,15 @@ def _unpickled(task: bytes) -> Any:
 
 
 class Cluster(Executor):
-    """The workers of a Dask scheduler, by its address.
+    """The workers of a Dask scheduler, see `open_executor`."""
 
-    Parameters
-    ----------
-    address : str
-        Such as tcp://192.168.1.5:8786.
-    logs : Path, optional
-        As of `Pool`; on a file system that the workers see.
-
-    Raises
-    ------
-    DloError
-        If `distributed` is missing, or no scheduler or worker answers.
-    """
-
-    def __init__(self, address: str, logs: Path | None = None) -> None:
+    def __init__(self, address: str, logs: Path | None) -> None:
         try:
             import distributed
         except ImportError:
-            raise DloError(
-                "--scheduler needs Dask.\n  Try: pip install 'dlo-casadi[dask]'"
-            ) from None
-        self.losses: tuple[type[BaseException], ...] = (distributed.KilledWorker,)
-        self.logs = logs
+            message = "--scheduler needs Dask.\n  Try: pip install 'dlo-casadi[dask]'"
+            raise DloError(message) from None
+        self.losses, self.logs = (distributed.KilledWorker,), logs
         try:
             self._client = distributed.Client(
                 address, timeout=PATIENCE, set_as_default=False, name="dlo-casadi"
@@ -168,62 +146,44 @@ class Cluster(Executor):
                 f"no Dask scheduler answers at {address} within {PATIENCE:g} s: {error}.\n"
                 "  Try: `dask scheduler` there, and the address that it prints."
             ) from None
+        with ExitStack() as on_failure:
+            on_failure.callback(self._client.close)
+            self._check_workers(address)
+            on_failure.pop_all()
+        # Equal calls are different tasks: each is one row, one sample.
+        self._inner = self._client.get_executor(pure=False)
+
+    def _check_workers(self, address: str) -> None:
+        own, same = software(), "  Try: the same environment on all machines."
         try:
             self._client.wait_for_workers(1, timeout=PATIENCE)
+            theirs: dict[str, dict[str, str]] = self._client.run(software)
         except TimeoutError:
-            self._client.close()
             raise DloError(
                 f"the Dask scheduler at {address} has had no worker for {PATIENCE:g} s.\n"
                 f"  Try: `dask worker {address} --nworkers 2 --nthreads 1`"
             ) from None
-        try:
-            self._check_software()
-        except DloError:
-            self._client.close()
-            raise
-        # Equal calls are different tasks: each is one row, one sample.
-        self._inner = self._client.get_executor(pure=False)
-
-    def _check_software(self) -> None:
-        """Other versions give other digits: results must not depend on the worker."""
-        own = software()
-        try:
-            theirs: dict[str, dict[str, str]] = self._client.run(software)
         except ImportError as error:
-            raise DloError(
-                f"a worker of the cluster cannot import dlo_casadi: {error}.\n"
-                "  Try: the same environment on all machines."
-            ) from None
+            message = f"a worker of the cluster cannot import dlo_casadi: {error}.\n{same}"
+            raise DloError(message) from None
         for worker, found in theirs.items():
-            other = [f"{name} {found[name]}" for name in own if found[name] != own[name]]
+            other = [name for name in own if found[name] != own[name]]
+            has, mine = (", ".join(f"{name} {of[name]}" for name in other) for of in (found, own))
             if other:
-                mine = ", ".join(f"{name} {own[name]}" for name in own if found[name] != own[name])
-                raise DloError(
-                    f"worker {worker} has {', '.join(other)}, this machine {mine}.\n"
-                    "  Try: the same environment on all machines."
-                )
+                raise DloError(f"worker {worker} has {has}, this machine {mine}.\n{same}")
 
     @property
     def workers(self) -> int:
         """Processes that take tasks now; they may come and go."""
         return max(1, len(self._client.nthreads()))
 
-    @property
-    def capacity(self) -> int:
-        """Tasks that may be under way."""
-        return 2 * self.workers
-
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit to the cluster."""
-        future: Future[Any] = self._inner.submit(fn, *args, **kwargs)
-        return future
+        return self._inner.submit(fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Let go of the cluster; what was not awaited is cancelled."""
         self._client.close()
-
-
-AnyExecutor = InProcess | Pool | Cluster
 
 
 @contextmanager
@@ -234,7 +194,7 @@ def open_executor(
     *,
     here: bool = False,
     libraries: Sequence[str] = (),
-) -> Iterator[AnyExecutor]:
+) -> Iterator[Executor]:
     """Open the executor that a command's `--jobs` and `--scheduler` ask for.
 
         with open_executor(jobs=4) as executor:
@@ -248,9 +208,10 @@ def open_executor(
     jobs : int
         1 runs in this process, more in a pool of so many processes.
     scheduler : str, optional
-        Address of a Dask scheduler, instead.
+        Address of a Dask scheduler, instead, such as tcp://192.168.1.5:8786.
     logs : Path, optional
-        Folder of the workers' logs; it must exist.
+        Folder in which each worker keeps a log; a crash leaves its stack there. It must exist, on a
+        file system that the workers see.
     here : bool
         Whether this process is one of the `jobs`, and does what a lost worker has left: for tasks
         none of which can crash. Else it waits for the others, and outlives them.
@@ -260,7 +221,8 @@ def open_executor(
     Raises
     ------
     DloError
-        If jobs is not positive, both are asked for, or the cluster does not answer.
+        If jobs is not positive, both are asked for, `distributed` is missing, no scheduler or
+        worker answers, or a worker has other versions of what decides the digits of results.
     """
     if jobs < 1:
         raise DloError(f"--jobs {jobs}: at least one process must do the work")
@@ -269,13 +231,12 @@ def open_executor(
             f"--jobs {jobs} and --scheduler {scheduler}: a cluster has its own number of workers; "
             "give one of the two"
         )
-    if logs is not None:
-        logs = logs.resolve()
-    executor: AnyExecutor
+    logs = None if logs is None else logs.resolve()
+    executor: Executor = InProcess()
     if scheduler is not None:
         executor = Cluster(scheduler, logs)
-    else:
-        executor = InProcess() if jobs == 1 else Pool(jobs - here, logs, here, libraries)
+    elif jobs > 1:
+        executor = Pool(jobs, logs, here, libraries)
     with ended_first(executor):
         yield executor
     executor.shutdown()
@@ -292,3 +253,122 @@ def ended_first(executor: Executor) -> Iterator[None]:
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         raise
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set variables of the environment; what was set before is put back."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold BLAS, OpenMP and OpenCV to one thread each: the matrices are small.
+
+    Libraries that are loaded already are told so, others find it in the environment.
+    """
+    with ExitStack() as stack:
+        stack.enter_context(environment(THREADS))
+        stack.enter_context(threadpool_limits(limits=1))
+        cv2: Any = sys.modules.get("cv2")
+        if cv2 is not None:
+            stack.callback(cv2.setNumThreads, cv2.getNumThreads())
+            cv2.setNumThreads(1)
+        yield
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Hold interrupts back until the end of the block; they are raised there."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # interrupts are the main thread's
+        return
+    received: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: received.append(number))
+        for number in INTERRUPTS
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for one in received:
+            signal.raise_signal(one)
+
+
+@contextmanager
+def starting_processes() -> Iterator[None]:
+    """Hold interrupts back while processes are started, and in them until `begin_worker`.
+
+    A process that is interrupted half way in its start, or whose parent is, prints its stack.
+    """
+    with interrupts_held(), ExitStack() as stack:
+        if BLOCKABLE:
+            resource_tracker.ensure_running()  # which lets go of the signals when it starts
+            # What is started inherits the mask.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
+            stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
+        yield
+
+
+def begin_worker(logs: Path | None, libraries: Sequence[str] = ()) -> None:
+    """Leave interrupts to the parent, end with it, keep the stack of a crash; import libraries."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if BLOCKABLE:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    for handler in worker_log(logs).handlers:
+        stream = getattr(handler, "stream", sys.stderr)
+        faulthandler.enable(stream)
+        # What libraries print would tear the progress of the parent.
+        for number in (1, 2):
+            os.dup2(stream.fileno(), number)
+    for name in libraries:
+        import_module(name)
+
+
+def _end_with(sentinel: int) -> None:
+    """A worker whose parent was killed would wait for work for ever."""
+    multiprocessing.connection.wait([sentinel])
+    os._exit(1)
+
+
+def software() -> dict[str, str]:
+    """Versions on which the digits of results depend."""
+    packages = ("dlo-casadi", "casadi", "numpy", "scipy", "opencv-contrib-python-headless")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def worker_name() -> str:
+    """Machine and process."""
+    return f"{platform.node()}-{os.getpid()}"
+
+
+def worker_log(folder: Path | None) -> logging.Logger:
+    """Logger of this process, to its own file in that folder if there is one."""
+    logger = logging.getLogger("dlo_casadi.worker")
+    path = folder and folder / f"worker-{worker_name()}.log"
+    if path is None or any(old.name == str(path) for old in logger.handlers):
+        return logger
+    for old in list(logger.handlers):
+        logger.removeHandler(old)
+        old.close()
+    # A machine of the cluster may not see the folder: Dask keeps its own log there.
+    with suppress(OSError):
+        handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+        handler.name = str(path)
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+    return logger

@@ -9,17 +9,17 @@ import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Sequence, Sized
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
+from operator import call
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.runtime.executors import open_executor
-from dlo_casadi.runtime.workers import one_thread, worker_log, worker_name
+from dlo_casadi.runtime.executors import one_thread, open_executor, worker_log, worker_name
 
 __all__ = [
     "Finished",
@@ -138,83 +138,78 @@ def map_as_completed(
     """
     if total is None and isinstance(items, Sized):
         total = len(items)
-    tally = _Count(total, executor)
-    losses = getattr(executor, "losses", (BrokenExecutor,))
-    logs = getattr(executor, "logs", None)
+    here, logs = getattr(executor, "here", False), getattr(executor, "logs", None)
     waiting = iter(enumerate(items))
-    again: list[_Task[Item]] = []
-    suspects: list[_Task[Item]] = []
-    under_way: dict[Future[Any], _Task[Item]] = {}
-    here, workers, taken = getattr(executor, "here", False), getattr(executor, "workers", 1), 0
+    again: list[tuple[int, Item, int]] = []
+    suspects: list[tuple[int, Item, int]] = []
+    under_way: dict[Future[Finished[Any, Result]], tuple[int, Item, int]] = {}
+    started, taken, failed, durations = time.perf_counter(), 0, 0, list[float]()
 
     def room() -> int:
-        # Asked anew each time: workers of a cluster come and go.
-        most = in_flight or int(getattr(executor, "capacity", 2))
-        if here and total is not None:
+        workers = getattr(executor, "workers", 1)  # asked anew: those of a cluster come and go
+        most = in_flight or 2 * (workers - here)
+        if here and (workers == 1 or total is not None):
             # The fewer are left, the fewer wait for a worker that this process could do.
-            left = total - taken
+            left = (total or 0) - taken
             most = min(most, (workers - 1) * max(1, left // (2 * workers))) if left > 1 else 0
         return max(0, most - len(under_way))
 
-    def submit(task: _Task[Item]) -> None:
-        future = executor.submit(_run, function, task.item, task.index, _text(logs))
-        under_way[future] = task
+    def submit(index: int, item: Item, losses: int = 0) -> None:
+        """Hand out a task, and say how often it was lost before."""
+        under_way[executor.submit(_run, function, index, item, logs)] = index, item, losses
 
-    def done_here(task: _Task[Item]) -> tuple[Result | None, Exception | None, float, str]:
-        return _run(function, task.item, task.index, None)
-
-    def ended(task: Finished[Item, Result]) -> Finished[Item, Result]:
-        tally.add(task)
+    def ended(item: Item, task: Finished[Any, Result]) -> Finished[Item, Result]:
+        nonlocal failed
+        done: Finished[Item, Result] = replace(task, item=item)
+        failed += done.error is not None
+        durations.append(done.seconds)
         if progress is not None:
-            progress(tally.now())
-        return task
+            elapsed = time.perf_counter() - started
+            left = _remaining(durations, total, elapsed, executor)
+            progress(Tally(len(durations), failed, total, elapsed, left))
+        return done
 
     try:
         while True:
             while again and room():
-                submit(again.pop())
+                submit(*again.pop())
             for index, item in islice(waiting, room()):
-                submit(_Task(index, item))
                 taken += 1
+                submit(index, item)
             own = list(islice(waiting, int(here)))
             for index, item in own:
                 taken += 1
-                yield ended(Finished(index, item, *done_here(_Task(index, item))))
+                yield ended(item, _run(function, index, item, None))
             if not under_way:
                 if own:
                     continue
                 if not suspects:
                     return
-                submit(suspects.pop())
+                submit(*suspects.pop())
             # Who has just done a task goes on with the next, and does not wait for the others.
-            patience = 0.0 if own else None
-            for future in wait(under_way, patience, FIRST_COMPLETED).done:
-                task = under_way.pop(future)
+            for future in wait(under_way, 0.0 if own else None, FIRST_COMPLETED).done:
+                index, item, lost = under_way.pop(future)
                 if future.cancelled():
                     raise LostTaskError("the executor was shut down with tasks under way")
                 error = future.exception()
-                if here and isinstance(error, losses):
-                    yield ended(Finished(task.index, task.item, *done_here(task)))
+                if error is None:
+                    task = future.result()
+                elif not isinstance(error, _losses(executor)):
+                    task = Finished(index, None, None, error, 0.0, "")
+                elif here:
+                    task = _run(function, index, item, None)
+                elif lost < retries:
+                    # With no other beside it, nobody else can be to blame for the last loss.
+                    (again if lost + 1 < retries else suspects).append((index, item, lost + 1))
                     continue
-                if isinstance(error, losses):
-                    task.lost += 1
-                    if task.lost < retries:
-                        again.append(task)
-                        continue
-                    if task.lost == retries:
-                        # With no other beside it, nobody else can be to blame for the next loss.
-                        suspects.append(task)
-                        continue
-                    times = f"{task.lost} times, at last alone" if retries else "once"
+                else:
+                    times = f"{lost + 1} times, at last alone" if retries else "once"
                     error = LostTaskError(
-                        f"task {task.index} was lost {times}: its worker was killed.\n"
+                        f"task {index} was lost {times}: its worker was killed.\n"
                         "  Try: more memory; see the workers' logs."
                     )
-                if error is None:
-                    result, error, seconds, worker = future.result()
-                else:
-                    result, seconds, worker = None, 0.0, ""
-                yield ended(Finished(task.index, task.item, result, error, seconds, worker))
+                    task = Finished(index, None, None, error, 0.0, "")
+                yield ended(item, task)
     finally:
         for future in under_way:
             future.cancel()
@@ -240,27 +235,18 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
     Where the executor has no worker but this process, it is made when the result is asked for, and
     where the worker is killed, again. As each task of `map_as_completed` it has one thread.
     """
-    call = partial(_run, _called, (function, args), 0)
-    begun: Future[Any] | None = None
+    task = partial(_run, call, 0, partial(function, *args))
+    begun: Future[Finished[Any, Result]] | None = None
     if getattr(executor, "workers", 1) > 1:
-        begun = executor.submit(call, _text(getattr(executor, "logs", None)))
-    losses = getattr(executor, "losses", (BrokenExecutor,))
+        begun = executor.submit(task, getattr(executor, "logs", None))
 
     def result() -> Result:
         try:
-            found, error, _, _ = call(None) if begun is None else begun.result()
-        except losses:
-            found, error, _, _ = call(None)
-        if error is not None:
-            raise error
-        return cast(Result, found)
+            return (task(None) if begun is None else begun.result()).value
+        except _losses(executor):
+            return task(None).value
 
     return result
-
-
-def _called(call: tuple[Callable[..., Result], tuple[Any, ...]]) -> Result:
-    function, args = call
-    return function(*args)
 
 
 def generator_of(seed: int, index: int) -> np.random.Generator:
@@ -268,18 +254,17 @@ def generator_of(seed: int, index: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
 
 
-# ---- on a worker -------------------------------------------------------------------------------
-
 # CasADi's expressions are not made for threads: a worker does one task at a time.
 _one_at_a_time = threading.RLock()
 
 
 def _run(
-    function: Callable[[Item], Result], item: Item, index: int, logs: str | None
-) -> tuple[Result | None, Exception | None, float, str]:
-    """Run one task, timed and logged; an exception is returned."""
+    function: Callable[[Item], Result], index: int, item: Item, logs: Path | None
+) -> Finished[Any, Result]:
+    """Run one task, timed and logged; what is returned holds an exception, but not the item."""
     # Tasks within a task have no log of their own.
     log = worker_log(logs) if logs is not None else logging.getLogger("dlo_casadi.unlogged")
+    result, failure = None, None
     with _one_at_a_time, one_thread():
         begin = time.perf_counter()
         log.info("task %d begins: %.200r", index, item)
@@ -289,58 +274,32 @@ def _run(
             log.info("task %d failed", index, exc_info=True)
             if multiprocessing.parent_process() is not None and not isinstance(error, DloError):
                 error.add_note(traceback.format_exc())  # the stack does not come along
-            return None, error, time.perf_counter() - begin, worker_name()
+            failure = error
         seconds = time.perf_counter() - begin
-        log.info("task %d done in %.3f s", index, seconds)
-        return result, None, seconds, worker_name()
+        if failure is None:
+            log.info("task %d done in %.3f s", index, seconds)
+        return Finished(index, None, result, failure, seconds, worker_name())
 
 
-# ---- bookkeeping -------------------------------------------------------------------------------
+def _losses(executor: Executor) -> tuple[type[BaseException], ...]:
+    """How a lost worker shows."""
+    losses: tuple[type[BaseException], ...] = getattr(executor, "losses", (BrokenExecutor,))
+    return losses
 
 
-@dataclass
-class _Task(Generic[Item]):
-    index: int
-    item: Item
-    lost: int = 0
+def _remaining(
+    durations: Sequence[float], total: int | None, elapsed: float, executor: Executor
+) -> tuple[float, float] | None:
+    """Time of the tasks left: a sum of so many, whose mean itself is known from those done.
 
-
-class _Count:
-    """Counts tasks and their durations."""
-
-    def __init__(self, total: int | None, executor: Executor) -> None:
-        self._begin = time.perf_counter()
-        self._total = total
-        self._executor = executor
-        self._failed = 0
-        self._seconds: list[float] = []
-
-    def add(self, task: Finished[Any, Any]) -> None:
-        """One more has ended."""
-        self._failed += task.error is not None
-        self._seconds.append(task.seconds)
-
-    def now(self) -> Tally:
-        """Numbers at this moment."""
-        elapsed = time.perf_counter() - self._begin
-        done = len(self._seconds)
-        return Tally(done, self._failed, self._total, elapsed, self._remaining(elapsed))
-
-    def _remaining(self, elapsed: float) -> tuple[float, float] | None:
-        """Time of the tasks left: a sum of so many, whose mean itself is known from those done.
-
-        (k mean +- 1.645 s sqrt(k + k^2 / m)) / workers  with k left and m done.
-        """
-        m = len(self._seconds)
-        if self._total is None or m < 2:
-            return None
-        seconds = np.array(self._seconds)
-        workers = getattr(self._executor, "workers", max(1.0, float(seconds.sum()) / elapsed))
-        k = self._total - m
-        middle = k * float(seconds.mean())
-        spread = NINETY * float(seconds.std(ddof=1)) * (k + k**2 / m) ** 0.5
-        return max(0.0, middle - spread) / workers, (middle + spread) / workers
-
-
-def _text(path: Path | None) -> str | None:
-    return None if path is None else str(path)
+    (k mean +- 1.645 s sqrt(k + k^2 / m)) / workers  with k left and m done.
+    """
+    m = len(durations)
+    if total is None or m < 2:
+        return None
+    seconds = np.array(durations)
+    workers = getattr(executor, "workers", max(1.0, float(seconds.sum()) / elapsed))
+    k = total - m
+    middle = k * float(seconds.mean())
+    spread = NINETY * float(seconds.std(ddof=1)) * (k + k**2 / m) ** 0.5
+    return max(0.0, middle - spread) / workers, (middle + spread) / workers

@@ -23,9 +23,8 @@ from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.executors import InProcess, one_thread
 from dlo_casadi.runtime.parallel import begin
-from dlo_casadi.runtime.workers import one_thread
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.findings import found_effects
