@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.descent import descend
-from dlo_casadi.equilibrium.initial_frames import same_sign
+from dlo_casadi.equilibrium.guesses import same_sign
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError

@@ -9,6 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.equilibrium.pose import Pose
+
 FloatArray = NDArray[np.floating]
 
 # Polynomial coefficients (powers of u, weights) of the interpolants' derivatives by u.
@@ -168,6 +170,40 @@ class NodeCurve:
     def distances(self, points: FloatArray) -> FloatArray:
         """Distance (K,) [m] of each point to the nearest place on the curve."""
         return np.linalg.norm(points - self.at(self.nearest(points)), axis=1)
+
+
+def chord_places(points: FloatArray, pose: Pose, length: float) -> FloatArray:
+    """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L.
+
+    Chords across gaps are shorter than the cable; between two fixtures the whole is scaled.
+    """
+    line = [np.array(pose.start)[None], points]
+    if pose.end is not None:
+        line.append(np.array(pose.end)[None])
+    polyline = np.concatenate(line)
+    steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
+    # Noise lengthens a dense polyline: chords over several points are what counts.
+    s = _denoised_length(polyline, steps)
+    places = s[1 : len(points) + 1]
+    if pose.end is not None:
+        places = places * (length / s[-1])
+    return np.clip(places, 0.0, length)
+
+
+def _denoised_length(polyline: FloatArray, steps: FloatArray) -> FloatArray:
+    """Cumulative length of the polyline smoothed over about 1/50 of itself."""
+    total = steps.sum()
+    s = np.concatenate([[0.0], np.cumsum(steps)])
+    width = max(total / 50, 1e-12)
+    knots = np.linspace(0.0, total, 51)
+    kernel = np.exp(-0.5 * ((knots[:, None] - s[None]) / (0.5 * width)) ** 2)
+    norm = kernel.sum(axis=1, keepdims=True)
+    smooth = np.where(norm > 1e-9, kernel @ polyline / np.maximum(norm, 1e-9), np.nan)
+    straight = np.stack([np.interp(knots, s, column) for column in polyline.T], axis=1)
+    smooth = np.where(np.isfinite(smooth), smooth, straight)
+    smooth[0], smooth[-1] = polyline[0], polyline[-1]
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
+    return np.interp(s, knots, arc)
 
 
 @dataclass(frozen=True)

@@ -1,30 +1,74 @@
-"""First guesses of the nodes of a cable held at the ends of a pose."""
+"""First guesses of the nodes of a cable held at the ends of a pose, or along a measured line.
+
+The generated solver tries the same ones, number for number: codegen/templates/*_guesses.c.in.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from dlo_casadi.equilibrium.initial_arcs import arc_headings, arc_into_clamps, limited, wrapped
-from dlo_casadi.equilibrium.initial_frames import guessed_frames_of
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import Chain
+from dlo_casadi.rod.node import Frame
 
 FloatArray = NDArray[np.floating]
+Clamps = tuple[FloatArray | None, FloatArray | None]
+Turned = tuple[Rotation | None, Rotation | None]
 
 # First guesses that seldom lead to the lowest equilibrium are left out, see `guesses` [rad].
 # Of 300 random problems with a clamp at the end or at both ends this loses none.
 FAR, CURVED = 1.5, 1.0
+# Joints of a first guess stay within this: 0.9 of the bound of an equilibrium's joints [rad].
+LARGEST_BEND = 0.9 * np.pi / 2
+# A clamp's turning decays as (1 - s/L)^5 from it. Of 1200 random problems with clamps, the lowest
+# equilibrium was missed in 9, 2, 0, 0, 1 with the power 3, 4, 5, 6, 8; high ones seldom converge.
+_DECAY = 5
+# Rolls so near to half a turn [rad] are as near to none the other way round: arcs to four sides
+# differ by as much, 1.2 rad in a pose whose lowest equilibrium is the other one.
+HALF_TURN = 1.0
+# Turns by which one twist must be nearer than another: arcs to two sides may lie half a turn apart.
+_ROUNDING = 1e-6
+# Least squares of half_angle / sqrt(1 - ratio), squared, in powers of 1 - ratio; to 2e-4 rad.
+_HALF_ANGLE = (
+    *(5.9998487866413575, 1.818549938733748, 0.45541329964829563, 3.159529741805951),
+    *(-9.268767992481754, 17.431184753381647, -15.583929636428092, 5.856747675543661),
+)
+_FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def resting_headings(chain: Chain, rest: FloatArray) -> FloatArray:
-    """Headings (n_nodes,) of the cable at rest, counted from its start [rad]."""
-    cells = chain.cells
-    turn = np.concatenate([[0.0], np.cumsum(rest * np.diff(cells, axis=1).ravel())])
-    edges = np.concatenate([cells[:1, 0], cells[:, 1]])
-    return np.interp(chain.places, edges, turn)
+def first_nodes(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> list[FloatArray]:
+    """First guesses of the nodes (n_nodes, coordinates): `guesses`, or `guessed_frames`."""
+    if model.node is Frame:
+        return guessed_frames(model, p, rest, pose)
+    return [phi[:, None] for phi in guesses(model, p, rest, pose)]
+
+
+def _held(
+    model: CableModel, p: FloatArray, pose: Pose
+) -> tuple[FloatArray, FloatArray | None, Clamps]:
+    """What guesses are made of: arc lengths of the nodes, end minus start, and clamped frames.
+
+    Lengths are over the cable's own; no chord leads to a free end, no frame to a pinned one.
+    """
+    ends, length = lagrangian_of(model).held(p, pose.ends, 0)
+    d, c = model.node.dimension, model.node.coordinates
+    start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
+    chord = None if model.end == "free" else (end - start) / float(length)
+    clamps = (
+        first if model.start == "clamped" else None,
+        last if model.end == "clamped" else None,
+    )
+    return model.chain.places / model.chain.length, chord, clamps
+
+
+# ---- in a plane ----------------------------------------------------------------------------------
 
 
 def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> list[FloatArray]:
@@ -54,79 +98,135 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
        or the rest shape by more than 1 rad.
 
     In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings.
-    The generated solver tries the same ones: codegen/templates/guesses.c.in.
 
     Parameters
     ----------
     p : (n_parameters,)
     rest : (n_rests,) [1/m]
     """
-    chain = model.chain
-    ends, length = lagrangian_of(model).held(p, pose.ends, 0)
-    start, end, headings = np.array(ends).reshape(3, 2)
-    u, chord = chain.places / chain.length, (end - start) / float(length)
-    held = tuple(side == "clamped" for side in (model.start, model.end))
-    clamps = (
-        float(headings[0]) if held[0] else None,
-        float(headings[1]) if held[1] else None,
-    )
-    bent = resting_headings(chain, rest)
+    u, chord, clamps = _held(model, p, pose)
+    bent = resting_headings(model.chain, rest)
     sides = (-1, 1) if pose.branch == "cw" else (1, -1)
-    if model.end == "free":
+    if chord is None:
         found = _hanging(model, u, bent, clamps[0])
-    elif any(held):
+    elif model.start == model.end == "pinned":
+        found = [arc_headings(u, 1.0, np.zeros(2), chord, side) for side in sides]
+        found += _curved(model.n, u, bent, chord)
+    else:
         into = [arc_into_clamps(u, chord, clamps, side) for side in sides]
         found = [near for near, _, _ in into]
         found += [far for _, far, bend in into if bend > FAR or np.ptp(bent) > CURVED]
-    else:
-        found = [arc_headings(u, 1.0, np.zeros(2), chord, side) for side in sides]
-        found += _curved(chain.n, u, bent, chord)
     out = [limited(phi) for phi in found]
-    for phi in out:
-        phi[[0, -1]] = np.where(held, headings, phi[[0, -1]])
+    for end, clamp in zip((0, -1), clamps, strict=True):
+        if clamp is not None:
+            for phi in out:
+                phi[end] = clamp[0]
     return out
 
 
-def first_nodes(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> list[FloatArray]:
-    """First guesses of the nodes (n_nodes, coordinates): `guesses`, or `guessed_frames`."""
-    if model.in_space:
-        return guessed_frames(model, p, rest, pose)
-    return [phi[:, None] for phi in guesses(model, p, rest, pose)]
+def resting_headings(chain: Chain, rest: FloatArray) -> FloatArray:
+    """Headings (n_nodes,) of the cable at rest, counted from its start [rad]."""
+    cells = chain.cells
+    turn = np.concatenate([[0.0], np.cumsum(rest * np.diff(cells, axis=1).ravel())])
+    edges = np.concatenate([cells[:1, 0], cells[:, 1]])
+    return np.interp(chain.places, edges, turn)
 
 
-def guessed_frames(
-    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose
-) -> list[FloatArray]:
-    """First guesses of the frames (n_nodes, 4) of a cable in space.
+def arc_half_angle(chord: float, length: float) -> float:
+    """Half the turning of a circular arc: sin(a) / a = chord / length, a in [0, pi].
 
-    Between two ends, four arcs of the cable's length, the first sagging along gravity, the others
-    turned about the chord by quarter turns; bent into the clamps, the roll of the end clamp that
-    is nearest to `turns` spread evenly; of no turns, where that is nearly half a turn, also with
-    the one the other way round. With a free end: the rest shape, the cable fallen down, and
-    straight on.
+    By a polynomial, to 2e-4 rad.
+
+    Parameters
+    ----------
+    chord, length : float [m]
+        0 <= chord; a chord longer than the arc gives 0.
     """
-    ends, length = lagrangian_of(model).held(p, pose.ends, 0)
-    values = np.array(ends).ravel()
-    start, end, first, last = np.split(values, [3, 6, 10])
-    held = tuple(side == "clamped" for side in (model.start, model.end))
-    clamps = (first if held[0] else None, last if held[1] else None)
-    u = model.chain.places / model.chain.length
-    down = np.array(model.gravity)
-    chord = None if model.end == "free" else (end - start) / float(length)
-    cells = model.chain.cells
-    widths = np.diff(cells, axis=1).ravel()
-    bent = model.chain.curvatures(rest) * widths
-    return guessed_frames_of(u, chord, clamps, down, bent, pose.turns)
+    y = max(1.0 - chord / length, 0.0)
+    total = 0.0
+    for coefficient in _HALF_ANGLE[::-1]:
+        total = coefficient + y * total
+    return float(np.sqrt(y * total))
+
+
+def arc_headings(
+    places: FloatArray, length: float, start: FloatArray, end: FloatArray, side: int
+) -> FloatArray:
+    """Headings (k,) [rad] of the circular arc of the given length through both ends.
+
+    Parameters
+    ----------
+    places : (k,) [m]
+        Arc lengths.
+    start, end : (2,) [m]
+    side : +1 or -1
+        +1 turns counter-clockwise from start to end.
+    """
+    chord = end - start
+    half = arc_half_angle(float(np.hypot(*chord)), length)
+    direction = np.arctan2(chord[1], chord[0])
+    return direction + side * half * (2 * places / length - 1)
+
+
+def arc_into_clamps(
+    u: FloatArray, chord: FloatArray, clamps: Clamps, side: int
+) -> tuple[FloatArray, FloatArray, float]:
+    """Headings of the arc through both ends that bends into the headings of the clamps.
+
+        phi(u) = arc(u) + t + (1 - u)^5 (first - arc(0) - t) + u^5 (last - arc(1) - t),  t = 2 pi k
+
+    Headings are continuous along the cable, so that whole turns k of the arc count.
+
+    Parameters
+    ----------
+    u : (k,)
+        Arc length over length.
+    chord : (2,)
+        End minus start, over length.
+    clamps : (1,) [rad] or None, each
+        First and last heading; None where the cable may turn, not both.
+    side : +1 or -1
+
+    Returns
+    -------
+    (k,) [rad]
+        With the k that bends the cable least at its clamps.
+    (k,) [rad]
+        With the next k, that bends it the other way.
+    float [rad]
+        How far the first bends it, in the mean over the clamps, at most pi.
+    """
+    arc = arc_headings(np.concatenate([[0.0], u, [1.0]]), 1.0, np.zeros(2), chord, side)
+    excess = [
+        (float(clamp[0] - own), (1 - from_clamp) ** _DECAY)
+        for clamp, own, from_clamp in zip(clamps, arc[[0, -1]], (u, 1 - u), strict=True)
+        if clamp is not None
+    ]
+    mean = sum(angle for angle, _ in excess) / len(excess)
+    turns = np.floor(mean / (2 * np.pi) + 0.5)
+    rest = mean - 2 * np.pi * turns
+
+    def bent(turns: float) -> FloatArray:
+        shift = 2 * np.pi * turns
+        return sum(((angle - shift) * decay for angle, decay in excess), start=arc[1:-1] + shift)
+
+    return bent(turns), bent(turns + 1 if rest > 0 else turns - 1), abs(rest)
+
+
+def limited(phi: FloatArray) -> FloatArray:
+    """Headings (k,) whose bends are cut at LARGEST_BEND; the first heading stays."""
+    bends = np.clip(np.diff(phi), -LARGEST_BEND, LARGEST_BEND)
+    return phi[0] + np.concatenate([[0.0], np.cumsum(bends)])
 
 
 def _hanging(
-    model: CableModel, u: FloatArray, bent: FloatArray, first: float | None
+    model: CableModel, u: FloatArray, bent: FloatArray, clamp: FloatArray | None
 ) -> list[FloatArray]:
-    """Guesses for a cable with a free end; `first` is the clamp's heading."""
+    """Guesses for a cable with a free end."""
     down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
-    if first is None:
-        first = down
-    drop, decay = wrapped(down - first), 1 - np.exp(-4 * u)
+    first = down if clamp is None else float(clamp[0])
+    decay = 1 - np.exp(-4 * u)
+    drop = down - first - 2 * np.pi * np.floor((down - first + np.pi) / (2 * np.pi))
     found = [first + bent, first + drop * decay, np.full_like(u, first)]
     if abs(drop) > FAR or np.ptp(bent) > CURVED:
         found.append(first + (drop - 2 * np.pi * (1 if drop > 0 else -1)) * decay)
@@ -145,3 +245,165 @@ def _curved(n: int, u: FloatArray, bent: FloatArray, chord: FloatArray) -> list[
         looped = 2 * np.pi * np.clip((u - 0.5) / slack + 0.5, 0.0, 1.0)
         found += [direction + looped, direction - looped]
     return found
+
+
+# ---- in space ------------------------------------------------------------------------------------
+
+
+def guessed_frames(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose
+) -> list[FloatArray]:
+    """First guesses of the frames (n_nodes, 4) of a cable in space.
+
+    Between two ends, four arcs of the cable's length, the first sagging along gravity, the others
+    turned about the chord by quarter turns; bent into the clamps, the roll of the end clamp that
+    is nearest to `turns` spread evenly; of no turns, where that is nearly half a turn, also with
+    the one the other way round. With a free end: the rest shape, the cable fallen down, and
+    straight on. Turns are counted along the first arc, and as near to that along the others.
+    """
+    u, chord, frames = _held(model, p, pose)
+    clamps = _rotation(frames[0]), _rotation(frames[1])
+    down = np.array(model.gravity)
+    if chord is None:
+        bends = model.chain.curvatures(rest) * np.diff(model.chain.cells, axis=1).ravel()
+        return _hanging_frames(u, clamps[0], down, bends)
+    along = chord / max(float(np.linalg.norm(chord)), 1e-12)
+    side = down - (down @ along) * along
+    if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
+        side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    found: list[FloatArray] = []
+    others: list[FloatArray] = []
+    aimed = turns = 0.0 if None in clamps else pose.turns
+    for quarter in range(4):
+        turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
+        carried, roll = _carried(u, _arc_tangents(u, chord, turned), clamps)
+        roll = _nearest(roll, aimed)
+        if turns and not found:
+            aimed = roll / (2 * np.pi)
+        if not turns and None not in clamps and abs(roll) > np.pi - HALF_TURN:
+            others.append(_rolled(u, carried, clamps, roll - np.copysign(2 * np.pi, roll)))
+        found.append(_rolled(u, carried, clamps, roll))
+    return found + others
+
+
+def _rotation(frame: Sequence[float] | FloatArray | None) -> Rotation | None:
+    return None if frame is None else Rotation.from_quat(frame)
+
+
+def _smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
+    """Smallest rotation of the unit vector a into b."""
+    axis = np.cross(a, b)
+    cosine = float(a @ b)
+    if cosine < -1 + 1e-12:
+        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis))
+    return Rotation.from_quat(np.append(axis, 1 + cosine))
+
+
+def _arc_tangents(u: FloatArray, chord: FloatArray, side: FloatArray) -> FloatArray:
+    """Tangents (k, 3) of the circular arc of length 1 over a chord (3,), bulging to a side (3,)."""
+    along = chord / max(float(np.linalg.norm(chord)), 1e-12)
+    across = side - (side @ along) * along
+    across = across / max(float(np.linalg.norm(across)), 1e-12)
+    angle = arc_half_angle(float(np.linalg.norm(chord)), 1.0) * (1 - 2 * u)
+    return np.cos(angle)[:, None] * along + np.sin(angle)[:, None] * across
+
+
+def _hanging_frames(
+    u: FloatArray, first: Rotation | None, down: FloatArray, bends: FloatArray
+) -> list[FloatArray]:
+    """Guesses for a cable with a free end; rest bends (2, k - 1) [rad] about the axes y and z."""
+    down = down / max(float(np.linalg.norm(down)), 1e-12)
+    if first is None:
+        first = _smallest_turn(_FORWARD, down if np.any(down) else _FORWARD)
+    rest = [first]
+    for bend in bends.T:
+        rest.append(rest[-1] * Rotation.from_rotvec([0.0, *bend]))
+    shapes = [Rotation.concatenate(rest)]
+    if np.any(down):
+        fall = _smallest_turn(first.apply(_FORWARD), down).as_rotvec()
+        shapes.append(Rotation.from_rotvec((1 - np.exp(-4 * u))[:, None] * fall) * first)
+    shapes.append(Rotation.concatenate([first] * len(u)))
+    return [same_sign(shape.as_quat()) for shape in shapes]
+
+
+def _carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotation, float]:
+    """Frames (k,) along tangents bent into the clamps, without twist, and the end clamp's roll.
+
+    It is the angle [rad], within (-pi, pi], about the cable by which the end clamp is turned
+    against the last of them.
+    """
+    bends = [
+        decay[:, None] * _smallest_turn(tangents[end], clamp.apply(_FORWARD)).as_rotvec()
+        for clamp, end, decay in zip(clamps, (0, -1), ((1 - u) ** _DECAY, u**_DECAY), strict=True)
+        if clamp is not None
+    ]
+    axes = tangents
+    for bend in bends:
+        axes = Rotation.from_rotvec(bend).apply(axes)
+    first = clamps[0] or _smallest_turn(_FORWARD, axes[0])
+    frames = [_smallest_turn(first.apply(_FORWARD), axes[0]) * first]
+    for before, after in pairwise(axes):
+        frames.append(_smallest_turn(before, after) * frames[-1])
+    if clamps[1] is None:
+        return Rotation.concatenate(frames), 0.0
+    x, _, _, w = (frames[-1].inv() * clamps[1]).as_quat()
+    return Rotation.concatenate(frames), float(np.pi - (np.pi - 2 * np.arctan2(x, w)) % (2 * np.pi))
+
+
+def _rolled(u: FloatArray, frames: Rotation, clamps: Turned, roll: float) -> FloatArray:
+    """Frames (k, 4) with a roll [rad] at the end: spread evenly from a clamp, alike from a pin."""
+    share = np.ones_like(u) if clamps[0] is None else u
+    about = Rotation.from_rotvec(np.outer(roll * share, _FORWARD))
+    return same_sign((frames * about).as_quat())
+
+
+def _nearest(roll: float, aimed: float) -> float:
+    """The roll [rad], by whole turns more or less, nearest to those aimed at [turns].
+
+    Of two that are as near to rounding the larger.
+    """
+    return roll + 2 * np.pi * float(np.floor(aimed - roll / (2 * np.pi) + 0.5 + _ROUNDING))
+
+
+def same_sign(quaternions: FloatArray) -> FloatArray:
+    """Quaternions (k, 4) of which neighbours have the same sign."""
+    flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(axis=1))
+    signs = np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])
+    return quaternions * signs[:, None]
+
+
+# ---- along a measured line -----------------------------------------------------------------------
+
+
+def line_nodes(points: FloatArray, pose: Pose, chain: Chain, places: FloatArray) -> FloatArray:
+    """Nodes (n_nodes, coordinates) along a measured line, from its chords.
+
+    Those of some hundredths of the length; `places` (K,) [m] are the points' arc lengths. In a
+    plane headings are continuous along the cable; in space the clamps' roll is spread evenly, of
+    the twists that reach the end clamp the one nearest to `turns`.
+    """
+    line = [np.array(pose.start)[None], points]
+    s = [np.array([0.0]), places]
+    if pose.end is not None:
+        line.append(np.array(pose.end)[None])
+        s.append(np.array([chain.length]))
+    polyline, at = np.concatenate(line), np.maximum.accumulate(np.concatenate(s))
+    grid = np.linspace(0.0, at[-1], 31)
+    chords = np.diff([np.interp(grid, at, column) for column in polyline.T]).T
+    middles = (grid[1:] + grid[:-1]) / 2
+    if chain.kind.node is not Frame:
+        headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+        if pose.start_heading is not None:
+            turns = np.round((pose.start_heading - headings[0]) / (2 * np.pi))
+            headings = headings + 2 * np.pi * turns
+        return np.interp(chain.places, middles, headings)[:, None]
+    tangents = np.stack([np.interp(chain.places, middles, x) for x in chords.T], axis=1)
+    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)
+    clamps = (
+        _rotation(pose.start_orientation if chain.start_clamped else None),
+        _rotation(pose.end_orientation if chain.end_clamped else None),
+    )
+    u = chain.places / chain.length
+    frames, roll = _carried(u, tangents, clamps)
+    return _rolled(u, frames, clamps, _nearest(roll, 0.0 if None in clamps else pose.turns))

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.equilibrium.chords import line_nodes
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
+from dlo_casadi.equilibrium.guesses import line_nodes
 from dlo_casadi.equilibrium.pose import Pose, PoseBranch
 from dlo_casadi.equilibrium.solve import continued, solve_equilibria, ways_of
 from dlo_casadi.errors import EquilibriumError

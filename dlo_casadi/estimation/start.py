@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.chords import line_nodes
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
-from dlo_casadi.equilibrium.guesses import first_nodes
+from dlo_casadi.equilibrium.guesses import first_nodes, line_nodes
 from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
 from dlo_casadi.estimation.linearization import Point, Values
 from dlo_casadi.model.assembly import Shapes, Tangents

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
-from dlo_casadi.equilibrium.initial_arcs import arc_headings
+from dlo_casadi.equilibrium.guesses import arc_headings
 from dlo_casadi.equilibrium.ipopt import run_ipopt
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.rod.chain import Chain

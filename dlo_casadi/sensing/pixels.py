@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from dlo_casadi.equilibrium.chords import chord_places
-from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange, chord_places
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import OfPoints

@@ -14,8 +14,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.equilibrium.chords import chord_places
-from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange, chord_places
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.node import Node

@@ -22,8 +22,7 @@ from dlo_casadi.codegen.poses import pose_table
 from dlo_casadi.codegen.records import shape_record
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
-from dlo_casadi.equilibrium.guesses import guesses
-from dlo_casadi.equilibrium.initial_arcs import limited
+from dlo_casadi.equilibrium.guesses import guesses, limited
 from dlo_casadi.equilibrium.ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of

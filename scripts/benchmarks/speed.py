@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.codegen.library import compile_library
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.initial_arcs import arc_headings
+from dlo_casadi.equilibrium.guesses import arc_headings
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential

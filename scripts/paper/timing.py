@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from dlo_casadi import CableModel, CompiledSolver, Pose, solve_equilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.equilibrium.initial_arcs import arc_headings
+from dlo_casadi.equilibrium.guesses import arc_headings
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.report.canvas import BLACK, GREY, VERMILLION
 from paper import published
