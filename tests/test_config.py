@@ -391,7 +391,7 @@ def load_for_all(folder: Path, options: str) -> Config:
     )
 
 
-@pytest.mark.parametrize("name", [name for name, kind in EFFECTS.items() if kind.in_plane])
+@pytest.mark.parametrize("name", [name for name, kind in EFFECTS.items() if 2 in kind.dimensions])
 def test_no_parameter_of_an_effect_takes_any_number(tmp_path, name):
     for q in EFFECTS[name]().parameters(Cable(0.8, 0.23, 0.0128, 0.6)):
         options = f"model: {{effects: [{{name: {name}, parameters: {{{q.name}: 1e300}}}}]}}\n"
@@ -440,7 +440,7 @@ def test_names_that_no_file_system_takes(tmp_path):
 
 
 def test_every_effect_can_be_declared(tmp_path):
-    in_plane = [name for name, kind in EFFECTS.items() if kind.in_plane]
+    in_plane = [name for name, kind in EFFECTS.items() if 2 in kind.dimensions]
     config = load_for_all(tmp_path, f"model: {{effects: [{', '.join(in_plane)}]}}\n")
     assert [item.name for item in config.model.effects] == in_plane
 

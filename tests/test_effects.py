@@ -61,7 +61,7 @@ CASES = [
     (name, where, element)
     for where, element in WHERE
     for name, kind in sorted(EFFECTS.items())
-    if getattr(kind, f"in_{where}")
+    if {"plane": 2, "space": 3}[where] in kind.dimensions
 ]
 EVERYWHERE = pytest.mark.parametrize(("name", "where", "element"), CASES)
 
@@ -140,9 +140,9 @@ def test_declaration(name):
     assert isinstance(effect, Effect)
     assert (effect.name, effect.label) == (name, name)
     assert effect.kind in KINDS
-    declared = effect.parameters(CABLE if effect.in_plane else IN_SPACE)
+    declared = effect.parameters(CABLE if 2 in effect.dimensions else IN_SPACE)
     assert declared
-    assert effect.in_plane or effect.in_space
+    assert effect.dimensions in ((2,), (3,), (2, 3))
     for q in declared:
         assert q.unit in UNITS, f"{q.name}: unit {q.unit!r}"
         assert np.isfinite(q.nominal)

@@ -70,7 +70,7 @@ PLANAR = {
 
 
 def test_every_effect_of_both_is_compared():
-    both = {k for k, kind in EFFECTS.items() if kind.in_plane and kind.in_space}
+    both = {k for k, kind in EFFECTS.items() if kind.dimensions == (2, 3)}
     # A clamp that gives way turns by another angle in space, to third order: see below.
     assert set(PLANAR) == both - {"clamp_compliance"}
 

@@ -36,7 +36,7 @@ class BendingAnisotropy(SectionLaw):
     """
 
     name = "bending_anisotropy"
-    in_plane = False
+    dimensions = (3,)
     isotropic = False
 
     @classmethod

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import inf, isfinite, pi
+from typing import Self
 
 from dlo_casadi.errors import DloError
 
@@ -100,6 +102,13 @@ class Parameter:
         """From where to where a declared value may lie: finite, where a bound is not."""
         away = _FARTHEST * self.scale
         return max(self.lower, self.nominal - away), min(self.upper, self.nominal + away)
+
+    @classmethod
+    def symmetric(
+        cls, names: Iterable[str], unit: str, scale: float, bound: float = inf
+    ) -> tuple[Self, ...]:
+        """Parameters that vanish at 0, of one scale, and as far to either side as the bound."""
+        return tuple(cls(name, unit, scale=scale, lower=-bound, upper=bound) for name in names)
 
     def with_prior(self, std: float) -> Parameter:
         """Return the same parameter with a prior of this standard deviation."""

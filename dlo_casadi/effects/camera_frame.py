@@ -33,7 +33,7 @@ class CameraFrame(MeasurementEffect):
     """
 
     name = "camera_frame"
-    in_plane = False
+    dimensions = (3,)
     tolerances: ClassVar = {
         **dict.fromkeys(_ROTATIONS, "camera_rotation"),
         **dict.fromkeys(_TRANSLATIONS, "camera_translation"),

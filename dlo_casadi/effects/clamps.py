@@ -53,7 +53,7 @@ class ClampEffect(BoundaryEffect):
 
     def may_be(self, found: Fitted) -> bool:
         """A local effect beside a clamp may be the clamp's."""
-        return (self.start and found.near_start) or (self.end and found.near_end)
+        return any(found.near(side) for side in self.sides)
 
 
 class ClampTurn(ClampEffect):
@@ -64,11 +64,8 @@ class ClampTurn(ClampEffect):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the errors of the clamped ends."""
-        return tuple(
-            Parameter(f"{side}_{error}", "rad", scale=0.05, lower=-0.9, upper=0.9)
-            for side in self.sides
-            for error in self.errors
-        )
+        names = (f"{side}_{error}" for side in self.sides for error in self.errors)
+        return Parameter.symmetric(names, "rad", 0.05, 0.9)
 
 
 class ClampAngle(ClampTurn):
@@ -83,7 +80,7 @@ class ClampAngle(ClampTurn):
     """
 
     name = "clamp_angle"
-    in_space = False
+    dimensions = (2,)
     errors = ("heading_error",)
     tolerances: ClassVar = {"start_heading_error": "heading", "end_heading_error": "heading"}
 
@@ -107,22 +104,18 @@ class ClampRotation(ClampTurn):
     """
 
     name = "clamp_rotation"
-    in_plane = False
+    dimensions = (3,)
     errors = ("y", "z")
     tolerances: ClassVar = dict.fromkeys(("start_y", "start_z", "end_y", "end_z"), "rotation")
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Turn the clamps."""
-        if self.start:
-            ends = ends.changed(start_frame=_turned(ends.start_frame, "start", params))
-        if self.end:
-            ends = ends.changed(end_frame=_turned(ends.end_frame, "end", params))
-        return ends
-
-
-def _turned(frame: ca.SX, side: str, params: Params) -> ca.SX:
-    turn = rotation(ca.vertcat(0, params[f"{side}_y"], params[f"{side}_z"]))
-    return ca.vertcat(*quaternion_product(ca.vertsplit(frame), ca.vertsplit(turn)))
+        turned = {}
+        for name in (f"{side}_frame" for side in self.sides):
+            side, frame = name.split("_")[0], ca.vertsplit(getattr(ends, name))
+            turn = rotation(ca.vertcat(0, params[f"{side}_y"], params[f"{side}_z"]))
+            turned[name] = ca.vertcat(*quaternion_product(frame, ca.vertsplit(turn)))
+        return ends.changed(**turned)
 
 
 class ClampCompliance(ClampEffect):

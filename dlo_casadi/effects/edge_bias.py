@@ -36,7 +36,7 @@ class EdgeBias(MeasurementEffect):
     """
 
     name = "edge_bias"
-    in_space = False
+    dimensions = (2,)
     shown: ClassVar = False
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:

@@ -104,9 +104,8 @@ class Effect:
     inverses: ClassVar[Mapping[str, tuple[str, str]]] = {}
     # Whether tables of parameters show it while it is a nuisance.
     shown: ClassVar[bool] = True
-    # Whether there is such an effect on a cable in a plane, and on one in space.
-    in_plane: ClassVar[bool] = True
-    in_space: ClassVar[bool] = True
+    # Whether there is such an effect on a cable in a plane, 2, and on one in space, 3.
+    dimensions: ClassVar[tuple[int, ...]] = (2, 3)
 
     label: str = ""
 
@@ -125,7 +124,7 @@ class Effect:
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Whether the effect makes sense in a setup, and measurements there can show it."""
-        return cls.in_space if setup.in_space else cls.in_plane
+        return len(setup.gravity) in cls.dimensions
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
@@ -134,12 +133,12 @@ class Effect:
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
         """Why it cannot be declared with these values, and what to try; empty if it can."""
-        if self.in_space if setup.in_space else self.in_plane:
+        count, where = len(setup.gravity), {2: "a plane", 3: "space"}
+        if count in self.dimensions:
             return ""
-        own, other = ("a plane", "space") if setup.in_space else ("space", "a plane")
         return (
-            f"it is of cables in {own}, and gravity has "
-            f"{counted(len(setup.gravity), 'number')}: the cable is in {other}. "
+            f"it is of cables in {where[self.dimensions[0]]}, and gravity has "
+            f"{counted(count, 'number')}: the cable is in {where[count]}. "
             "Try: without it, or experiment.gravity"
         )
 
@@ -283,7 +282,7 @@ class LoadAcrossGravity(Load):
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
         """With the axis that gravity is most along."""
-        if not setup.in_space:
+        if len(setup.gravity) == 2:
             return cls()
         return cls(vertical="xyz"[int(np.argmax(np.abs(setup.gravity)))])
 
@@ -389,17 +388,12 @@ class Fitted:
     values: Mapping[str, float]
     stds: Mapping[str, float]
 
-    @property
-    def near_start(self) -> bool:
-        """Whether it acts so near to the start that it may be the fixture's."""
-        place = self.effect.place(self.values)
-        return place is not None and place < NEAR_END * self.setup.cable.length
-
-    @property
-    def near_end(self) -> bool:
-        """Whether it acts so near to the end that it may be the fixture's."""
-        place = self.effect.place(self.values)
-        return place is not None and place > (1 - NEAR_END) * self.setup.cable.length
+    def near(self, side: str) -> bool:
+        """Whether it acts so near to the start, or end, that it may be the fixture's."""
+        place, length = self.effect.place(self.values), self.setup.cable.length
+        if place is None:
+            return False
+        return place < NEAR_END * length if side == "start" else place > (1 - NEAR_END) * length
 
     def propagated(
         self, of: Callable[[Params], ca.SX]

@@ -25,12 +25,8 @@ class EndOffset(BoundaryEffect):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the offset."""
-        bound = 0.3 * cable.length
-        scale = 0.002 * cable.length
-        return tuple(
-            Parameter(f"d{axis}", "m", scale=scale, lower=-bound, upper=bound)
-            for axis in cable.axes
-        )
+        names = (f"d{axis}" for axis in cable.axes)
+        return Parameter.symmetric(names, "m", 0.002 * cable.length, 0.3 * cable.length)
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:

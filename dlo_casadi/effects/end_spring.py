@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable, Parameter
@@ -25,7 +27,9 @@ class _PinSpring(BoundaryEffect):
         Direction in which the spring is relaxed.
     """
 
-    in_space = False
+    dimensions = (2,)
+    # The end that the pin holds.
+    side: ClassVar[str]
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare stiffness and relaxed heading."""
@@ -35,7 +39,23 @@ class _PinSpring(BoundaryEffect):
             Parameter("heading", "rad", scale=0.5, lower=-10.0, upper=10.0),
         )
 
-    def _spring(self, heading: ca.SX, params: Params) -> ca.SX:
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where that end is a pin."""
+        return super().applies(setup) and getattr(setup, cls.side) == "pinned"
+
+    def scans(self, setup: Setup) -> tuple[Scan, ...]:
+        """Look about the cable's mean heading at that end."""
+        mean = setup.directions[self.side == "end"]
+        return tuple({"heading": mean + turn} for turn in HEADINGS)
+
+    def may_be(self, found: Fitted) -> bool:
+        """A local effect beside the pin may be the pin's."""
+        return found.near(self.side)
+
+    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
+        """Energy of the spring [J]."""
+        heading = first if self.side == "start" else last
         return params["stiffness"] * (heading - params["heading"]) ** 2 / 2
 
 
@@ -43,43 +63,11 @@ class StartSpring(_PinSpring):
     """A torsional spring at the start pin: V = k (phi(0) - heading)^2 / 2."""
 
     name = "start_spring"
-
-    @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """Where the start is a pin."""
-        return super().applies(setup) and setup.start == "pinned"
-
-    def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Look about the cable's mean heading at the start."""
-        return tuple({"heading": setup.directions[0] + turn} for turn in HEADINGS)
-
-    def may_be(self, found: Fitted) -> bool:
-        """A local effect beside the start pin may be the pin's."""
-        return found.near_start
-
-    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
-        """Energy of the spring [J]."""
-        return self._spring(first, params)
+    side = "start"
 
 
 class EndSpring(_PinSpring):
     """A torsional spring at the end pin: V = k (phi(L) - heading)^2 / 2."""
 
     name = "end_spring"
-
-    @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """Where the end is a pin."""
-        return super().applies(setup) and setup.end == "pinned"
-
-    def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Look about the cable's mean heading at the end."""
-        return tuple({"heading": setup.directions[1] + turn} for turn in HEADINGS)
-
-    def may_be(self, found: Fitted) -> bool:
-        """A local effect beside the end pin may be the pin's."""
-        return found.near_end
-
-    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
-        """Energy of the spring [J]."""
-        return self._spring(last, params)
+    side = "end"

@@ -27,10 +27,7 @@ class GravityTilt(LoadAcrossGravity):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the angles."""
-        return tuple(
-            Parameter(name, "rad", scale=0.05, lower=-0.5, upper=0.5)
-            for name in self.components("angle", cable)
-        )
+        return Parameter.symmetric(self.components("angle", cable), "rad", 0.05, 0.5)
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
         """Turn gravity counter-clockwise."""

@@ -34,7 +34,7 @@ class ImageDistortion(MeasurementEffect):
     """
 
     name = "image_distortion"
-    in_space = False
+    dimensions = (2,)
 
     center: tuple[float, float] = (0.0, 0.0)
 

@@ -22,7 +22,7 @@ class ImageScale(MeasurementEffect):
     """
 
     name = "image_scale"
-    in_space = False
+    dimensions = (2,)
     tolerances: ClassVar = {"factor": "scale"}
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:

@@ -26,12 +26,8 @@ class LengthError(Kinematics):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the difference."""
-        bound = 0.3 * cable.length
-        return (
-            Parameter(
-                "length_difference", "m", scale=0.002 * cable.length, lower=-bound, upper=bound
-            ),
-        )
+        length = cable.length
+        return Parameter.symmetric(("length_difference",), "m", 0.002 * length, 0.3 * length)
 
     def stretch(self, cable: Cable, params: Params) -> ca.SX:
         """Return true over declared length."""

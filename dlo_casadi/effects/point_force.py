@@ -25,14 +25,8 @@ class PointForce(PointLoad):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the force and its place."""
-        scale = 0.1 * 9.81 * cable.mass
-        return (
-            *(
-                Parameter(f"f{axis}", "N", scale=scale, lower=-30 * scale, upper=30 * scale)
-                for axis in cable.axes
-            ),
-            self.position(cable),
-        )
+        names, scale = (f"f{axis}" for axis in cable.axes), 0.1 * 9.81 * cable.mass
+        return (*Parameter.symmetric(names, "N", scale, 30 * scale), self.position(cable))
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force."""
@@ -59,14 +53,8 @@ class UnknownPull(PointLoad):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the mean force and its place."""
-        scale = 9.81 * cable.mass
-        return (
-            *(
-                Parameter(f"f{axis}", "N", scale=scale, lower=-10 * scale, upper=10 * scale)
-                for axis in cable.axes
-            ),
-            self.position(cable),
-        )
+        names, scale = (f"f{axis}" for axis in cable.axes), 9.81 * cable.mass
+        return (*Parameter.symmetric(names, "N", scale, 10 * scale), self.position(cable))
 
     def per_pose(self, cable: Cable) -> tuple[str, ...]:
         """f_j."""

@@ -53,8 +53,3 @@ class Setup:
     tolerances: Mapping[str, float] = field(default_factory=dict)
     directions: tuple[float, float] = (0.0, 0.0)
     largest_bend: float | None = None
-
-    @property
-    def in_space(self) -> bool:
-        """Whether the cable may leave the plane."""
-        return len(self.gravity) == 3

@@ -27,10 +27,8 @@ class SideLoad(LoadAcrossGravity):
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the force per length."""
         weight = 9.81 * cable.mass / cable.length
-        return tuple(
-            Parameter(name, "N/m", scale=0.1 * weight, lower=-0.5 * weight, upper=0.5 * weight)
-            for name in self.components("force_per_length", cable)
-        )
+        names = self.components("force_per_length", cable)
+        return Parameter.symmetric(names, "N/m", 0.1 * weight, 0.5 * weight)
 
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX:
         """Force on the part beyond s."""

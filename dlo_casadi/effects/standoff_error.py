@@ -35,7 +35,7 @@ class StandoffError(MeasurementEffect):
     """
 
     name = "standoff_error"
-    in_space = False
+    dimensions = (2,)
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the distance."""

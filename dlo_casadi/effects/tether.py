@@ -38,17 +38,9 @@ class Tether(PointLoad):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare stiffness, place and anchor."""
-        reach = FARTHEST * cable.length
-        return (
-            _stiffness(cable),
-            self.position(cable),
-            *(
-                Parameter(
-                    f"anchor_{axis}", "m", scale=0.1 * cable.length, lower=-reach, upper=reach
-                )
-                for axis in cable.axes
-            ),
-        )
+        names, length = (f"anchor_{axis}" for axis in cable.axes), cable.length
+        anchor = Parameter.symmetric(names, "m", 0.1 * length, FARTHEST * length)
+        return (_stiffness(cable), self.position(cable), *anchor)
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
@@ -85,12 +77,9 @@ class _LinearTether(PointLoad):
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare stiffness, place and the force on the place when it is at the origin."""
-        scale = 0.1 * 9.81 * cable.mass
-        return (
-            _stiffness(cable),
-            self.position(cable),
-            *(Parameter(f"f{axis}", "N", scale=scale) for axis in cable.axes),
-        )
+        names = (f"f{axis}" for axis in cable.axes)
+        force = Parameter.symmetric(names, "N", 0.1 * 9.81 * cable.mass)
+        return (_stiffness(cable), self.position(cable), *force)
 
     def springs(self, params: Params) -> tuple[SpringAt, ...]:
         """The spring, its energy up to a constant."""
