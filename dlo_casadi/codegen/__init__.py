@@ -2,8 +2,7 @@
 
 from dlo_casadi.codegen.compiled import CompiledSolver
 from dlo_casadi.codegen.generate import Solver, generate
-from dlo_casadi.codegen.obstacles import Capsule, Gap, HalfSpace
-from dlo_casadi.codegen.shapes import STATUSES, Shape, ShapePath, Slope
+from dlo_casadi.codegen.shapes import STATUSES, Capsule, Gap, HalfSpace, Shape, ShapePath, Slope
 
 __all__ = [
     "STATUSES",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import shutil
+import subprocess
 import tempfile
 import weakref
 from collections.abc import Sequence
@@ -13,12 +15,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.codegen.generate import generate
-from dlo_casadi.codegen.library import compile_library
-from dlo_casadi.codegen.obstacles import Gap, HalfSpace, Obstacle
-from dlo_casadi.codegen.poses import no_equilibrium, pose_table
-from dlo_casadi.codegen.records import gap_record, obstacle_record, shape_record, slope_record
-from dlo_casadi.codegen.shapes import STATUSES, Shape, ShapePath, Slope
+from dlo_casadi.codegen.generate import Solver, generate
+from dlo_casadi.codegen.shapes import (
+    STATUSES,
+    Gap,
+    HalfSpace,
+    Obstacle,
+    Shape,
+    ShapePath,
+    Slope,
+    no_equilibrium,
+    pose_table,
+    records_of,
+)
 from dlo_casadi.equilibrium.pose import Branch, Pose
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
@@ -26,6 +35,51 @@ from dlo_casadi.model.cable_model import CableModel
 FloatArray = NDArray[np.floating]
 # Poses, or rows of numbers laid out as dlo_pose in the C header.
 Poses = Sequence[Pose] | FloatArray
+
+# Arguments of the functions in the header: a pointer, an int, a number of things (size_t).
+_TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "n": ctypes.c_size_t}
+_ARGUMENTS = {
+    "dlo_solve": "pipppn",
+    "dlo_step": "ppippn",
+    "dlo_sensitivity": "ppppn",
+    "dlo_clearance": "ppnpp",
+    "dlo_batch": "pnipppn",
+    "dlo_path": "pnipppppn",
+}
+
+
+def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",)) -> Path:
+    """Compile a solver into a shared library.
+
+    Parameters
+    ----------
+    solver : Solver
+    folder : Path
+        Where the files go.
+    flags : sequence of str
+        Of the compiler, beside what a shared library needs.
+
+    Raises
+    ------
+    DloError
+        If there is no compiler, or it fails.
+    """
+    named = os.environ.get("CC")
+    compiler = next((c for c in (named, "cc", "gcc", "clang") if c and shutil.which(c)), None)
+    if compiler is None:
+        raise DloError(
+            "no C compiler found (looked for $CC, cc, gcc, clang).\n"
+            "  Try: apt-get install gcc, or set CC; scripts/generate_solver.py needs none."
+        )
+    solver.write(folder)
+    library = folder / f"{solver.prefix}_solver.so"
+    command = [compiler, "-std=c99", *flags, "-fPIC", "-shared", f"{solver.prefix}_solver.c"]
+    run = subprocess.run(
+        [*command, "-o", library.name, "-lm"], cwd=folder, capture_output=True, text=True
+    )
+    if run.returncode:
+        raise DloError(f"{compiler} could not compile the solver:\n{run.stderr[:2000]}")
+    return library
 
 
 class CompiledSolver:
@@ -65,19 +119,9 @@ class CompiledSolver:
         folder = Path(tempfile.mkdtemp(prefix="dlo_solver_"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
-        self.record, self._slope = shape_record(model), slope_record(model)
-        self.workspace = self.source.workspace
-        size, pointer, integer = ctypes.c_size_t, ctypes.c_void_p, ctypes.c_int
-        tail: list[Any] = [pointer, size]
-        self._c.dlo_solve.argtypes = [pointer, integer, pointer, pointer, *tail]
-        self._c.dlo_step.argtypes = [pointer, pointer, integer, pointer, *tail]
-        self._c.dlo_sensitivity.argtypes = [pointer, pointer, pointer, *tail]
-        self._c.dlo_clearance.argtypes = [pointer, pointer, size, pointer, pointer]
-        self._c.dlo_batch.argtypes = [pointer, size, integer, pointer, pointer, *tail]
-        self._c.dlo_path.argtypes = [
-            *(pointer, size, integer, pointer, pointer, pointer, pointer),
-            *tail,
-        ]
+        for name, kinds in _ARGUMENTS.items():
+            getattr(self._c, name).argtypes = [_TYPES[kind] for kind in kinds]
+        self._records, self.workspace = records_of(model), self.source.workspace
 
     def solve(self, pose: Pose, *, warm: Shape | None = None, throw: bool = True) -> Shape:
         """Shape of the cable in one pose.
@@ -100,14 +144,14 @@ class CompiledSolver:
             If pose or warm start do not fit the cable.
         """
         table, branch = pose_table(self.model, [pose])
-        kept, out = self._record_of(warm), np.zeros(1, self.record)
-        status = self._c.dlo_solve(_at(table), branch, _at(kept), _at(out), *self._work())
+        out = np.zeros(1, self._records.shape)
+        status = self._call("dlo_solve", table, branch, self._record_of(warm), out)
         if status and throw:
             raise EquilibriumError(
                 no_equilibrium(STATUSES[status], pose, self.model.cable.length),
                 p_des=None if pose.end is None else tuple(map(float, pose.end)),
             )
-        return self._read(out[0], status)
+        return _shape(out[0], status)
 
     def step(self, shape: Shape, pose: Pose, *, steps: int = 4) -> Shape:
         """Shape in a pose close by, in at most so many Newton steps; see its `status`.
@@ -120,9 +164,9 @@ class CompiledSolver:
         if not isinstance(steps, int | np.integer):
             raise DloError(f"steps: a whole number of Newton steps belongs here, found {steps!r}")
         table, _ = pose_table(self.model, [pose])
-        kept, out = self._record_of(shape), np.zeros(1, self.record)
-        status = self._c.dlo_step(_at(table), _at(kept), steps, _at(out), *self._work())
-        return self._read(out[0], status)
+        out = np.zeros(1, self._records.shape)
+        status = self._call("dlo_step", table, self._record_of(shape), steps, out)
+        return _shape(out[0], status)
 
     def solve_many(
         self, poses: Poses, *, branch: Branch | None = None
@@ -148,8 +192,8 @@ class CompiledSolver:
             If the poses do not fit the cable or are of several branches.
         """
         table, number = pose_table(self.model, poses, branch)
-        out, statuses = np.zeros(len(table), self.record), np.zeros(len(table), np.intc)
-        self._c.dlo_batch(*(_at(table), len(table), number, _at(out), _at(statuses)), *self._work())
+        out, statuses = np.zeros(len(table), self._records.shape), np.zeros(len(table), np.intc)
+        self._call("dlo_batch", table, len(table), number, out, statuses)
         return out, statuses
 
     def path(
@@ -170,13 +214,10 @@ class CompiledSolver:
             As in `solve_many`.
         """
         table, number = pose_table(self.model, poses, branch)
-        out, statuses = np.zeros(len(table), self.record), np.zeros(len(table), np.intc)
+        out, statuses = np.zeros(len(table), self._records.shape), np.zeros(len(table), np.intc)
         kept, jump = self._record_of(warm), np.zeros(1, np.uintp)
-        self._c.dlo_path(
-            *(_at(table), len(table), number, _at(kept), _at(out), _at(statuses), _at(jump)),
-            *self._work(),
-        )
-        shapes = tuple(self._read(record, int(k)) for record, k in zip(out, statuses, strict=True))
+        self._call("dlo_path", table, len(table), number, kept, out, statuses, jump)
+        shapes = tuple(_shape(record, int(k)) for record, k in zip(out, statuses, strict=True))
         return ShapePath(shapes, int(jump[0]) if jump[0] < len(table) else None)
 
     def sensitivity(self, shape: Shape, pose: Pose) -> Slope:
@@ -188,14 +229,14 @@ class CompiledSolver:
             If the shape is no stable equilibrium of this pose.
         """
         table, _ = pose_table(self.model, [pose])
-        kept, out = self._record_of(shape), np.zeros(1, self._slope)
-        status = self._c.dlo_sensitivity(_at(table), _at(kept), _at(out), *self._work())
+        out = np.zeros(1, self._records.slope)
+        status = self._call("dlo_sensitivity", table, self._record_of(shape), out)
         if status:
             raise EquilibriumError(
                 f"no derivatives ({STATUSES[status]}): is the shape a stable equilibrium of this "
                 "pose?"
             )
-        return Slope(**{name: out[0][name] for name in out.dtype.names or ()})
+        return Slope(**_values(out[0]))
 
     def clearance(
         self, shape: Shape, obstacles: Sequence[Obstacle], slope: Slope | None = None
@@ -213,7 +254,7 @@ class CompiledSolver:
         DloError
             If there is no obstacle or another object, or a number is not finite.
         """
-        kept, given = self._record_of(shape), np.zeros(len(obstacles), obstacle_record(self.model))
+        given = np.zeros(len(obstacles), self._records.obstacle)
         for row, obstacle in zip(given, obstacles, strict=True):
             if not isinstance(obstacle, Obstacle):
                 raise DloError(f"a Capsule or a HalfSpace belongs here, found {obstacle!r}")
@@ -222,39 +263,39 @@ class CompiledSolver:
                 raise DloError(f"places of an obstacle must have {count}, found {obstacle!r}")
             row["kind"], row["radius"] = isinstance(obstacle, HalfSpace), obstacle.radius
             row["a"], row["b"] = obstacle.ends
-        along = None if slope is None else _filled(self._slope, slope)
-        out = np.zeros(1, gap_record(self.model))
-        status = self._c.dlo_clearance(_at(kept), _at(given), len(given), _at(along), _at(out))
+        along = None if slope is None else _filled(self._records.slope, slope)
+        kept, out = self._record_of(shape), np.zeros(1, self._records.gap)
+        status = self._call("dlo_clearance", kept, given, len(given), along, out)
         if status:
             count = counted(len(obstacles), "obstacle")
             raise DloError(f"no clearance ({STATUSES[status]}): {count} given")
-        found = out[0]
-        return Gap(
-            float(found["distance"]),
-            float(found["place"]),
-            found["point"].copy(),
-            found["normal"].copy(),
-            found["gradient"].copy(),
-            int(found["obstacle"]),
-        )
+        return Gap(**_values(out[0]))
 
     def _record_of(self, shape: Shape | None) -> Any:
         if shape is None:
             return None
-        nodes = self.record["x"].shape
+        nodes = self._records.shape["x"].shape
         if not isinstance(shape, Shape) or np.shape(shape.x) != nodes:
             raise DloError(f"a shape of this solver, with x of the shape {nodes}, belongs here")
-        return _filled(self.record, shape)
+        return _filled(self._records.shape, shape)
 
-    def _read(self, record: Any, status: int) -> Shape:
-        values = {name: record[name] for name in self.record.names or ()}
-        scalars = {name: values[name].item() for name in values if values[name].ndim == 0}
-        arrays = {name: values[name].copy() for name in values if values[name].ndim}
-        return Shape(**arrays, **scalars, status=STATUSES[status])
-
-    def _work(self) -> tuple[Any, int]:
+    def _call(self, name: str, *arguments: Any) -> int:
+        """Status of a function of the library; those but the clearance end with a workspace."""
         work = np.empty(self.workspace)
-        return _at(work), work.size
+        given = (*arguments, work, work.size)[: len(_ARGUMENTS[name])]
+        places = (a.ctypes.data if isinstance(a, np.ndarray) else a for a in given)
+        status: int = getattr(self._c, name)(*places)
+        return status
+
+
+def _shape(record: Any, status: int) -> Shape:
+    return Shape(**_values(record), status=STATUSES[status])
+
+
+def _values(record: Any) -> dict[str, Any]:
+    """Numbers and arrays of a record of the library by their names."""
+    values = {name: record[name] for name in record.dtype.names}
+    return {name: v.copy() if v.ndim else v.item() for name, v in values.items()}
 
 
 def _filled(record: np.dtype[Any], values: Shape | Slope) -> Any:
@@ -262,8 +303,3 @@ def _filled(record: np.dtype[Any], values: Shape | Slope) -> Any:
     for name in record.names or ():
         out[name] = getattr(values, name)
     return out
-
-
-def _at(array: Any) -> Any:
-    """The array as an argument in C, which keeps it alive; a null pointer for None."""
-    return None if array is None else array.ctypes.data_as(ctypes.c_void_p)

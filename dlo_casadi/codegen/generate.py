@@ -6,23 +6,19 @@ import hashlib
 import json
 import re
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import __version__
-from dlo_casadi.codegen import plane, space
-from dlo_casadi.codegen.kernels import Kernels, c_number, size_of_code, table_to_c, text_of
-from dlo_casadi.codegen.prefix import check_prefix
-from dlo_casadi.codegen.records import n_columns
+from dlo_casadi.codegen.cases import Case, case_of, template
+from dlo_casadi.codegen.kernels import c_number, size_of_code, table_to_c, text_of
+from dlo_casadi.codegen.shapes import records_of
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.lagrangian import lagrangian_of
 
 FloatArray = NDArray[np.floating]
 
@@ -30,6 +26,16 @@ FloatArray = NDArray[np.floating]
 FINEST = 4096
 # By which a generated file is known, in all templates.
 MARK = "written by dlo-casadi"
+# Keywords of C99, C11 and C++, and what every program defines.
+_KEYWORDS = """
+auto break case char const continue default do double else enum extern float for
+goto if inline int long register restrict return short signed sizeof static struct
+switch typedef union unsigned void volatile while bool catch class constexpr
+decltype delete dynamic_cast explicit export false friend mutable namespace new
+noexcept nullptr operator private protected public reinterpret_cast static_assert
+static_cast template this thread_local throw true try typeid typename using virtual
+wchar_t and or not xor asm alignas alignof main errno
+"""
 
 
 @dataclass(frozen=True)
@@ -101,61 +107,62 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _template(name: str) -> str:
-    return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
-
-
-def _values(model: CableModel, prefix: str, digest: str) -> dict[str, str]:
+def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
     """What the templates' marks stand for, of any cable."""
-    clamped = {side: int(getattr(model, side) == "clamped") for side in ("start", "end")}
-    names = [effect.name for effect in model.effects]
-    return {
+    model, node, kind = case.model, case.model.node, case.model.chain.kind
+    effects = comment(", ".join(effect.name for effect in model.effects)) or "none"
+    held = f"start {model.start}, end {model.end}"
+    table, (kernels, loops, kernel_numbers) = case.table, text_of(case.meshes)
+    values = case.values
+    return values | {
         "PREFIX": prefix,
         "FILE": f"{prefix}_solver",
         "TITLE": comment(model.cable.name),
         "VERSION": __version__,
-        "MODEL": f"{counted(model.n, model.element)}, start {model.start}, end {model.end}, "
-        + "effects: "
-        + (comment(", ".join(names)) or "none"),
+        "MODEL": f"{counted(model.n, model.element)}, {held}, effects: {effects}",
         "HASH": digest,
-        "DIMENSION": str(model.node.dimension),
-        "COORDINATES": str(model.node.coordinates),
-        "AXES": str(model.node.increment),
-        "COLUMNS": str(n_columns(model)),
-        "N": str(model.n),
-        "NODES": str(model.chain.n_nodes),
-        "NODES_ARE": model.chain.kind.nodes_are,
-        "START_CLAMPED": str(clamped["start"]),
-        "END_CLAMPED": str(clamped["end"]),
-        "END_FREE": str(int(model.end == "free")),
+        "DIMENSION": node.dimension,
+        "COORDINATES": node.coordinates,
+        "AXES": node.increment,
+        "COLUMNS": records_of(model).columns,
+        "N": model.n,
+        "NODES": model.chain.n_nodes,
+        "NODES_ARE": kind.nodes_are,
+        "START_CLAMPED": model.start == "clamped",
+        "END_CLAMPED": model.end == "clamped",
+        "END_FREE": model.end == "free",
+        "LENGTH": c_number(case.length),
         "RADIUS": c_number(model.cable.diameter / 2),
-        "ELASTIC": str(int(model.yields)),
-        "STRETCHES": str(int(model.extensible)),
-        "SMOOTH": str(int(model.chain.kind.smooth)),
+        "ELASTIC": model.yields,
+        "STRETCHES": model.extensible,
+        "SMOOTH": kind.smooth,
+        "SPINS": model.may_spin and not case.rest.any(),
+        "TABLE": table_to_c(table),
+        "EXTRA": kernel_numbers,
+        "CODE": size_of_code(case.meshes.values(), table),
+        "KERNELS": kernels,
+        "LOOPS": loops,
+        "TRY_STEPS": case.try_steps,
+        "PATH_STEPS": int(values["STEPS"]) + case.try_steps * (2 * FINEST + 13),
     }
-
-
-def _own(model: CableModel) -> ModuleType:
-    """What differs between plane and space."""
-    return space if model.in_space else plane
 
 
 def table_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
     """The table of another cable of the kind of a solver generated with `inline=False`."""
-    own = _own(model)
-    return _table(own, model, p, rest, own.meshes_of(model, p, rest, inline=False))
+    return case_of(model, p, rest, inline=False).table
 
 
-def _table(
-    own: ModuleType,
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    meshes: dict[str, Kernels],
-) -> list[float]:
-    """Numbers of the kernels of all meshes, then the others."""
-    rows = [number for kernels in meshes.values() for number in kernels.table]
-    return [*rows, *own.numbers_of(model, p, rest)]
+def check_prefix(prefix: str) -> None:
+    """Raise DloError unless the prefix can begin the names of a C library."""
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix, flags=re.ASCII):
+        raise DloError(
+            f"the prefix {prefix!r} is not a C identifier: use letters, digits and underscores, "
+            "a letter first, e.g. --prefix harness"
+        )
+    if prefix in _KEYWORDS.split():
+        raise DloError(f"the prefix {prefix!r} is a keyword of C or C++; choose another one")
+    if prefix.endswith("_") or len(prefix) > 40:
+        raise DloError(f"the prefix {prefix!r} must be short and must not end in an underscore")
 
 
 def comment(text: str) -> str:
@@ -225,37 +232,21 @@ def generate(
             "  Try: dlo predict, or dlo_casadi.predict, which know it."
         )
     digest = solver_hash(model, p, rest)
-    own, kind = _own(model), "space" if model.in_space else "plane"
-    meshes = own.meshes_of(model, p, rest, inline)
-    numbers = _table(own, model, p, rest, meshes)
-    kernels, loops, kernel_numbers = text_of(meshes)
+    case = case_of(model, p, rest, inline)
     values = {
-        **_values(model, prefix, digest),
-        **own.values(model, p, meshes),
-        "LENGTH": c_number(float(lagrangian_of(model).held(p, 0, 0)[1])),
-        "SPINS": str(int(model.may_spin and not rest.any())),
-        "TABLE": table_to_c(numbers),
-        "EXTRA": str(kernel_numbers),
-        "CODE": str(size_of_code(meshes.values(), numbers)),
-        "KERNELS": kernels,
-        "LOOPS": loops,
+        mark: value if isinstance(value, str) else str(int(value))
+        for mark, value in _values(case, prefix, digest).items()
     }
-    values["TRY_STEPS"] = str(own.TRY_STEPS)
-    values["PATH_STEPS"] = str(int(values["STEPS"]) + own.TRY_STEPS * (2 * FINEST + 13))
-    texts = {**own.TEXTS, "POSE_TYPE": _template(f"{kind}_pose.h.in").rstrip()}
-    parts = (
-        *("common", kind, "newton", f"{kind}_descent", f"{kind}_guesses", f"{kind}_shape"),
-        *("shape", "clearance", "interface"),
-    )
-    source = "".join(_template(f"{name}.c.in") for name in parts)
-    names = {
-        f"{prefix}_solver.h": "solver.h.in",
-        f"{prefix}_solver.hpp": "solver.hpp.in",
-        "CMakeLists.txt": "CMakeLists.txt.in",
-        f"{prefix}_solver.pc.in": "solver.pc.in",
-        "example.c": "example.c.in",
+    own = [f"{case.name}_{part}" for part in ("descent", "guesses", "shape")]
+    sources = ("common", case.name, "newton", *own, "shape", "clearance", "interface")
+    found = {
+        f"{prefix}_solver.h": template("solver.h.in"),
+        f"{prefix}_solver.hpp": template("solver.hpp.in"),
+        "CMakeLists.txt": template("CMakeLists.txt.in"),
+        f"{prefix}_solver.pc.in": template("solver.pc.in"),
+        "example.c": template("example.c.in"),
+        f"{prefix}_solver.c": "".join(template(f"{name}.c.in") for name in sources),
     }
-    found = {name: _template(template) for name, template in names.items()}
-    found[f"{prefix}_solver.c"] = source
-    filled = {name: fill(marked(text, texts), values, prefix) for name, text in found.items()}
+    words = case.words
+    filled = {name: fill(marked(text, words), values, prefix) for name, text in found.items()}
     return Solver(prefix, digest, filled, int(values["WORKSPACE"]))

@@ -49,16 +49,10 @@ def table_to_c(numbers: Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class Kernel:
-    """Segments of one kind, which differ in numbers only.
+    """Segments first <= j < last of one kind, which differ in numbers alone: their rows.
 
-    Parameters
-    ----------
-    members : (first, last) int
-        Segments first <= j < last.
-    rows : (last - first, k)
-        Numbers that differ from segment to segment.
-    derive : callable
-        Makes the function.
+    `members` are (first, last), `rows` (last - first, k) the numbers of each segment, and `derive`
+    makes the function.
     """
 
     members: tuple[int, int]
@@ -69,6 +63,31 @@ class Kernel:
     def function(self) -> ca.Function:
         """(x, lam, row (k,), p) -> value and derivatives."""
         return self.derive()
+
+    def loop(self, name: str, table_at: int) -> str:
+        """Statement that calls it for all its segments; its rows begin there in the table."""
+        (first, last), width = self.members, self.rows.shape[1]
+        row = f"table + {table_at} + (j - {first}) * {width}" if width else "table"
+        state = self.function.numel_in(0) // 2
+        return f"""\
+    for (j = {first}; j < {last}; ++j)
+        {name}(x + {state} * j, lam, {row}, table,
+        {" " * len(name)} segment + SEGMENT * j);"""
+
+    def text(self, name: str) -> str:
+        """The function in C."""
+        first, last = self.members
+        targets = [f"out[{i}] =" for i in range(self.function.nnz_out(0))]
+        head = f"static void {name}("
+        return f"""\
+/* Segments {first} to {last - 1}. */
+{head}const double *x, const double *lam, const double *row,
+{" " * len(head)}const double *table, double *restrict out)
+{{
+{_statements(self.function, ("x", "lam", "row", "table"), targets)}
+    (void)x, (void)lam, (void)row, (void)table;
+}}
+"""
 
 
 @dataclass(frozen=True)
@@ -98,36 +117,12 @@ class Kernels:
     @property
     def operations(self) -> int:
         """Floating-point operations of all kernels."""
-        counts = (
-            (last - first) * kernel.function.n_nodes()
-            for kernel in self.segments
-            for first, last in [kernel.members]
-        )
-        return sum(counts)
+        return sum(len(kernel.rows) * kernel.function.n_nodes() for kernel in self.segments)
 
     @property
     def code_size(self) -> int:
         """Bytes of their machine code, about."""
         return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.segments))
-
-    def loops(self, name: str, table_at: int = 0) -> str:
-        """Statements that call all kernels, `table_at` after the start of the solver's table."""
-        found, offset = [], table_at + len(self.shared)
-        for k, kernel in enumerate(self.segments):
-            (first, last), width = kernel.members, kernel.rows.shape[1]
-            row = f"table + {offset} + (j - {first}) * {width}" if width else "table"
-            state = kernel.function.numel_in(0) // 2
-            found += [
-                f"    for (j = {first}; j < {last}; ++j)",
-                f"        {name}_{k}(x + {state} * j, lam, {row}, table,",
-                f"        {' ' * len(f'{name}_{k}')} segment + SEGMENT * j);",
-            ]
-            offset += kernel.rows.size
-        return "\n".join(found)
-
-    def to_c(self, name: str) -> list[str]:
-        """Kernel functions, called `name`_0, `name`_1, ..."""
-        return [_kernel_text(f"{name}_{k}", kernel) for k, kernel in enumerate(self.segments)]
 
 
 def text_of(meshes: dict[str, Kernels]) -> tuple[str, str, int]:
@@ -139,14 +134,17 @@ def text_of(meshes: dict[str, Kernels]) -> tuple[str, str, int]:
     loops: list[str] = []
     at = 0
     for name, kernels in meshes.items():
-        functions += kernels.to_c(name)
-        loops.append(kernels.loops(name, at))
-        at += len(kernels.table)
+        statements, at = [], at + len(kernels.shared)
+        for k, kernel in enumerate(kernels.segments):
+            functions.append(kernel.text(f"{name}_{k}"))
+            statements.append(kernel.loop(f"{name}_{k}", at))
+            at += kernel.rows.size
         if kernels.ends is not None:
             functions.append(_ends_text(kernels.ends))
+        loops.append("\n".join(statements))
     fine, *coarse = loops
-    for statements in coarse:
-        inside = re.sub("^", "    ", statements, flags=re.MULTILINE)
+    for inside in coarse:
+        inside = re.sub("^", "    ", inside, flags=re.MULTILINE)
         fine = f"    if (w->coarse) {{\n{inside}\n        return;\n    }}\n{fine}"
     text = "\n".join(functions)
     helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
@@ -162,14 +160,7 @@ def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
 
 
 def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True) -> Kernels:
-    """Kernels of a model at given parameters.
-
-    Parameters
-    ----------
-    inline : bool
-        Whether numbers that all segments share are written into the code; otherwise parameters and
-        rows are in the table, and cables of one kind differ in it alone.
-    """
+    """Kernels of a model at given parameters; `inline` as in `generate`."""
     places = model.chain.layout.segments
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
@@ -198,16 +189,11 @@ def _kernel(
     members: tuple[int, int],
     inline: bool,
 ) -> Kernel:
-    varies = [
-        not (inline and np.allclose(column, column[0], rtol=_ROUNDING, atol=0.0))
-        for column in own.T
-    ]
-    row = ca.SX.sym("row", sum(varies))
-    symbols = iter(ca.vertsplit(row)) if row.numel() else iter(())
-    values = [
-        next(symbols) if varied else ca.SX(float(column[0]))
-        for varied, column in zip(varies, own.T, strict=True)
-    ]
+    alike = np.isclose(own, own[0], rtol=_ROUNDING, atol=0.0).all(axis=0) & inline
+    row = ca.SX.sym("row", int(np.sum(~alike)))
+    values = [ca.SX(number) for number in own[0]]
+    for i, k in enumerate(np.flatnonzero(~alike)):
+        values[k] = row[i]
     start = values[0]
     # The cell's start counts from the segment's: segments of one kind differ in that alone.
     place = ca.vertcat(start, first[1], start + (first[2] - first[0]), *first[3:])
@@ -218,7 +204,7 @@ def _kernel(
         ca.SX.zeros(len(model.deviation_names)),
         lagrangian_of(model).shares(p, ca.DM(first) if inline else place),
     )
-    return Kernel(members, own[:, varies], partial(_told, model, numbers, row))
+    return Kernel(members, own[:, ~alike], partial(_told, model, numbers, row))
 
 
 def _told(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Function:
@@ -231,12 +217,13 @@ def _told(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Function
     the upper triangle column by column.
     """
     x, lam = ca.SX.sym("x", 2 * model.node.coordinates), ca.SX.sym("lam", model.node.dimension)
-    found = (_in_space if model.in_space else _in_plane)(model, x, lam, numbers)
+    derive = {1: _of_headings, 3: _of_frames}[model.node.increment]
+    found = derive(model, x, lam, numbers)
     arguments = [x, lam, row, _symbols(numbers.p)]
     return ca.Function("kernel", arguments, ca.cse([ca.densify(ca.vertcat(*found))]))
 
 
-def _in_plane(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
+def _of_headings(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
     position = ca.SX.zeros(0) if model.end == "free" else lam
     multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
     arguments = [x, multipliers, numbers.p, numbers.rest, numbers.place, numbers.deviation]
@@ -252,7 +239,7 @@ def _in_plane(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) 
     return [value, gradient[2:], gradient[:2], bends, borders, _triangle(hessian[2:, 2:])]
 
 
-def _in_space(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
+def _of_frames(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
     """Derivatives are by increments about the world's axes."""
     found = lagrangian_of(model).in_frame(x, lam, numbers).derivatives()
     found = found.about(found.turn, found.turn)
@@ -309,12 +296,8 @@ _OUTPUT = re.compile(r"if \(res\[0\]!=0\) res\[0\]\[(\d+)\]=(.*?);")
 def _statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[str]) -> str:
     """What CasADi prints for a function, reading and writing our names.
 
-    Parameters
-    ----------
-    inputs : sequence of str
-        C array of each input.
-    targets : sequence of str
-        Of each number of the output: the assignment's left side and operator.
+    `inputs` are the C arrays of its inputs, `targets` the left side and the operator of each
+    assignment to a number of its output.
     """
     generator = ca.CodeGenerator("kernel")
     generator.add(function)
@@ -328,21 +311,6 @@ def _statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[
         r"casadi_\w+", lambda match: _CALLS.get(match[0], match[0][len("casadi_") :]), text
     )
     return "\n".join("  " + line for line in text.splitlines() if line.strip())
-
-
-def _kernel_text(name: str, kernel: Kernel) -> str:
-    function, (first, last) = kernel.function, kernel.members
-    targets = [f"out[{i}] =" for i in range(function.nnz_out(0))]
-    head = f"static void {name}("
-    return f"""\
-/* Segments {first} to {last - 1}. */
-{head}const double *x, const double *lam, const double *row,
-{" " * len(head)}const double *table, double *restrict out)
-{{
-{_statements(function, ("x", "lam", "row", "table"), targets)}
-    (void)x, (void)lam, (void)row, (void)table;
-}}
-"""
 
 
 def _ends_text(function: ca.Function) -> str:

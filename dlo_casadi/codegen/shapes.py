@@ -1,13 +1,21 @@
-"""What the compiled solver returns."""
+"""What the compiled solver takes and returns, and how the structures of its C lie in memory."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.errors import DloError, counted
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.ends import EndConditions
+
 FloatArray = NDArray[np.floating]
+Place = tuple[float, ...]
 
 # As in the header.
 STATUSES = (
@@ -21,6 +29,17 @@ STATUSES = (
     "other_branch",
     "turns_shed",
 )
+_BRANCHES = {None: 0, "ccw": 1, "cw": 2}
+# What to try, by the name of the status.
+_HINTS = {
+    "unreachable": "is the end in metres?",
+    "iteration_limit": "warm: the shape of a pose nearby.",
+    "not_finite": "finite numbers for start, end and directions.",
+    "unstable": "another branch, or a pose nearby.",
+    "bad_argument": "in space a pose without a branch, and orientations that are not zero.",
+    "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
+    "turns_shed": "fewer turns, or the end farther from the start.",
+}
 
 
 @dataclass(frozen=True)
@@ -99,3 +118,196 @@ class Slope:
     end_force: FloatArray
     moments: FloatArray
     min_bend_radius: FloatArray
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All within `radius` [m] of the segment from `a` to `b` [m]; a sphere where they agree."""
+
+    a: Place
+    b: Place
+    radius: float
+
+    @property
+    def ends(self) -> tuple[Place, Place]:
+        """As the C solver takes it."""
+        return self.a, self.b
+
+
+@dataclass(frozen=True)
+class HalfSpace:
+    """All behind the plane through `point` [m] across `normal`, which points out of it."""
+
+    point: Place
+    normal: Place
+    radius: ClassVar[float] = 0.0
+
+    @property
+    def ends(self) -> tuple[Place, Place]:
+        """As the C solver takes it."""
+        return self.point, self.normal
+
+
+Obstacle = Capsule | HalfSpace
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Where the cable comes nearest to obstacles.
+
+    Parameters
+    ----------
+    distance : float [m]
+        Between the surfaces; negative where the cable cuts in.
+    place : float
+        Arc length over length.
+    point, normal : (dimension,)
+        Of the cable's axis there [m], and away from the obstacle.
+    gradient : (4,) or (12,)
+        Of the distance by the columns of the slope; zeros without one.
+    obstacle : int
+        Which one.
+    """
+
+    distance: float
+    place: float
+    point: FloatArray
+    normal: FloatArray
+    gradient: FloatArray
+    obstacle: int
+
+
+class Records(NamedTuple):
+    """The structures of a solver's C: dlo_shape, dlo_slope, dlo_obstacle and dlo_gap.
+
+    Parameters
+    ----------
+    shape, slope, obstacle, gap : numpy.dtype
+    columns : int
+        Numbers of a pose by which dlo_slope has derivatives; in a plane not of the start's place.
+    """
+
+    shape: np.dtype[Any]
+    slope: np.dtype[Any]
+    obstacle: np.dtype[Any]
+    gap: np.dtype[Any]
+    columns: int
+
+
+def records_of(model: CableModel) -> Records:
+    """Layouts of the structures of a model's solver."""
+    node, points, nodes = model.node, model.n + 1, model.chain.n_nodes
+    d, turn = node.dimension, node.increment
+    k = 2 * turn + (2 * d if model.in_space else d)
+    shape = _record(
+        points=(float, (points, d)),
+        x=(float, (nodes, node.coordinates)),
+        start_force=(float, d),
+        end_force=(float, d),
+        moments=(float, (2, turn)),
+        energy=float,
+        min_bend_radius=float,
+        max_twist=float,
+        end_error=float,
+        imbalance=float,
+        iterations=np.intc,
+        turn=np.intc,
+    )
+    slope = _record(
+        points=(float, (points, d, k)),
+        rotations=(float, (nodes, turn, k)),
+        end_force=(float, (d, k)),
+        moments=(float, (2, turn, k)),
+        min_bend_radius=(float, k),
+    )
+    obstacle = _record(kind=np.intc, a=(float, d), b=(float, d), radius=float)
+    gap = _record(
+        distance=float,
+        place=float,
+        point=(float, d),
+        normal=(float, d),
+        gradient=(float, k),
+        obstacle=np.uintp,
+    )
+    return Records(shape, slope, obstacle, gap, k)
+
+
+def _record(**fields: Any) -> np.dtype[Any]:
+    return np.dtype({"names": list(fields), "formats": list(fields.values())}, align=True)
+
+
+def pose_size(model: CableModel) -> int:
+    """Numbers of dlo_pose: both ends, and in space the turns; headings count theirs themselves."""
+    return EndConditions.size(model.node) + int(model.in_space)
+
+
+def pose_table(
+    model: CableModel, poses: Sequence[Pose] | FloatArray, branch: object = None
+) -> tuple[FloatArray, int]:
+    """Poses (m, k) laid out as dlo_pose, and the C solver's number of their branch.
+
+    Parameters
+    ----------
+    poses : sequence of Pose, or (m, k)
+    branch : "ccw", "cw" or None
+        Of rows of numbers; a Pose has its own.
+
+    Raises
+    ------
+    DloError
+        If they are no poses of this cable, of several branches, or of an unknown one.
+    """
+    if isinstance(poses, np.ndarray):
+        size = pose_size(model)
+        if poses.ndim != 2 or poses.shape[1] != size:
+            raise DloError(
+                f"poses: an array (m, {size}) as dlo_pose in the C header belongs here, found "
+                f"{poses.shape}"
+            )
+        if poses.dtype.kind not in "fiu":
+            raise DloError(f"poses: real numbers belong in the array, found {poses.dtype}")
+        return np.ascontiguousarray(poses, float), _branch_number(branch)
+    if branch is not None:
+        raise DloError(f"branch {branch!r} is for poses in an array; a Pose names its own")
+    table = np.array([_row(model, pose) for pose in poses]).reshape(-1, pose_size(model))
+    numbers = {_branch_number(pose.branch) for pose in poses} or {0}
+    if len(numbers) > 1:
+        found = ", ".join(sorted({str(pose.branch) for pose in poses}))
+        raise DloError(f"poses of one branch belong in one call, found {found}\n  Try: two calls.")
+    return table, numbers.pop()
+
+
+def _branch_number(branch: object) -> int:
+    if branch is not None and not (isinstance(branch, str) and branch in _BRANCHES):
+        raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
+    return _BRANCHES[branch]
+
+
+def _row(model: CableModel, pose: object) -> FloatArray:
+    if not isinstance(pose, Pose):
+        raise DloError(f"a Pose belongs here, found {pose!r}\n  Try: dlo_casadi.Pose(start, end)")
+    if pose.end is None and model.end != "free":
+        raise DloError(
+            f"{pose.name}: the end of the cable is {model.end}: where is it?\n  Try: end"
+        )
+    d = model.node.dimension
+    for name, place in (("start", pose.start), ("end", pose.end)):
+        if place is not None and np.shape(place) != (d,):
+            raise DloError(f"{pose.name}: {name} must have {counted(d, 'number')}, found {place!r}")
+    try:
+        numbers = np.asarray([*pose.ends, pose.turns], float)
+    except (TypeError, ValueError):
+        raise DloError(f"numbers belong in a pose, found {pose!r}") from None
+    if len(numbers) != EndConditions.size(model.node) + 1:
+        raise DloError(f"{pose.name}: an orientation must have 4 numbers, found {pose!r}")
+    return numbers[: pose_size(model)]
+
+
+def no_equilibrium(status: str, pose: Pose, length: float) -> str:
+    """Message on a pose that ends in a status other than ok."""
+    start, end = (", ".join(f"{x:.4f}" for x in place or ()) for place in (pose.start, pose.end))
+    hint = _HINTS.get(status)
+    return (
+        f"no equilibrium: {status} with the end {f'at ({end}) m' if end else 'free'}, the start at "
+        f"({start}) m; the cable is {length:.4f} m long." + (f"\n  Try: {hint}" if hint else "")
+    )

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.space_ipopt import Ipopt
+from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.codegen.generate import generate, table_of
-from dlo_casadi.codegen.library import compile_library
-from dlo_casadi.codegen.poses import pose_table
-from dlo_casadi.codegen.records import shape_record
+from dlo_casadi.codegen.shapes import pose_table, records_of
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses, limited
@@ -269,7 +268,7 @@ class AnyCable:
         self._c.dlo_batch_with.argtypes = [
             *(pointer, pointer, size, ctypes.c_int, pointer, pointer, pointer, pointer, size)
         ]
-        self.record = shape_record(model)
+        self.record = records_of(model).shape
         self._work = np.empty(source.workspace)
 
     def table(self, problem: Problem | SpaceProblem) -> FloatArray:

@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.random_cables import SpaceProblem
 from benchmarks.speed import FLAGS, HERE, summary
 from dlo_casadi.codegen import CompiledSolver, generate
-from dlo_casadi.codegen.library import compile_library
-from dlo_casadi.codegen.poses import pose_table
-from dlo_casadi.codegen.records import shape_record
+from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.shapes import pose_table, records_of
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.cable_model import CableModel
@@ -117,7 +116,7 @@ class Timed:
 
     def bare(self, pose: Pose, which: int, warm: NDArray[np.void] | None) -> NDArray[np.void]:
         """Shape to which the bare method leads; zeros if it leads nowhere."""
-        out = np.zeros(1, shape_record(self.own.model))
+        out = np.zeros(1, records_of(self.own.model).shape)
         at, _ = pose_table(self.own.model, [pose])
         self._c.dlo_bare(
             *(at.ctypes.data, which, None if warm is None else warm.ctypes.data),
@@ -139,7 +138,7 @@ class Timed:
         warm: NDArray[np.void] | None,
         repeats: int,
     ) -> tuple[FloatArray, NDArray[np.void]]:
-        taken, out = np.zeros(repeats), np.zeros(1, shape_record(self.own.model))
+        taken, out = np.zeros(repeats), np.zeros(1, records_of(self.own.model).shape)
         at, _ = pose_table(self.own.model, [pose])
         for _ in range(2):  # the first round fills the caches
             clock(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from dlo_casadi.codegen import CompiledSolver, generate
-from dlo_casadi.codegen.library import compile_library
+from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.guesses import arc_headings
 from dlo_casadi.equilibrium.pose import Pose

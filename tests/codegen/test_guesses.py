@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.codegen import generate
-from dlo_casadi.codegen.library import compile_library
+from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.effects import Cable, ClampAngle, EndOffset, LengthError
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses

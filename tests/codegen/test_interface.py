@@ -7,7 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from dlo_casadi.codegen import STATUSES, CompiledSolver, generate, library, poses
+from dlo_casadi.codegen import STATUSES, CompiledSolver, generate, shapes
 from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, EndOffset, ImageScale
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -138,7 +138,7 @@ def test_small_workspace_and_wrong_branch(links, monkeypatch):
     assert shape.status == "workspace_too_small"
     assert all_zero(shape)
     monkeypatch.undo()
-    monkeypatch.setitem(poses._BRANCHES, "ccw", 7)
+    monkeypatch.setitem(shapes._BRANCHES, "ccw", 7)
     assert links.solve(at((0.5, 0.1), branch="ccw"), throw=False).status == "bad_argument"
 
 
@@ -372,7 +372,7 @@ def test_links_nothing_but_libm(tmp_path):
 
 
 def test_no_compiler_is_an_error_that_says_so(monkeypatch):
-    monkeypatch.setattr(library.shutil, "which", lambda name: None)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(DloError, match="no C compiler"):
         CompiledSolver(*cable())
 

@@ -7,24 +7,11 @@ import numpy as np
 import pytest
 
 from dlo_casadi.codegen import generate
-from dlo_casadi.codegen.records import (
-    gap_record,
-    obstacle_record,
-    pose_size,
-    shape_record,
-    slope_record,
-)
+from dlo_casadi.codegen.shapes import pose_size, records_of
 from dlo_casadi.effects import Cable
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
-
-RECORDS = {
-    "shape": shape_record,
-    "slope": slope_record,
-    "obstacle": obstacle_record,
-    "gap": gap_record,
-}
 
 
 @pytest.mark.parametrize("gravity", [(0.0, -9.81), (0.0, 0.0, -9.81)], ids=["plane", "space"])
@@ -32,7 +19,8 @@ def test_every_field_is_where_the_compiler_puts_it(tmp_path, gravity):
     cable = Cable(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011 if len(gravity) == 3 else None)
     model = CableModel(cable, 5, "arc", "clamped", "clamped", gravity)
     generate(model, model.nominal, np.zeros(model.chain.n_rests)).write(tmp_path)
-    records = {name: record(model) for name, record in RECORDS.items()}
+    records = records_of(model)._asdict()
+    del records["columns"]
     lines = ['printf("%zu\\n", sizeof(dlo_pose) / sizeof(double));']
     expected = [pose_size(model)]
     for name, record in records.items():

@@ -18,8 +18,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 from benchmarks import memory
 
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate
-from dlo_casadi.codegen.library import compile_library
-from dlo_casadi.codegen.space import coarse_elements
+from dlo_casadi.codegen.cases import case_of
+from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, LumpedMass, PointForce
 from dlo_casadi.equilibrium.guesses import guessed_frames
 from dlo_casadi.equilibrium.pose import Pose
@@ -496,7 +496,7 @@ def test_links_nothing_but_libm(tmp_path):
 
 
 def test_the_coarse_mesh_is_never_finer_than_the_fine_one():
-    found = [coarse_elements(problem(n=n)[0]) for n in (2, 4, 12, 30, 1000)]
+    found = [case_of(*problem(n=n), inline=True).coarse_elements for n in (2, 4, 12, 30, 1000)]
     assert found == [2, 4, 6, 15, 500]
 
 

@@ -1,0 +1,231 @@
+"""What differs between the solver of a cable in a plane and of one in space."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.codegen.kernels import Kernels, kernels_of
+from dlo_casadi.equilibrium.guesses import resting_headings
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
+
+FloatArray = NDArray[np.floating]
+
+
+def template(name: str) -> str:
+    """Text of a template."""
+    return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
+
+
+def case_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> Case:
+    """What the templates of this cable are filled with."""
+    kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
+    return kind(model, p, rest, inline)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What the templates are filled with: the cable's numbers, and words of its kind.
+
+    `name` begins the names of its templates, `try_steps` are Newton steps for a part of a path.
+    """
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    inline: bool
+    name: ClassVar[str]
+    try_steps: ClassVar[int]
+
+    @cached_property
+    def meshes(self) -> dict[str, Kernels]:
+        """Kernels of its meshes by their names in C, the cable's own first."""
+        return {"kernel": kernels_of(self.model, self.p, self.rest, self.inline)}
+
+    @property
+    def numbers(self) -> list[float]:
+        """Numbers that no kernel holds, in the order of the template's macros."""
+        raise NotImplementedError
+
+    @property
+    def values(self) -> dict[str, int | str]:
+        """What the marks of the templates stand for."""
+        raise NotImplementedError
+
+    @property
+    def table(self) -> list[float]:
+        """Numbers of the kernels of all meshes, then the others."""
+        rows = [number for kernels in self.meshes.values() for number in kernels.table]
+        return [*rows, *self.numbers]
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Parts of the templates by their marks."""
+        text = template(f"{self.name}_words.in")
+        _, *parts = re.split(r"^@([A-Z_]+)@\n", text, flags=re.MULTILINE)
+        return {mark: part[:-1] for mark, part in zip(parts[::2], parts[1::2], strict=True)}
+
+    @property
+    def lagrangian(self) -> Lagrangian:
+        """Expressions of the model."""
+        return lagrangian_of(self.model)
+
+    @property
+    def length(self) -> float:
+        """True length of the cable [m]."""
+        return float(self.lagrangian.held(self.p, 0, 0)[1])
+
+    @property
+    def load(self) -> FloatArray:
+        """Sum of the dead loads [N]."""
+        return np.array(functions_of(self.model).dead_load(self.p)).ravel()
+
+
+class _PlaneCase(Case):
+    """A cable in a plane."""
+
+    name, try_steps = "plane", 13
+    # Doubles of a workspace per node, as in the template: arrays, border, segments of two points.
+    doubles = 12 + 2 + 2 * 15
+
+    @property
+    def numbers(self) -> list[float]:
+        model, chain, gravity = self.model, self.model.chain, self.model.gravity
+        offsets, _ = self.lagrangian.held(self.p, 0, 0)
+        stretch = self.length / model.cable.length
+        return [
+            self.length,
+            float(np.arctan2(gravity[1], gravity[0])) if any(gravity) else 0.0,
+            *self.load,
+            *np.array(offsets).ravel()[2:],
+            *(1 / c if c > 0 else 0.0 for c in self.compliances),
+            *(chain.places / model.cable.length),
+            *resting_headings(chain, self.rest),
+            *(1 / (np.diff(chain.cells, axis=1).ravel() * stretch)),
+        ]
+
+    @property
+    def compliances(self) -> list[float]:
+        """Turn of the start and end clamp per moment on it [rad/(N m)]."""
+        turns = np.array(self.lagrangian.compliances(self.p)).ravel()
+        found = zip(self.lagrangian.compliant, turns, strict=True)
+        named = {self.model.condition_names[k]: float(c) for k, c in found}
+        return [named.get(f"{side}_heading", 0.0) for side in ("start", "end")]
+
+    @property
+    def values(self) -> dict[str, int | str]:
+        model, chain, kernels = self.model, self.model.chain, self.meshes["kernel"]
+        count, gives = chain.n_nodes, [c > 0 for c in self.compliances]
+        # Each first guess is descended from freely, then led by springs in 15 stages; a descent
+        # takes 100 steps, and 6 more off saddles. The template checks the number.
+        guesses = 5 if (model.start, model.end) == ("pinned", "pinned") else 4
+        return {
+            "WORKSPACE": self.doubles * (count + 1),
+            "ELEMENTS": chain.n_segments,
+            "FIRST": chain.layout.advancing[0],
+            "LOW": model.start == "clamped" and not gives[0],
+            "HIGH": count - (model.end == "clamped" and not gives[1]),
+            "GIVES_START": gives[0],
+            "GIVES_END": gives[1],
+            # Elimination and solution: about 30 operations a node; the trial point, too.
+            "OPERATIONS": 2 * kernels.operations + 30 * count,
+            "STEPS": (1 + 16 * guesses) * (100 + 6),
+            "HOLDERS": "" if kernels.ends is None else "    add_ends(q, w->table);",
+        }
+
+
+class _SpaceCase(Case):
+    """A cable in space."""
+
+    name, try_steps = "space", 12
+    # Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
+    doubles, coarse_shapes = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 8
+    # Fewest arcs of the coarse mesh, and elements of the fine one in each of them. Of 3,000 random
+    # clamped problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than if all
+    # first guesses are followed on the fine mesh.
+    least_coarse, coarsening = 6, 2.0
+
+    @property
+    def coarse_elements(self) -> int:
+        """Arcs of the mesh on which first guesses are followed; 0 where that is the mesh itself."""
+        model = self.model
+        count = min(model.n, max(self.least_coarse, round(model.n / self.coarsening)))
+        itself = count == model.n and model.element == "arc"
+        return 0 if model.end == "free" or itself else count
+
+    @cached_property
+    def meshes(self) -> dict[str, Kernels]:
+        found = super().meshes
+        if found["kernel"].ends is not None or self.lagrangian.compliant:
+            raise DloError(
+                "no solver can be generated for a cable in space whose ends are held by springs, "
+                "or by clamps that give way\n"
+                "  Try: dlo predict, or dlo_casadi.predict, which know them."
+            )
+        if not self.coarse_elements:
+            return found
+        coarse = self.model.with_mesh(self.coarse_elements, "arc")
+        # Rest strains of the coarse cells: means of those of the fine ones.
+        (low, high), (start, end) = self.model.chain.cells.T, coarse.chain.cells.T[..., None]
+        inside = np.minimum(high, end) - np.maximum(low, start)
+        shares = np.clip(inside, 0.0, None) / (end - start)
+        parts = np.split(self.rest, len(self.model.node.strains))
+        rest = np.concatenate([shares @ part for part in parts])
+        return found | {"coarse_kernel": kernels_of(coarse, self.p, rest, self.inline)}
+
+    @property
+    def clamps(self) -> FloatArray:
+        """End's offset ahead (3,), and frames (8,) of the true clamps in the declared ones."""
+
+        def held(frames: FloatArray) -> FloatArray:
+            ends = np.concatenate([np.zeros(6), frames.ravel()])
+            return np.array(self.lagrangian.held(self.p, ends, 0)[0]).ravel()
+
+        found = held(np.tile(self.model.node.identity, 2))
+        anywhere = np.random.default_rng(0).normal(size=(2, 4))
+        anywhere /= np.linalg.norm(anywhere, axis=1)[:, None]
+        turns = Rotation.from_quat(found[6:].reshape(2, 4))
+        expected = (Rotation.from_quat(anywhere) * turns).as_quat()
+        turned = held(anywhere)[6:].reshape(2, 4)
+        if np.abs(np.abs((turned * expected).sum(axis=1)) - 1).max() > 1e-12:
+            raise DloError(
+                "no solver can be generated: an effect moves the clamps in another way than about "
+                "their own axes\n  Try: dlo predict, or dlo_casadi.predict, which know it."
+            )
+        return found[3:]
+
+    @property
+    def numbers(self) -> list[float]:
+        model, chain = self.model, self.model.chain
+        bends = chain.curvatures(self.rest) * np.diff(chain.cells, axis=1).ravel()
+        length = self.length
+        first = [length, length / model.n, *model.gravity]
+        return [*first, *self.load, *self.clamps, *bends.T.ravel()]
+
+    @property
+    def values(self) -> dict[str, int | str]:
+        n, coarse = self.model.n, self.coarse_elements
+        # Each first guess is descended from on the coarse mesh, from its minimum on the fine mesh,
+        # and should all that be in vain, on the fine mesh from the start; a descent takes 80
+        # steps. The template checks the number.
+        guesses = 3 if self.model.end == "free" else 8
+        return {
+            "WORKSPACE": self.doubles * (n + 2) + 4 * self.coarse_shapes * (coarse + 1),
+            "COARSE": coarse,
+            "FIRST": 0,
+            "GIVES_START": 0,
+            "GIVES_END": 0,
+            # Elimination and solution: about 500 operations a node.
+            "OPERATIONS": self.meshes["kernel"].operations + 500 * (n + 1),
+            "STEPS": (1 + 3 * guesses) * 80,
+        }
