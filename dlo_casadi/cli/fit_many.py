@@ -11,8 +11,9 @@ from dlo_casadi.cli.counter import Counter
 from dlo_casadi.cli.guard import BAD_INPUT, OK
 from dlo_casadi.cli.options import add_jobs, command, console, parsed, print_json
 from dlo_casadi.errors import counted
-from dlo_casadi.fleet import FleetResult, Options, find_sessions, fit_fleet
-from dlo_casadi.fleet.outliers import judge
+from dlo_casadi.fleet.discover import find_sessions
+from dlo_casadi.fleet.overview import judge
+from dlo_casadi.fleet.run import FleetResult, Options, fit_fleet
 from dlo_casadi.io.files import make_folder
 from dlo_casadi.runtime.parallel import open_executor
 

@@ -14,10 +14,9 @@ from dlo_casadi.cli.options import add_jobs, add_parameters, command, console, p
 from dlo_casadi.cli.predict import plain_numbers
 from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet.shape_poses import Grid, PoseList, Poses
-from dlo_casadi.fleet.shape_solve import Plan
-from dlo_casadi.fleet.shape_table import shape_table
-from dlo_casadi.fleet.store import parquet_library
+from dlo_casadi.fleet.rows import parquet_library
+from dlo_casadi.fleet.shape_poses import Grid, PoseList
+from dlo_casadi.fleet.shape_table import Plan, shape_table
 from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import open_executor
@@ -74,7 +73,7 @@ def main(argv: Sequence[str]) -> int:
     parquet_library()
     model, p, rest, metadata = with_mesh(cable, chosen)
     fixed, needed = _ends(cable, chosen.start, chosen.start_heading, chosen.end_heading)
-    poses: Poses
+    poses: Grid | PoseList
     if chosen.grid is not None:
         poses = _grid(model, chosen.grid, fixed, needed)
     else:

@@ -56,10 +56,14 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
     folder = Path(text)
     if os.path.isdir(folder):
         base = folder.resolve()
-        found = [path for path in _yaml_files(base) if _is_session(path)]
+        found = []
+        for inner, folders, names in os.walk(base):
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            paths = [Path(inner, name) for name in names if name.lower().endswith(ENDINGS)]
+            found += [path for path in paths if _is_session(path)]
     else:
-        paths = {Path(name).resolve() for name in glob.glob(text, recursive=True)}
-        found = [path for path in paths if path.is_file()]
+        named = {Path(name).resolve() for name in glob.glob(text, recursive=True)}
+        found = [path for path in named if path.is_file()]
         base = Path(os.path.commonpath([path.parent for path in found])) if found else folder
     if not found:
         raise DloError(
@@ -69,15 +73,6 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
     keys = [well_formed(path.relative_to(base).as_posix()) for path in found]
     sessions = sorted(map(Session, keys, found))
     return base, tuple(sessions)
-
-
-def _yaml_files(base: Path) -> list[Path]:
-    """All YAML files below a folder, none in hidden folders."""
-    found = []
-    for folder, inner, names in os.walk(base):
-        inner[:] = sorted(name for name in inner if not name.startswith("."))
-        found += [Path(folder, name) for name in names if name.lower().endswith(ENDINGS)]
-    return found
 
 
 def _is_session(path: Path) -> bool:
@@ -102,8 +97,14 @@ def digest_of(session: Session, options: tuple[Any, ...]) -> str:
         digest.update(content)
 
     add(repr((__version__, options)).encode())
+    try:
+        poses = read_yaml(session.path)["experiment"]["poses"]
+        named = [name for pose in poses for name in (pose.get("file"), *(pose.get("files") or ()))]
+        names = [str(name) for name in named if name is not None]
+    except (DloError, KeyError, TypeError, AttributeError):
+        names = []  # a configuration that cannot be read
     add(_content(session.path))
-    for name in _data_files(session.path):
+    for name in names:
         add(well_formed(name).encode())
         add(_content(session.path.parent / name))
     return digest.hexdigest()
@@ -116,12 +117,3 @@ def _content(path: Path) -> bytes:
             return hashlib.file_digest(stream, "sha256").digest()
     except (OSError, ValueError):  # a name that no file can have is a ValueError
         return b""
-
-
-def _data_files(path: Path) -> list[str]:
-    """Names of the poses' files as written, none where the configuration cannot be read."""
-    try:
-        poses = read_yaml(path)["experiment"]["poses"]
-        return [str(pose["file"]) for pose in poses if "file" in pose]
-    except (DloError, KeyError, TypeError):
-        return []

@@ -1,52 +1,118 @@
-"""The page of a fleet: one row per session, the odd ones first. Self-contained, no script."""
+"""Which sessions are unlike the others, and the page that shows these first."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from html import escape
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import quote
+
+import numpy as np
 
 from dlo_casadi import __version__
 from dlo_casadi.errors import counted
-from dlo_casadi.fleet.columns import Row, last_error
-from dlo_casadi.fleet.outliers import OUTLYING, Judged, judge
+from dlo_casadi.fleet.rows import Row, last_error
 
-STYLE = """
-:root { color-scheme: light dark; --line: #8884; --odd: #c0392b; --good: #2c7a4b; }
-body { font: 15px/1.45 system-ui, sans-serif; }
-body { margin: 2rem auto; max-width: 80rem; padding: 0 1rem; }
-h1 { font-size: 1.4rem; margin: 0 0 .3rem; } p { margin: .3rem 0 1rem; max-width: 60rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: .3rem .6rem; text-align: right; border-bottom: 1px solid var(--line); }
-td { white-space: nowrap; vertical-align: top; } th { vertical-align: bottom; }
-.text { text-align: left; } .long { white-space: normal; min-width: 11rem; }
-.odd { color: var(--odd); font-weight: 600; } .good { color: var(--good); }
-pre { white-space: pre-wrap; margin: 0; font: inherit; }
-"""
+if TYPE_CHECKING:
+    from jinja2 import Template
 
-# Of a session whose diagnosis was switched off.
-UNDIAGNOSED = "not diagnosed"
+# Beyond it a value is called an outlier (Iglewicz and Hoaglin, 1993).
+OUTLYING = 3.5
+# With fewer sessions nothing is unlike the others.
+FEWEST = 5
+# A z-score where all others are equal to the last digit.
+LARGEST = 99.0
 
-HEAD = (
-    ("session", "text"),
-    ("verdict", "text"),
-    ("what is odd", "text"),
-    ("EI [N m²]", ""),
-    ("95 %", ""),
-    ("z of EI", ""),
-    ("error [mm]", ""),
-    ("z of error", ""),
-    ("noise std [mm]", ""),
-    ("effects", "text"),
-    ("time [s]", ""),
-)
+
+@dataclass(frozen=True)
+class Judged:
+    """A row and what is odd about it.
+
+    Parameters
+    ----------
+    row : dict
+    stiffness_z, error_z : float or None
+        Robust z-scores of log EI and of the log of the last stage's error.
+    """
+
+    row: Row
+    stiffness_z: float | None
+    error_z: float | None
+
+    @property
+    def error(self) -> float | None:
+        """Error of the last stage [m]."""
+        return last_error(self.row)
+
+    @property
+    def verdict(self) -> str:
+        """The diagnosis's, or why there is none."""
+        row = self.row
+        return str(
+            (row["verdict"] or "not diagnosed") if row["status"] == "done" else row["status"]
+        )
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why to look at it first; empty if nothing is odd."""
+        if self.row["status"] != "done":
+            return (self.verdict,)
+        stiffness, error = self.stiffness_z or 0.0, self.error_z or 0.0
+        reasons = {
+            "unexplained": self.verdict == "unexplained",
+            "stiffer": stiffness > OUTLYING,
+            "softer": stiffness < -OUTLYING,
+            # Flag only large errors as outliers, never small ones.
+            "larger error": error > OUTLYING,
+        }
+        return tuple(text for text, holds in reasons.items() if holds)
+
+    @property
+    def order(self) -> tuple[bool, bool, bool, float, str]:
+        """Place in a list that begins with the oddest."""
+        return (
+            self.row["status"] == "done",
+            "unexplained" not in self.reasons,
+            not self.reasons,
+            -max(abs(self.stiffness_z or 0.0), self.error_z or 0.0),
+            str(self.row["session"]),
+        )
+
+
+def judge(rows: Sequence[Row]) -> list[Judged]:
+    """All rows, the oddest first: failed, unexplained, outlying, then the others by score."""
+    measures = [row["bending_stiffness"] for row in rows], [last_error(row) for row in rows]
+    scores = [
+        robust_z([None if x is None or x <= 0 else float(np.log(x)) for x in values])
+        for values in measures
+    ]
+    return sorted(map(Judged, rows, *scores), key=lambda item: item.order)
+
+
+def robust_z(values: Sequence[float | None]) -> list[float | None]:
+    """Modified z-scores: z = 0.6745 (x - median) / median |x - median|.
+
+    None where there is no value, and everywhere if there are fewer than five values.
+
+    References
+    ----------
+    Iglewicz and Hoaglin, How to detect and handle outliers, 1993.
+    """
+    known = np.array(values, dtype=float)
+    if np.isfinite(known).sum() < FEWEST:
+        return [None] * len(values)
+    away = known - np.nanmedian(known)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scores = 0.6745 * away / np.nanmedian(np.abs(away))
+    scores = np.clip(np.where(away == 0, 0.0, scores), -LARGEST, LARGEST)
+    return [None if np.isnan(score) else float(score) for score in scores]
 
 
 def overview_html(rows: Sequence[Row], output: Path) -> str:
-    """The page as text.
+    """The page of a fleet as text: one row per session; self-contained, without a script.
 
     Parameters
     ----------
@@ -55,87 +121,36 @@ def overview_html(rows: Sequence[Row], output: Path) -> str:
         Folder in which the page will lie; sessions with results in it are linked.
     """
     judged = judge(rows)
-    head = "".join(f'<th class="{kind}">{escape(text)}</th>' for text, kind in HEAD)
-    body = "\n".join(_line(item, output) for item in judged)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{counted(len(rows), 'session')}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<h1>{counted(len(rows), 'session')}</h1>\n<p>{escape(_summary(judged))}</p>\n"
-        f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody>\n</table></div>\n"
-        "<p>Error: root mean square distance of the measured centre-lines from the prediction of "
-        "the last stage, of held-out poses where there are any. z: distance from the median of "
-        "all sessions, on a logarithmic scale, in robust standard deviations; beyond "
-        f"{OUTLYING:g} it is called an outlier. All numbers: table.parquet.</p>\n"
-        f"<p>dlo_casadi {escape(__version__)}</p>\n</body>\n</html>\n"
-    )
-
-
-def _summary(judged: Sequence[Judged]) -> str:
-    verdicts = Counter(
-        item.row["verdict"] or UNDIAGNOSED if item.row["status"] == "done" else item.row["status"]
-        for item in judged
-    )
-    counts = ", ".join(f"{n} {str(name).replace('_', ' ')}" for name, n in verdicts.most_common())
+    verdicts = Counter(item.verdict for item in judged)
+    counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in verdicts.most_common())
     odd = sum(bool(item.reasons) for item in judged)
-    return f"{counts or 'nothing is finished yet'}. {odd} to look at first."
-
-
-def _line(item: Judged, output: Path) -> str:
-    row = item.row
-    name = _link(row, output)
-    odd = f'<span class="odd">{escape(", ".join(item.reasons))}</span>' if item.reasons else ""
-    if row["status"] != "done":
-        text = f'<pre class="odd">{escape(str(row["message"]))}</pre>'
-        return (
-            f'<tr><td class="text long">{name}</td><td></td><td class="text">{odd}</td>'
-            f'<td class="text long" colspan="{len(HEAD) - 3}">{text}</td></tr>'
-        )
-    verdict = str(row["verdict"] or UNDIAGNOSED)
-    error = last_error(row)
-    cells = (
-        ("text long", name),
-        ("text good" if verdict == "complete" else "text", escape(verdict.replace("_", " "))),
-        ("text", odd),
-        ("", _number(row["bending_stiffness"], "{:.4g}")),
-        ("", _interval(row)),
-        (_score(item.stiffness_z), _number(item.stiffness_z, "{:+z.1f}")),
-        ("", _number(error, "{:.2f}", 1e3)),
-        (_score(max(item.error_z or 0.0, 0.0)), _number(item.error_z, "{:+z.1f}")),
-        ("", _number(row["noise_std"], "{:.2f}", 1e3)),
-        ("text long", escape(", ".join(_effect(effect) for effect in row["effects"]))),
-        ("", _number(row["time_session_s"], "{:.1f}")),
+    return _template().render(
+        title=counted(len(rows), "session"),
+        summary=f"{counts or 'nothing is finished yet'}. {odd} to look at first.",
+        judged=[(item, _link(item.row, output)) for item in judged],
+        outlying=OUTLYING,
+        version=__version__,
     )
-    return "<tr>" + "".join(f'<td class="{kind}">{text}</td>' for kind, text in cells) + "</tr>"
 
 
-def _link(row: Row, output: Path) -> str:
+@cache
+def _template() -> Template:
+    # Workers, which import this room, draw no page.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("dlo_casadi.fleet"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template("overview.html")
+
+
+def _link(row: Row, output: Path) -> str | None:
     """The session's page: of its results, or of why there are none."""
-    key = str(row["session"])
-    text = escape(key).replace("/", "/<wbr>")
     for name in ("report.html", "report.json") if row["status"] == "done" else ("failed.html",):
-        if (output / "sessions" / key / name).is_file():
-            return f'<a href="{quote(f"sessions/{key}/{name}")}">{text}</a>'
-    return text
-
-
-def _number(value: float | None, form: str, factor: float = 1.0) -> str:
-    return "" if value is None else form.format(factor * value)
-
-
-def _interval(row: Row) -> str:
-    if not row["identifiable"]:
-        return '<span class="odd">not determined</span>'
-    low, high = row["bending_stiffness_low_95"], row["bending_stiffness_high_95"]
-    return f"{_number(low, '{:.4g}')} to {_number(high, '{:.4g}')}"
-
-
-def _score(z: float | None) -> str:
-    return "odd" if z is not None and abs(z) > OUTLYING else ""
-
-
-def _effect(effect: Row) -> str:
-    """Name of an effect, and of what it cannot be told from."""
-    rivals = effect["indistinguishable_from"]
-    return str(effect["name"]) + (f" (or {', '.join(rivals)})" if rivals else "")
+        if (output / "sessions" / row["session"] / name).is_file():
+            return quote(f"sessions/{row['session']}/{name}")
+    return None

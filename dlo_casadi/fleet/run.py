@@ -3,23 +3,51 @@
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
-from dlo_casadi.fleet.columns import Row, empty_row
+from dlo_casadi.config import load_config
+from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.fleet.discover import Session, digest_of
-from dlo_casadi.fleet.one import Job, Options, fit_one
 from dlo_casadi.fleet.overview import overview_html
-from dlo_casadi.fleet.store import parquet_library, read_row, write_row, write_table
+from dlo_casadi.fleet.rows import (
+    Row,
+    empty_row,
+    parquet_library,
+    read_row,
+    row_of,
+    write_row,
+    write_table,
+)
 from dlo_casadi.io.files import make_folder, only_run, write_file
+from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.runtime.executors import worker_log
 from dlo_casadi.runtime.parallel import Tally, map_as_completed
+from dlo_casadi.session import run_session
 
 PAGE = "index.html"
 # The table is folded anew after so many seconds, and at most for this share of the time.
 FOLD_AFTER = 10.0
 FOLD_SHARE = 0.02
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is done with each session.
+
+    Parameters
+    ----------
+    diagnosis : bool
+        Whether missing effects are searched for, where the configuration does not forbid it.
+    reports : bool
+        Whether each session gets its folder of results.
+    """
+
+    diagnosis: bool = True
+    reports: bool = True
 
 
 @dataclass(frozen=True)
@@ -85,58 +113,110 @@ def fit_fleet(
     parquet_library()
     options = options or Options()
     output = output.resolve()
+    kept = ("done",) if retry_failed else ("done", "failed")
+    rows: dict[str, Row] = {}
+    jobs = []
+    next_fold = time.perf_counter() + FOLD_AFTER
+
+    def fold() -> None:
+        """Write table and page from time to time, for a small share of it."""
+        nonlocal next_fold
+        begun = time.perf_counter()
+        write_table(output, rows.values())
+        write_file(output / PAGE, overview_html(list(rows.values()), output))
+        end = time.perf_counter()
+        next_fold = end + max(FOLD_AFTER, (end - begun) / FOLD_SHARE)
+
     with only_run(output):
         make_folder(output / "rows")
-        digests = {session.key: digest_of(session, astuple(options)) for session in sessions}
-        rows: dict[str, Row] = {}
         for session in sessions:
-            row = read_row(output, session.key, digests[session.key])
-            if row is None or row["status"] == "lost":
-                continue
-            if row["status"] == "done" or not retry_failed:
+            job = Job(session, digest_of(session, astuple(options)), output, options)
+            row = read_row(output, session.key, job.digest)
+            if row is not None and row["status"] in kept:
                 rows[session.key] = row
-        jobs = [
-            Job(session, digests[session.key], output, options)
-            for session in sessions
-            if session.key not in rows
-        ]
-        for job in jobs:
-            make_folder(job.folder.parent)
+            else:
+                jobs.append(job)
+                make_folder(job.folder.parent)
         taken_over = len(rows)
         begin(taken_over, len(jobs))
-        folding = _Folding(output)
         try:
             for done in map_as_completed(executor, fit_one, jobs, progress=progress):
-                job = done.item
-                if done.result is None:
-                    row = empty_row(job.session.key, job.digest, "lost", str(done.error), 0.0)
+                key, row = done.item.session.key, done.result
+                if row is None:
+                    row = empty_row(key, done.item.digest, "lost", str(done.error), 0.0)
                     write_row(output, row)
-                else:
-                    row = done.result
-                rows[job.session.key] = row
-                folding.maybe(rows)
+                rows[key] = row
+                if time.perf_counter() > next_fold:
+                    fold()
         finally:
-            folding.now(rows)
-    ordered = tuple(rows[key] for key in sorted(rows))
-    return FleetResult(ordered, taken_over, output)
+            fold()
+    return FleetResult(tuple(rows[key] for key in sorted(rows)), taken_over, output)
 
 
-class _Folding:
-    """Writes table and page from time to time, for a small share of it."""
+@dataclass(frozen=True)
+class Job:
+    """One session to fit, with all that a worker must know.
 
-    def __init__(self, output: Path) -> None:
-        self._output = output
-        self._next = time.perf_counter() + FOLD_AFTER
+    Parameters
+    ----------
+    session : Session
+    digest : str
+        Of what decides the results.
+    output : Path
+        Folder of all results, absolute.
+    options : Options
+    """
 
-    def maybe(self, rows: dict[str, Row]) -> None:
-        """Fold if it is time."""
-        if time.perf_counter() > self._next:
-            self.now(rows)
+    session: Session
+    digest: str
+    output: Path
+    options: Options
 
-    def now(self, rows: dict[str, Row]) -> None:
-        """Fold."""
-        begin = time.perf_counter()
-        write_table(self._output, rows.values())
-        write_file(self._output / PAGE, overview_html(list(rows.values()), self._output))
-        end = time.perf_counter()
-        self._next = end + max(FOLD_AFTER, (end - begin) / FOLD_SHARE)
+    @property
+    def folder(self) -> Path:
+        """The session's own results: named after its file, so that no two can meet."""
+        return self.output / "sessions" / self.session.key
+
+    def __repr__(self) -> str:
+        return self.session.key
+
+
+def fit_one(job: Job) -> Row:
+    """Fit a session and write its results, at last its row; a failure is a row with a message.
+
+    Raises
+    ------
+    OutputError
+        If the results or the row cannot be written: that is no property of the session.
+    """
+    begin, key = time.perf_counter(), job.session.key
+    try:
+        row = _fitted(job, begin)
+    except OutputError:
+        raise
+    except Exception as error:
+        message = str(error)
+        if not isinstance(error, DloError):
+            worker_log(None).error("bug in %s:\n%s", key, traceback.format_exc())
+            message = f"a bug: {type(error).__name__}: {error}; see the worker's log"
+        row = empty_row(key, job.digest, "failed", message, time.perf_counter() - begin)
+    write_row(job.output, row)
+    return row
+
+
+def _fitted(job: Job, begin: float) -> Row:
+    config = load_config(job.session.path)
+    if not job.options.diagnosis:
+        diagnosis = config.diagnosis.model_copy(update={"enabled": False})
+        config = replace(config, diagnosis=diagnosis)
+    if job.options.reports:
+        # It brings the libraries that draw; without figures a worker starts in half the time.
+        from dlo_casadi.report.writer import ResultsFolder
+
+        with ResultsFolder(job.folder, config) as folder:
+            outcome = run_session(config)
+            folder.write(outcome)
+    else:
+        outcome = run_session(config)
+    seconds = time.perf_counter() - begin
+    return row_of(job.session.key, job.digest, config.cable.name, report_dict(outcome), seconds)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +19,6 @@ FloatArray = NDArray[np.floating]
 COLUMNS = ("start_x", "start_y", "end_x", "end_y", "start_heading", "end_heading")
 # The same in the header of a list.
 HEADER = tuple(f"{name}_rad" if name.endswith("heading") else f"{name}_m" for name in COLUMNS)
-
-
-class Poses(Protocol):
-    """Poses in their order."""
-
-    @property
-    def count(self) -> int:
-        """How many there are."""
-
-    @property
-    def identity(self) -> Mapping[str, Any]:
-        """What decides them, as plain data."""
-
-    def chunks(self, size: int) -> Iterator[FloatArray]:
-        """Arrays (size, 6) with the columns COLUMNS; the last may be shorter."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +39,7 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name, (first, last, number) in (("X", self.x), ("Y", self.y)):
-            if number < 1 or number != int(number) or not np.all(np.isfinite([first, last])):
+            if number < 1 or number % 1 or not np.isfinite([first, last]).all():
                 raise DloError(
                     f"--grid: {name}0 {name}1 N{name} are two finite numbers [m] and a whole "
                     f"number of places, found {first:g} {last:g} {number:g}"
@@ -107,7 +92,7 @@ class PoseList:
 
     def __post_init__(self) -> None:
         try:
-            names = self._reader()[0]
+            names = self._data.schema.names
         except (OSError, ValueError) as error:
             raise DloError(f"--list {self.path}: {error}") from None
         missing = [name for name in self.needed if name not in names]
@@ -122,13 +107,8 @@ class PoseList:
 
     @property
     def count(self) -> int:
-        """How many there are; of a CSV the number of its lines."""
-        if self._is_parquet:
-            import pyarrow.parquet as pq
-
-            return int(pq.read_metadata(self.path).num_rows)
-        with self.path.open("rb") as stream:
-            return max(sum(1 for line in stream if line.strip()) - 1, 0)
+        """How many there are."""
+        return int(self._data.count_rows())
 
     @property
     def identity(self) -> Mapping[str, Any]:
@@ -138,46 +118,31 @@ class PoseList:
         return {"list_sha256": digest, "fixed": dict(self.fixed)}
 
     @property
-    def _is_parquet(self) -> bool:
-        return self.path.suffix.lower() == ".parquet"
+    def _data(self) -> Any:
+        from pyarrow import csv, dataset, float64
 
-    def _reader(self) -> tuple[list[str], Any]:
-        """Names of the columns, and an iterator of record batches."""
-        if self._is_parquet:
-            import pyarrow.parquet as pq
-
-            file = pq.ParquetFile(self.path)
-            return file.schema_arrow.names, file.iter_batches()
-        import pyarrow as pa
-        from pyarrow import csv
-
-        types = csv.ConvertOptions(column_types=dict.fromkeys(HEADER, pa.float64()))
-        reader = csv.open_csv(self.path, convert_options=types)
-        return reader.schema.names, reader
+        types = csv.ConvertOptions(column_types=dict.fromkeys(HEADER, float64()))
+        comma = dataset.CsvFileFormat(convert_options=types)
+        is_parquet = self.path.suffix.lower() == ".parquet"
+        return dataset.dataset(self.path, format="parquet" if is_parquet else comma)
 
     def chunks(self, size: int) -> Iterator[FloatArray]:
         """Arrays (size, 6); the last may be shorter."""
-        held: list[FloatArray] = []
+        held = np.zeros((0, len(COLUMNS)))
         try:
-            for batch in self._reader()[1]:
-                held.append(self._poses(batch))
-                while sum(map(len, held)) >= size:
-                    joined = np.concatenate(held)
-                    yield joined[:size]
-                    held = [joined[size:]]
+            for batch in self._data.to_batches():
+                poses = _fixed(batch.num_rows, self.fixed)
+                for name in batch.schema.names:
+                    column = batch.column(name).cast("float64")
+                    poses[:, HEADER.index(name)] = column.to_numpy(zero_copy_only=False)
+                held = np.concatenate([held, poses])
+                while len(held) >= size:
+                    yield held[:size]
+                    held = held[size:]
         except (OSError, ValueError) as error:
             raise DloError(f"--list {self.path}: {error}") from None
-        rest = np.concatenate(held) if held else np.zeros((0, len(COLUMNS)))
-        if len(rest):
-            yield rest
-
-    def _poses(self, batch: Any) -> FloatArray:
-        poses = _fixed(batch.num_rows, self.fixed)
-        for k, name in enumerate(HEADER):
-            if name in batch.schema.names:
-                column = batch.column(batch.schema.names.index(name))
-                poses[:, k] = column.cast("float64").to_numpy(zero_copy_only=False)
-        return poses
+        if len(held):
+            yield held
 
 
 def _fixed(count: int, fixed: Mapping[str, float]) -> FloatArray:

@@ -1,4 +1,4 @@
-"""All chunks, in any order, on any executor, into one file in the order of the poses."""
+"""Shapes of a fitted cable in very many poses: chunks on any executor, in one file at the end."""
 
 from __future__ import annotations
 
@@ -7,28 +7,87 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import __version__
-from dlo_casadi.codegen.shapes import STATUSES
-from dlo_casadi.errors import DloError
-from dlo_casadi.fleet.shape_arrow import table_of, table_schema
-from dlo_casadi.fleet.shape_poses import Poses
-from dlo_casadi.fleet.shape_solve import Chunk, Plan, part_type, solve_chunk
+from dlo_casadi.codegen.compiled import Branch, CompiledSolver
+from dlo_casadi.codegen.generate import solver_hash
+from dlo_casadi.codegen.shapes import STATUSES, records_of
+from dlo_casadi.errors import DloError, counted
+from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
 from dlo_casadi.io.files import only_run, write_file
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import Tally, map_as_completed
 
+if TYPE_CHECKING:
+    import pyarrow
+
+FloatArray = NDArray[np.floating]
+
 SCHEMA = "dlo-shapes/1"
+# A process holds the shapes of one chunk at a time, of so many bytes as the solver writes them.
+CHUNK_BYTES = 12_000_000
+# By a part of the column's name; [m] otherwise.
+_UNITS = {"force": "N", "moment": "N m", "energy": "J", "heading": "rad"}
+_ORDER = "x and y of the nodes in turn, from start to end"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is computed for each pose.
+
+    Parameters
+    ----------
+    model : CableModel
+    p : (n_parameters,)
+    rest : (n_rests,) [1/m]
+    branch : "ccw", "cw" or None
+    parts : Path
+        Folder of the finished chunks.
+    """
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    branch: Branch | None
+    parts: Path
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that decides the shapes, as in the C header."""
+        return solver_hash(self.model, self.p, self.rest)
+
+    @property
+    def chunk(self) -> int:
+        """Poses of a chunk."""
+        n, k = self.model.n, self.model.chain.n_nodes
+        return max(1, CHUNK_BYTES // (8 * (2 * (n + 1) + k + 12)))
+
+    def part(self, index: int) -> Path:
+        """Where a finished chunk lies."""
+        return self.parts / f"{index:08d}.arrow"
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Some of the poses, (m, 6) [m, rad]."""
+
+    index: int
+    poses: FloatArray
+
+    def __repr__(self) -> str:
+        return f"chunk {self.index} of {counted(len(self.poses), 'pose')}"
 
 
 def shape_table(
     plan: Plan,
-    poses: Poses,
+    poses: Grid | PoseList,
     output: Path,
     executor: Executor,
     *,
@@ -44,7 +103,7 @@ def shape_table(
     Parameters
     ----------
     plan : Plan
-    poses : Poses
+    poses : Grid or PoseList
     output : Path
         The file.
     executor : Executor
@@ -84,10 +143,18 @@ def shape_table(
         )
     if restart:
         shutil.rmtree(plan.parts, ignore_errors=True)
+    schema = _schema(plan.model, {"identity": identity, **(metadata or {})})
+    counts = np.zeros(len(STATUSES), int)
     with only_run(plan.parts):
-        _claim(plan.parts, identity)
-        counts = np.zeros(len(STATUSES), int)
-        fill = partial(_fill, plan, poses, executor, identity, metadata or {}, progress, counts)
+        mark = plan.parts / "identity.json"
+        if not mark.exists():
+            write_file(mark, identity)
+        elif mark.read_text(encoding="utf-8") != identity:
+            raise DloError(
+                f"{plan.parts} holds parts of another table: other poses, another model or "
+                "version.\n  Try: another --output, or --restart to throw them away."
+            )
+        fill = partial(_fill, plan, poses, executor, schema, progress, counts)
         write_file(output, fill, plan.parts / "draft.parquet")
         shutil.rmtree(plan.parts, ignore_errors=True)
     return {name: int(n) for name, n in zip(STATUSES, counts, strict=True) if n}
@@ -105,25 +172,11 @@ def _identity_of(path: Path) -> str | None:
     return None if found is None else found.decode()
 
 
-def _claim(parts: Path, identity: str) -> None:
-    """Say whose parts these are; refuse those of something else."""
-    mark = parts / "identity.json"
-    if mark.exists():
-        if mark.read_text(encoding="utf-8") != identity:
-            raise DloError(
-                f"{parts} holds parts of another table: other poses, another model or version.\n"
-                "  Try: another --output, or --restart to throw them away."
-            )
-        return
-    write_file(mark, identity)
-
-
 def _fill(
     plan: Plan,
-    poses: Poses,
+    poses: Grid | PoseList,
     executor: Executor,
-    identity: str,
-    metadata: dict[str, Any],
+    schema: pyarrow.Schema,
     progress: Callable[[Tally], None] | None,
     counts: NDArray[np.int_],
     stream: BinaryIO,
@@ -136,7 +189,6 @@ def _fill(
 
     total = -(-poses.count // plan.chunk)
     there = {k for k in range(total) if plan.part(k).exists()}
-    schema = table_schema(plan.model, {"identity": identity, **metadata})
     written = 0
 
     def missing() -> Iterator[Chunk]:
@@ -157,27 +209,102 @@ def _fill(
         def append() -> None:
             nonlocal written
             while written in there:
-                part = _read_part(plan, written)
-                counts[:] += np.bincount(part["status"], minlength=len(STATUSES))
-                writer.write_table(table_of(part, schema, plan.model))
+                part = _read_part(plan.part(written), schema)
+                counts[:] += np.bincount(part["status"].chunk(0).indices, minlength=len(STATUSES))
+                writer.write_table(part)
                 written += 1
 
         append()
-        tasks = map_as_completed(
-            executor,
-            partial(solve_chunk, plan),
-            missing(),
-            total=total - len(there),
-            progress=progress,
-        )
-        for done in tasks:
+        left, solve = total - len(there), partial(solve_chunk, plan)
+        for done in map_as_completed(executor, solve, missing(), total=left, progress=progress):
             _ = done.value  # a chunk that fails ends the run; finished ones are kept
             there.add(done.item.index)
             append()
 
 
-def _read_part(plan: Plan, index: int) -> NDArray[np.void]:
-    part: NDArray[np.void] = np.load(plan.part(index))
-    if part.dtype != part_type(plan.model.n):
-        raise DloError(f"{plan.part(index)} is no part of this table.\n  Try: --restart")
+def _read_part(path: Path, schema: pyarrow.Schema) -> pyarrow.Table:
+    import pyarrow as pa
+
+    with path.open("rb") as stream:
+        part = pa.ipc.open_file(stream).read_all()
+    if not part.schema.equals(schema):
+        raise DloError(f"{path} is no part of this table.\n  Try: --restart")
     return part
+
+
+_solvers: dict[str, CompiledSolver] = {}
+
+
+def solve_chunk(plan: Plan, chunk: Chunk) -> None:
+    """Solve a chunk and keep it durably, on a worker, which compiles the solver once."""
+    import pyarrow as pa
+
+    digest = plan.digest
+    if digest not in _solvers:
+        _solvers.clear()
+        _solvers[digest] = CompiledSolver(plan.model, plan.p, plan.rest)
+    found = _solvers[digest].solve_many(chunk.poses, branch=plan.branch)
+    part = table_of(plan.model, chunk.poses, *found)
+
+    def fill(stream: BinaryIO) -> None:
+        with pa.ipc.new_file(stream, part.schema) as writer:
+            writer.write_table(part)
+
+    write_file(plan.part(chunk.index), fill)
+
+
+def table_of(
+    model: CableModel, poses: FloatArray, records: NDArray[np.void], statuses: NDArray[np.intc]
+) -> pyarrow.Table:
+    """Poses with their shapes, which are null where there is none.
+
+    Points are in single precision: 0.1 um and better below a metre.
+    """
+    import pyarrow as pa
+
+    lost, ends = statuses != 0, ("start", "end")
+    clamped = [side for side in ends if getattr(model, side) == "clamped"]
+    known = {
+        *("start_x", "start_y", *([] if model.end == "free" else ["end_x", "end_y"])),
+        *(f"{side}_heading" for side in clamped),
+    }
+    results = {
+        "energy": records["energy"],
+        **{
+            f"force_on_{side}_{axis}": records[f"{side}_force"][:, k]
+            for side in ends
+            for k, axis in enumerate("xy")
+        },
+        **{f"moment_on_{side}": records["moments"][:, ends.index(side), 0] for side in clamped},
+        "min_bend_radius": records["min_bend_radius"],
+    }
+    points = pa.array(records["points"].astype(np.float32).ravel())
+    columns = {
+        **{name: pa.array(poses[:, k]) for k, name in enumerate(COLUMNS) if name in known},
+        "status": pa.DictionaryArray.from_arrays(statuses.astype(np.int8), list(STATUSES)),
+        **{name: pa.array(np.ascontiguousarray(x), mask=lost) for name, x in results.items()},
+        "points": pa.FixedSizeListArray.from_arrays(points, 2 * (model.n + 1), mask=pa.array(lost)),
+    }
+
+    def field(name: str, column: pyarrow.Array) -> pyarrow.Field:
+        unit = next((unit for part, unit in _UNITS.items() if part in name), "m")
+        said = {"status": {}, "points": {"unit": unit, "order": _ORDER}}.get(name, {"unit": unit})
+        return pa.field(name, column.type, metadata=said or None)
+
+    schema = pa.schema([field(*item) for item in columns.items()])
+    return pa.table(columns, schema=schema)
+
+
+def _schema(model: CableModel, metadata: dict[str, Any]) -> pyarrow.Schema:
+    """Types and units of the columns, and what the file says of the cable."""
+    none = np.zeros((0, len(COLUMNS))), np.zeros(0, records_of(model).shape), np.zeros(0, np.intc)
+    said = {
+        "cable": model.cable.name,
+        "length_m": model.cable.length,
+        "n": model.n,
+        "element": model.element,
+        "boundary": [model.start, model.end],
+        **metadata,
+    }
+    texts = {key: item if isinstance(item, str) else json.dumps(item) for key, item in said.items()}
+    return table_of(model, *none).schema.with_metadata(texts)

@@ -3,7 +3,8 @@
 import pytest
 from tiny_sessions import QUICK, without_times, write_fleet
 
-from dlo_casadi.fleet import find_sessions, fit_fleet
+from dlo_casadi.fleet.discover import find_sessions
+from dlo_casadi.fleet.run import fit_fleet
 from dlo_casadi.runtime.executors import InProcess
 
 

@@ -15,7 +15,8 @@ from distributed import LocalCluster
 from tiny_sessions import QUICK, without_times
 
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.fleet import find_sessions, fit_fleet
+from dlo_casadi.fleet.discover import find_sessions
+from dlo_casadi.fleet.run import fit_fleet
 from dlo_casadi.runtime import executors
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, map_in_order, open_executor
 

@@ -20,11 +20,10 @@ from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import fit_many, main
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet import find_sessions, fit_fleet
-from dlo_casadi.fleet.columns import COLUMNS, empty_row, row_of
-from dlo_casadi.fleet.one import Job, fit_one
-from dlo_casadi.fleet.outliers import judge, robust_z
-from dlo_casadi.fleet.overview import overview_html
+from dlo_casadi.fleet.discover import find_sessions
+from dlo_casadi.fleet.overview import judge, overview_html, robust_z
+from dlo_casadi.fleet.rows import COLUMNS, empty_row, row_of
+from dlo_casadi.fleet.run import Job, fit_fleet, fit_one
 from dlo_casadi.io.files import only_run
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import open_executor

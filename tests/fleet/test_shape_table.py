@@ -20,10 +20,9 @@ from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet import shape_solve
+from dlo_casadi.fleet import shape_table as shape_table_module
 from dlo_casadi.fleet.shape_poses import Grid, PoseList
-from dlo_casadi.fleet.shape_solve import Plan
-from dlo_casadi.fleet.shape_table import shape_table
+from dlo_casadi.fleet.shape_table import Plan, shape_table
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.parameters_text import parameters_text
 from dlo_casadi.runtime.executors import InProcess
@@ -52,7 +51,7 @@ def parameters(tmp_path_factory):
 @pytest.fixture
 def small_chunks(monkeypatch):
     """Some ten poses a chunk."""
-    monkeypatch.setattr(shape_solve, "CHUNK_BYTES", 4000)
+    monkeypatch.setattr(shape_table_module, "CHUNK_BYTES", 4000)
 
 
 def test_rows_are_predictions_in_the_order_of_the_grid(parameters, tmp_path, capsys):
@@ -134,7 +133,7 @@ def test_interrupted_and_resumed_or_in_a_pool_the_bytes_are_the_same(tmp_path, s
     with pytest.raises(KeyboardInterrupt):
         shape_table(plan, GRID, again, InProcess(), progress=interrupt)
     assert not again.exists()
-    before = len(list(plan.parts.glob("*.npy")))
+    before = len(list(plan.parts.glob("*.arrow")))
     assert before == 3
     tallies = []
     assert shape_table(plan, GRID, again, InProcess(), progress=tallies.append) == counts

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from dlo_casadi.fleet import Options
+from dlo_casadi.fleet.run import Options
 
 QUICK = Options(diagnosis=False, reports=False)
 BENCH = Path(__file__).parents[1] / "data" / "bench"

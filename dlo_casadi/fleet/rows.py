@@ -1,0 +1,207 @@
+"""The table of many sessions: its columns, the row of one, rows and table on the disk."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from dlo_casadi import __version__
+from dlo_casadi.errors import DloError
+from dlo_casadi.io.files import write_file
+from dlo_casadi.session.outcome import StageName
+from dlo_casadi.session.run import TIMED
+
+if TYPE_CHECKING:
+    import pyarrow
+
+SCHEMA = "dlo-fleet/1"
+TABLE = "table.parquet"
+Row = dict[str, Any]
+
+STAGES = get_args(StageName)
+TIMES = (*TIMED, "total")
+# What a stage tells beside its parameters.
+_ERRORS = {"rmse_fit": "m", "rmse_held_out": "m", "chi2_per_dof": ""}
+
+# Column -> kind and unit; a column is empty (null) where a session has no such thing. The names of
+# all columns that differ from run to run begin with `time_`.
+COLUMNS: dict[str, tuple[str, str]] = {
+    **dict.fromkeys(("session", "status", "message", "cable", "verdict"), ("text", "")),
+    "effects": ("effects", ""),
+    "bending_stiffness": ("number", "N m^2"),
+    "bending_stiffness_std": ("number", "N m^2"),
+    "bending_stiffness_low_95": ("number", "N m^2"),
+    "bending_stiffness_high_95": ("number", "N m^2"),
+    "identifiable": ("truth", ""),
+    "torsional_stiffness": ("number", "N m^2"),
+    "torsional_stiffness_std": ("number", "N m^2"),
+    "parameters": ("parameters", ""),
+    "rest_curvature_s": ("numbers", "m"),
+    "rest_curvature": ("numbers", "1/m"),
+    "rest_curvature_std": ("numbers", "1/m"),
+    "rest_curvature_z": ("numbers", "1/m"),
+    "rest_curvature_z_std": ("numbers", "1/m"),
+    **{f"{stage}_{what}": ("number", _ERRORS[what]) for stage in STAGES for what in _ERRORS},
+    **{f"unexplained_force_{axis}": ("number", "N") for axis in "xyz"},
+    "unexplained_position": ("number", "m"),
+    "noise_std": ("number", "m"),
+    "noise_correlation_length": ("number", "m"),
+    "kind": ("text", ""),
+    **dict.fromkeys(("poses_fit", "poses_held_out", "points", "elements"), ("count", "")),
+    "discretization_error": ("number", "m"),
+    "warnings": ("texts", ""),
+    "config_hash": ("text", ""),
+    "package_version": ("text", ""),
+    **{f"time_{part}_s": ("number", "s") for part in (*TIMES, "session")},
+}
+
+
+def empty_row(key: str, digest: str, status: str, message: str, seconds: float) -> Row:
+    """Row of a session without results."""
+    lists = ("effects", "parameters", "numbers", "texts")
+    return {name: [] if kind in lists else None for name, (kind, _) in COLUMNS.items()} | {
+        "session": key,
+        "status": status,
+        "message": message,
+        "config_hash": digest,
+        "package_version": __version__,
+        "time_session_s": seconds,
+    }
+
+
+def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: float) -> Row:
+    """Row of a session with results, from its report ("dlo-report/1")."""
+    found = report["stages"][-1]["parameters"]
+    stiffness, torsion = found["bending_stiffness"], found.get("torsional_stiffness", {})
+    low, high = stiffness["interval_95"] or (None, None)
+    # In a plane, or in space about the material axis y, and then about z.
+    rest = found["rest_curvature"]
+    about = {"": rest} if "value" in rest else {"": rest["k_y"], "_z": rest["k_z"]}
+    measurement, mesh = report["measurement"], report["discretization"]
+    pull = report["unexplained"] or {}
+    force = pull.get("force") or ()
+    kept = ("name", "p_value", "rmse_cross_validated_before", "rmse_cross_validated_after")
+    return empty_row(key, digest, "done", "", seconds) | {
+        "cable": cable,
+        "verdict": report["verdict"],
+        "effects": [
+            {name: effect[name] for name in (*kept, "indistinguishable_from")}
+            | {"parameters": _parameters(effect["parameters"])}
+            for effect in report["effects"]
+        ],
+        "bending_stiffness": stiffness["value"],
+        "bending_stiffness_std": stiffness["std"],
+        "bending_stiffness_low_95": low,
+        "bending_stiffness_high_95": high,
+        "identifiable": stiffness["identifiable"],
+        "torsional_stiffness": torsion.get("value"),
+        "torsional_stiffness_std": torsion.get("std"),
+        "parameters": _parameters(found),
+        "rest_curvature_s": rest["s"],
+        **{f"rest_curvature{axis}": item["value"] for axis, item in about.items()},
+        **{f"rest_curvature{axis}_std": item["std"] for axis, item in about.items()},
+        **{
+            f"{stage['name']}_{what}": stage[what] for stage in report["stages"] for what in _ERRORS
+        },
+        **{f"unexplained_force_{axis}": value for axis, value in zip("xyz", force, strict=False)},
+        "unexplained_position": pull.get("position"),
+        "noise_std": measurement["std"],
+        "noise_correlation_length": measurement["correlation_length_m"],
+        **{name: measurement[name] for name in ("kind", "poses_fit", "poses_held_out", "points")},
+        "elements": mesh["n"],
+        "discretization_error": mesh["error_m"],
+        "warnings": report["warnings"],
+        **{f"time_{part}_s": report["timing_s"].get(part) for part in TIMES},
+    }
+
+
+def _parameters(items: dict[str, Any]) -> list[dict[str, Any]]:
+    return [
+        {"name": name} | {key: item[key] for key in ("value", "std", "unit")}
+        for name, item in items.items()
+        if name != "rest_curvature"
+    ]
+
+
+def last_error(row: Row) -> float | None:
+    """Error of the last stage [m]: of held-out poses where there are any."""
+    errors = ("rmse_held_out", "rmse_fit")
+    names = [f"{stage}_{what}" for stage in ("closed", "batch") for what in errors]
+    return next((row[name] for name in names if row[name] is not None), None)
+
+
+def _row_file(output: Path, key: str) -> Path:
+    return output / "rows" / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.json"
+
+
+def write_row(output: Path, row: Row) -> None:
+    """Write a session's row; it is durable when this returns. A second one replaces the first."""
+    write_file(_row_file(output, row["session"]), json.dumps(row, allow_nan=False))
+
+
+def read_row(output: Path, key: str, digest: str) -> Row | None:
+    """Read the row of a session if it belongs to what the session is now."""
+    try:
+        row: Row = json.loads(_row_file(output, key).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    valid = isinstance(row, dict) and row.keys() == COLUMNS.keys()
+    return row if valid and (row["session"], row["config_hash"]) == (key, digest) else None
+
+
+def write_table(output: Path, rows: Iterable[Row]) -> None:
+    """Write all rows, in the order of their keys, into one table: equal rows, equal bytes."""
+    pyarrow, parquet = parquet_library()
+    ordered = sorted(rows, key=lambda row: str(row["session"]))
+    table = pyarrow.Table.from_pylist(ordered, schema=arrow_schema())
+    write_file(output / TABLE, lambda stream: parquet.write_table(table, stream))
+
+
+def parquet_library() -> tuple[Any, Any]:
+    """The library that writes Parquet.
+
+    Raises
+    ------
+    DloError
+        If it is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise DloError("tables need pyarrow.\n  Try: pip install 'dlo-casadi[table]'") from None
+    return pyarrow, pyarrow.parquet
+
+
+def arrow_schema() -> pyarrow.Schema:
+    """Types and units of the columns."""
+    pa, _ = parquet_library()
+    text, number = pa.string(), pa.float64()
+    values = {"name": text, "value": number, "std": number, "unit": text}
+    parameters = pa.list_(pa.struct(values.items()))
+    effect = {
+        "name": text,
+        "p_value": number,
+        "rmse_cross_validated_before": number,
+        "rmse_cross_validated_after": number,
+        "indistinguishable_from": pa.list_(text),
+        "parameters": parameters,
+    }
+    kinds = {
+        "text": text,
+        "number": number,
+        "count": pa.int64(),
+        "truth": pa.bool_(),
+        "texts": pa.list_(text),
+        "numbers": pa.list_(number),
+        "parameters": parameters,
+        "effects": pa.list_(pa.struct(effect.items())),
+    }
+    fields = [
+        pa.field(name, kinds[kind], metadata={"unit": unit} if unit else None)
+        for name, (kind, unit) in COLUMNS.items()
+    ]
+    return pa.schema(fields, metadata={"schema": SCHEMA, "dlo_casadi": __version__})
