@@ -294,7 +294,7 @@ def test_a_segment_is_differentiated_as_by_casadi_in_one_go(element, end):
         ca.SX.sym("i", 6),
     )
     place = m.chain.layout.segments[4]
-    nodes = ca.vertcat(node.retract(x[:4], delta[:3]), node.retract(x[4:], delta[3:]))
+    nodes = ca.vertcat(node.moved(x[:4], delta[:3]), node.moved(x[4:], delta[3:]))
     value, advance = functions_of(m).segment_by_share(
         nodes, lam, p, rest, place, deviation, lagrangian_of(m).shares(p, place)
     )

@@ -133,7 +133,6 @@ class ClampCompliance(ClampEffect):
     """
 
     name = "clamp_compliance"
-    gives = True
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Declare the compliances of the clamped ends."""

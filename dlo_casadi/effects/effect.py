@@ -325,9 +325,6 @@ class BoundaryEffect(Effect):
         """Change the end conditions. Changes are applied in the order of the model's effects."""
         return ends
 
-    # Whether clamps give way, see `compliance`.
-    gives: ClassVar[bool] = False
-
     def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX | float:
         """Energy stored in the holders [J], by the cable's first and last node. Energies add."""
         return 0.0

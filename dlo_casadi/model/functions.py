@@ -29,23 +29,14 @@ class Functions:
 
     def __init__(self, model: CableModel) -> None:
         self.model, self.terms = model, lagrangian_of(model)
-
-    @property
-    def _segment_arguments(self) -> list[ca.SX]:
-        x, _ = self.terms.nodes
-        return [
-            x,
-            self.terms.lam,
-            self.terms.p,
-            self.terms.rest_strains,
-            self.terms.place,
-            self.terms.deviation,
-        ]
-
-    @property
-    def _end_arguments(self) -> list[ca.SX]:
-        x, _ = self.terms.nodes
-        return [x, self.terms.lam, self.terms.p, self.terms.pose, self.terms.deviation]
+        x, lam, p, deviation = (getattr(self.terms, k) for k in ("x", "lam", "p", "deviation"))
+        rest, place = self.terms.rest_strains, self.terms.place
+        self._segment_arguments = [x, lam, p, rest, place, deviation]
+        self._end_arguments = [x, lam, p, self.terms.pose, deviation]
+        # Lagrangians are differentiated by the nodes' increments and the multipliers, their
+        # gradients by the numbers that they depend on.
+        self._by = ca.vertcat(self.terms.delta, lam)
+        self._numbers, self._end_numbers = ca.vertcat(p, rest, deviation), ca.vertcat(p, deviation)
 
     def _here(
         self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
@@ -55,48 +46,33 @@ class Functions:
         What is evaluated often is worth the search for common subexpressions: it takes away a
         fifth of the operations, and of many effects' derivatives longer than the evaluation.
         """
-        local, step = self.terms.local
-        _, delta = self.terms.nodes
-        symbols = [step, delta, local]
-        values = [ca.SX.zeros(step.shape), ca.SX.zeros(delta.shape), self.terms.local_of_nodes]
-        found = ca.substitute(outputs, symbols, values)
+        still = ca.SX.zeros(self.terms.delta.shape)
+        found = ca.substitute(outputs, [self.terms.delta], [still])
         found = ca.cse(found) if often else found
         return ca.Function(name, arguments, [ca.densify(one) for one in found])
 
-    @property
-    def _by_segment(self) -> ca.SX:
-        """What the Lagrangian of a segment is differentiated by: local increments, multipliers."""
-        return ca.vertcat(self.terms.local[1], self.terms.lam)
-
-    @property
-    def _by_ends(self) -> ca.SX:
-        """What that of the ends is differentiated by: increments of the nodes, multipliers."""
-        return ca.vertcat(self.terms.nodes[1], self.terms.lam)
-
-    @property
-    def _to_local(self) -> ca.SX:
-        """Derivative of local increments and multipliers by the nodes' and multipliers."""
-        return ca.diagcat(self.terms.local_slope, ca.SX.eye(self.model.n_border))
+    @cached_property
+    def _gradient(self) -> ca.SX:
+        """Gradient (2b + k,) of the Lagrangian of a segment."""
+        if self.model.chain.kind.framed:
+            return self._of_pulls @ self._about_nodes.gradient
+        return ca.gradient(self.terms.segment_terms.lagrangian, self._by)
 
     @cached_property
     def segment(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
-        if self.model.in_space:
+        if self.model.chain.kind.framed:
             found, spread = self._about_nodes, self._of_pulls
-            outputs = [found.value, spread @ found.gradient, spread @ found.hessian @ spread.T]
-            return self._here("segment", self._segment_arguments, outputs)
-        value = self.terms.segment_terms.lagrangian
-        hessian, gradient = ca.hessian(value, self._by_segment)
-        return self._here("segment", self._segment_arguments, [value, gradient, hessian])
+            value, hessian = found.value, spread @ found.hessian @ spread.T
+        else:
+            value = self.terms.segment_terms.lagrangian
+            hessian, _ = ca.hessian(value, self._by)
+        return self._here("segment", self._segment_arguments, [value, self._gradient, hessian])
 
     @cached_property
     def segment_slope(self) -> ca.Function:
         """As `segment` -> its gradient alone, for a small part of the operations."""
-        if self.model.in_space:
-            gradient = self._of_pulls @ self._about_nodes.gradient
-        else:
-            gradient = ca.gradient(self.terms.segment_terms.lagrangian, self._by_segment)
-        return self._here("segment_slope", self._segment_arguments, [gradient])
+        return self._here("segment_slope", self._segment_arguments, [self._gradient])
 
     @cached_property
     def segment_by_share(self) -> ca.Function:
@@ -142,7 +118,7 @@ class Functions:
         numbers = SegmentNumbers(
             self.terms.p, self.terms.rest_strains, self.terms.place, self.terms.deviation, shares
         )
-        return self.terms.in_frame(self.terms.nodes[0], ca.horzcat(*pulls), numbers)
+        return self.terms.in_frame(self.terms.x, ca.horzcat(*pulls), numbers)
 
     @cached_property
     def _about_nodes(self) -> SegmentDerivatives:
@@ -170,7 +146,7 @@ class Functions:
     @cached_property
     def at_ends(self) -> ca.Function:
         """(x, lam, p, pose, deviation) of the first and last node -> as `segment`."""
-        hessian, gradient = ca.hessian(self.terms.ends_lagrangian, self._by_ends)
+        hessian, gradient = ca.hessian(self.terms.ends_lagrangian, self._by)
         return self._here(
             "at_ends", self._end_arguments, [self.terms.ends_lagrangian, gradient, hessian]
         )
@@ -178,22 +154,19 @@ class Functions:
     @cached_property
     def segment_sensitivity(self) -> ca.Function:
         """As `segment` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
-        by = ca.vertcat(self.terms.p, self.terms.rest_strains, self.terms.deviation)
-        if self.model.in_space:
-            first, last, pulled = self._framed.by_numbers(by)
+        if self.model.chain.kind.framed:
+            first, last, pulled = self._framed.by_numbers(self._numbers)
             turns = self._framed.node_turns
             mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
         else:
-            mixed = ca.jacobian(
-                ca.gradient(self.terms.segment_terms.lagrangian, self._by_segment), by
-            )
+            mixed = ca.jacobian(self._gradient, self._numbers)
         return self._here("segment_sensitivity", self._segment_arguments, [mixed], often=False)
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
         """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
-        by = ca.vertcat(self.terms.p, self.terms.deviation)
-        mixed = ca.jacobian(ca.gradient(self.terms.ends_lagrangian, self._by_ends), by)
+        gradient = ca.gradient(self.terms.ends_lagrangian, self._by)
+        mixed = ca.jacobian(gradient, self._end_numbers)
         return self._here("end_sensitivity", self._end_arguments, [mixed])
 
     @cached_property
@@ -204,7 +177,7 @@ class Functions:
     @cached_property
     def _rates(self) -> ca.SX:
         """Length ratio of a segment and, in a plane, its turning d phi / ds [1/m]."""
-        if self.model.in_space:  # no map of the measurement depends on the frame there
+        if self.model.node.increment > 1:  # no map of the measurement depends on a frame
             return self.terms.segment_terms.ratio
         turning = self.terms.stretch * self.model.chain.kind.strain(self._plain)
         return ca.vertcat(self.terms.segment_terms.ratio, turning)
@@ -217,18 +190,15 @@ class Functions:
     @cached_property
     def segment_curve_slopes(self) -> ca.Function:
         """As `segment` -> the same, derivatives by increments, lam, and by p, rest, deviation."""
-        others = ca.vertcat(self.terms.p, self.terms.rest_strains, self.terms.deviation)
-        if self.model.in_space:
+        by = (self._by, self._numbers)
+        if self.model.chain.kind.framed:
             # The advance is the Lagrangian's derivative by the force on the end's holder.
-            found, spread = self._about_nodes, self._of_pulls
-            by_nodes = (spread @ found.hessian)[:, 6:9].T
-            advance = [by_nodes, self._framed.by_numbers(others)[2][:3, :]]
-            stretched = self.terms.segment_terms.ratio
-            by_nodes = ca.jacobian(stretched, self._by_segment) @ self._to_local
-            ratio = [by_nodes, ca.jacobian(stretched, others)]
+            by_nodes = (self._of_pulls @ self._about_nodes.hessian)[:, 6:9].T
+            advance = [by_nodes, self._framed.by_numbers(self._numbers)[2][:3, :]]
+            ratio = [ca.jacobian(self._rates, one) for one in by]
             blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
         else:
-            blocks = [ca.jacobian(self._advanced, by) for by in (self._by_segment, others)]
+            blocks = [ca.jacobian(self._advanced, one) for one in by]
         outputs = [self._advanced, *blocks]
         return self._here("segment_curve_slopes", self._segment_arguments, outputs, often=False)
 
@@ -236,21 +206,10 @@ class Functions:
     def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
         """Arguments, place (and slope) in the measurement of one station, and what moves it."""
         kind = self.model.chain.kind
-        x, delta = self.terms.nodes
-        point, rates = (
-            ca.SX.sym("point", self.model.node.dimension),
-            ca.SX.sym("rates", self._rates.numel()),
-        )
-        before, after = (
-            self.model.node.retract(own, step)
-            for own, step in zip(
-                ca.vertsplit(x, x.numel() // 2),
-                ca.vertsplit(delta, delta.numel() // 2),
-                strict=True,
-            )
-        )
-        frame = ca.SX.sym("frame", self.model.node.coordinates)
-        slope = rates[0] * self.model.node.tangent(frame)
+        node = self.model.node
+        point, rates = ca.SX.sym("point", node.dimension), ca.SX.sym("rates", self._rates.numel())
+        frame = ca.SX.sym("frame", node.coordinates)
+        slope = rates[0] * node.tangent(frame)
         image = point
         maps = self.terms.effects_of(MeasurementEffect)
         for effect, local in maps:
@@ -261,9 +220,9 @@ class Functions:
             for turning in ca.vertsplit(rates)[1:]:
                 slope += ca.jtimes(image, frame, turning)
             rows = ca.vertcat(image, slope)
-        rows = ca.substitute(rows, frame, self.model.node.middle(before, after))
-        arguments = [point, rates, x, self.terms.p, self.terms.pose]
-        return arguments, rows, ca.vertcat(point, rates, delta)
+        rows = ca.substitute(rows, frame, node.middle(*self.terms.moved))
+        arguments = [point, rates, self.terms.x, self.terms.p, self.terms.pose]
+        return arguments, rows, ca.vertcat(point, rates, self.terms.delta)
 
     @cached_property
     def station(self) -> ca.Function:
@@ -301,10 +260,7 @@ class Functions:
             mean = effect.next_rest(mean, strain, self.model.cable, local)
         rest = ca.SX.sym("mean", own.numel())
         mean = ca.substitute(mean, own, rest)
-        slopes = [
-            ca.jacobian(mean, symbols) for symbols in (self.terms.local[1], rest, self.terms.p)
-        ]
-        slopes[0] = slopes[0] @ self.terms.local_slope
+        slopes = [ca.jacobian(mean, symbols) for symbols in (self.terms.delta, rest, self.terms.p)]
         mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
         return self._here("segment_state", self._segment_arguments, [mean, *slopes])
 
@@ -316,7 +272,7 @@ class Functions:
         kept. Moments, about the world's axes, are the slope by turns of the first and last node of
         what the holders add to it: multipliers of clamps, springs of pins.
         """
-        node, (x, delta) = self.model.node, self.terms.nodes
+        node, x, delta = self.model.node, self.terms.x, self.terms.delta
         places = -ca.gradient(self.terms.ends_lagrangian, self.terms.pose)[: 2 * node.dimension]
         turns = ca.gradient(self.terms.ends_lagrangian, delta)
         places, turns = ca.substitute([places, turns], [delta], [ca.SX.zeros(delta.shape)])
@@ -326,16 +282,8 @@ class Functions:
             ca.vertsplit(turns, node.increment),
             strict=True,
         )
-        here = [row for force, own, turn in pairs for row in (force, node.in_world(own, turn))]
-        moved = [
-            node.retract(own, step)
-            for own, step in zip(
-                ca.vertsplit(x, node.coordinates),
-                ca.vertsplit(delta, node.increment),
-                strict=True,
-            )
-        ]
-        return ca.substitute([ca.vertcat(*here)], [x], [ca.vertcat(*moved)])[0]
+        here = [row for force, own, turn in pairs for row in (force, node.to_world(own, turn))]
+        return ca.substitute(ca.vertcat(*here), x, ca.vertcat(*self.terms.moved))
 
     @cached_property
     def reactions(self) -> ca.Function:
@@ -359,7 +307,7 @@ class Functions:
     @cached_property
     def reading_slopes(self) -> ca.Function:
         """As `readings` -> derivatives by increments and multipliers, by p, and by deviation."""
-        by = (self._by_ends, self.terms.p, self.terms.deviation)
+        by = (self._by, self.terms.p, self.terms.deviation)
         slopes = [ca.jacobian(self._readings, one) for one in by]
         return self._here("reading_slopes", self._end_arguments, slopes)
 

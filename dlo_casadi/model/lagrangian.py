@@ -9,51 +9,34 @@ equilibrium is a stationary point.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from dlo_casadi.effects import (
     BoundaryEffect,
-    Cable,
     Kinematics,
     Load,
     PointForceAt,
     SectionLaw,
     SpringAt,
+    Viewpoint,
 )
 from dlo_casadi.model.cable_model import (
     BENDING_STIFFNESS,
     END_ROLL,
     TORSIONAL_STIFFNESS,
+    VIEWPOINT_SIZE,
     CableModel,
 )
-from dlo_casadi.model.symbols import Symbols
-from dlo_casadi.rod.element import Cell, Section, Segment
+from dlo_casadi.rod.element import Cell, Law, Section, Segment
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import Forces, SegmentInFrame
 
 # Models whose expressions and functions are kept: a diagnosis compares some thirty at a time.
 MODELS = 64
-
-
-@dataclass(frozen=True)
-class _Law:
-    """A section law with its parameters, as elements ask for it."""
-
-    effect: SectionLaw
-    cable: Cable
-    params: dict[str, ca.SX]
-
-    def along(self, cell: Cell) -> ca.SX:
-        return self.effect.along(cell, self.cable, self.params)
-
-    def of_bend(self, square: ca.SX) -> ca.SX:
-        return self.effect.of_bend(square, self.cable, self.params)
-
-    def tangent(self, square: ca.SX) -> ca.SX:
-        return self.effect.tangent(square, self.cable, self.params)
 
 
 @dataclass(frozen=True)
@@ -76,20 +59,94 @@ class SegmentNumbers:
     shares: ca.SX
 
 
-class Lagrangian(Symbols):
-    """The expressions of a model.
+class Lagrangian:
+    """The symbols and the expressions of a model: of one segment, of the ends and of one pose.
 
     Parameters
     ----------
     model : CableModel
+
+    Attributes
+    ----------
+    p : (n_parameters,)
+        In the order of `model.names`.
+    pose : (n_pose,)
+        What is declared of one pose, see `pose.Pose.vector`.
+    deviation : (n_deviations,)
+        Of one pose from its declared ends, see `deviation_names`.
+    lam : (n_border,)
+        Border: multipliers of the end conditions, then place and pull of each spring.
+    x, delta : (2 coordinates,), (2 increment,)
+        Coordinates of the two nodes of a segment, or of the first and last; their increments.
+    rest_strains : (3 strains,) [1/m]
+        Rest strains inside a segment, see `Chain.rest_stencils`.
+    place : (5,)
+        A row of `Layout.segments`.
+    inner : (n_inner,)
+        Unknowns inside an element that are eliminated from it.
     """
+
+    def __init__(self, model: CableModel) -> None:
+        self.model, self.node, self.kind = model, model.node, model.chain.kind
+        self.p = ca.SX.sym("p", len(model.parameters))
+        self.pose = ca.SX.sym("pose", model.n_pose)
+        self.deviation = ca.SX.sym("deviation", len(model.deviation_names))
+        self.lam = ca.SX.sym("lam", model.n_border)
+        self.x = ca.SX.sym("x", 2 * self.node.coordinates)
+        self.delta = ca.SX.sym("delta", 2 * self.node.increment)
+        self.rest_strains = ca.SX.sym("rest", 3 * len(self.node.strains))
+        self.place = ca.SX.sym("place", model.chain.layout.segments.shape[1])
+        self.inner = ca.SX.sym("inner", self.kind.n_inner)
+
+    def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
+        """Effects of one segment of the model with their own parameters."""
+        names, cable = self.model.names, self.model.cable
+        picked = []
+        for effect in self.model.effects:
+            if isinstance(effect, base):
+                own = {
+                    q.name: self.p[names.index(f"{effect.label}.{q.name}")]
+                    for q in effect.parameters(cable)
+                }
+                for name in effect.per_pose(cable):
+                    own[name] = self.deviation[self.model.deviation_names.index(name)]
+                picked.append((effect, own))
+        return picked
+
+    @property
+    def declared_ends(self) -> ca.SX:
+        """The ends as declared, see `EndConditions.vector`."""
+        return self.pose[:-VIEWPOINT_SIZE]
+
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """From where the points of a pose are measured."""
+        start = EndConditions.of(self.declared_ends, self.node).start
+        return Viewpoint(start, self.pose[-3:-1], self.pose[-1])
+
+    @property
+    def moved(self) -> list[ca.SX]:
+        """The two nodes, moved by their increments."""
+        rows, steps = (ca.vertsplit(both, both.numel() // 2) for both in (self.x, self.delta))
+        return [self.node.moved(own, step) for own, step in zip(rows, steps, strict=True)]
+
+    @cached_property
+    def local(self) -> ca.SX:
+        """Local coordinates of a segment between the moved nodes, see `Element.local`."""
+        return self.kind.local(*self.moved)
+
+    def spring_unknowns(self, k: int) -> tuple[ca.SX, ca.SX]:
+        """Place and pull of a spring."""
+        d = self.node.dimension
+        own = self.lam[self.model.n_conditions + 2 * d * k :][: 2 * d]
+        return own[:d], own[d:]
 
     @cached_property
     def true_ends(self) -> EndConditions:
         """Where the ends really are: declared, deviation of the pose, boundary effects."""
-        d, b = self.model.node.dimension, self.model.node.increment
+        d, b = self.node.dimension, self.node.increment
         place, first, last, _ = ca.vertsplit(self.deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
-        declared = EndConditions.of(self.declared_ends, self.model.node)
+        declared = EndConditions.of(self.declared_ends, self.node)
         ends = declared.changed(end=declared.end + place).turned(first, last)
         for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)
@@ -119,10 +176,8 @@ class Lagrangian(Symbols):
     @cached_property
     def axial_compliance(self) -> ca.SX:
         """Axial strain per tension [1/N]."""
-        return sum(
-            (effect.compliance(local) for effect, local in self.effects_of(Kinematics)),
-            start=ca.SX(0),
-        )
+        own = (effect.compliance(local) for effect, local in self.effects_of(Kinematics))
+        return sum(own, start=ca.SX(0))
 
     @cached_property
     def felt_gravity(self) -> ca.SX:
@@ -143,37 +198,30 @@ class Lagrangian(Symbols):
     @cached_property
     def dead_forces(self) -> list[PointForceAt]:
         """Dead forces on single places of the cable."""
-        return [
-            force
-            for effect, local in self.effects_of(Load)
-            for force in effect.forces(self.felt_gravity, local)
-        ]
+        loads = self.effects_of(Load)
+        return [f for effect, local in loads for f in effect.forces(self.felt_gravity, local)]
 
     @cached_property
     def springs(self) -> list[SpringAt]:
         """Springs from places of the cable."""
-        return [
-            spring for effect, local in self.effects_of(Load) for spring in effect.springs(local)
-        ]
+        return [k for effect, local in self.effects_of(Load) for k in effect.springs(local)]
 
     @cached_property
     def total_load(self) -> ca.SX:
         """Sum of all dead loads [N]."""
         return sum((force.force for force in self.dead_forces), start=self.resultant(0.0))
 
-    def segment(self, ratio: ca.SX, inner: ca.SX, square: ca.SX) -> Segment:
+    def segment(
+        self, ratio: ca.SX, inner: ca.SX, square: ca.SX, local: ca.SX | None = None
+    ) -> Segment:
         """The segment's symbols; numbers that all segments share are written in."""
-        kind, table = self.model.chain.kind, self.model.chain.layout.segments
-        place = ca.vertcat(
-            *(
-                ca.SX(column[0]) if np.all(column == column[0]) else self.place[i]
-                for i, column in enumerate(table.T)
-            )
-        )
+        table = self.model.chain.layout.segments
+        alike = np.all(table == table[0], axis=0)
+        place = [ca.SX(table[0, i]) if alike[i] else self.place[i] for i in range(len(alike))]
         return Segment(
-            local=kind.local_moved(*self.local),
+            local=self.local if local is None else local,
             rest=self.rest_strains,
-            place=place,
+            place=ca.vertcat(*place),
             mesh=self.model.chain.h,
             stretch=self.stretch,
             ratio=ratio,
@@ -183,17 +231,17 @@ class Lagrangian(Symbols):
 
     def elastic_energy(self, segment: Segment) -> ca.SX:
         """Energy of bending and twist of a segment [J]."""
-        return self.model.chain.kind.elastic(segment, self.section)
+        return self.kind.elastic(segment, self.section)
 
     @property
     def section(self) -> Section:
         """The section, its stiffnesses and laws."""
         known = dict(zip(self.model.names, ca.vertsplit(self.p), strict=True))
-        bending = known[BENDING_STIFFNESS] * ca.SX.eye(len(self.model.node.curvatures))
-        filling = self.effects_of(SectionLaw)
-        for effect, local in filling:
+        bending, laws = known[BENDING_STIFFNESS] * ca.SX.eye(len(self.node.curvatures)), []
+        for effect, local in self.effects_of(SectionLaw):
             bending = effect.bending(bending, local)
-        laws = [_Law(effect, self.model.cable, local) for effect, local in filling]
+            factors = (effect.along, effect.of_bend, effect.tangent)
+            laws.append(Law(*(partial(f, cable=self.model.cable, params=local) for f in factors)))
         return Section(bending, known.get(TORSIONAL_STIFFNESS, ca.SX(0)), laws)
 
     @cached_property
@@ -204,7 +252,7 @@ class Lagrangian(Symbols):
         """
         bend, length = ca.SX.sym("bend"), self.model.cable.length
         cell = Cell(ca.SX(0.499 * length), ca.SX(0.002 * length), 0.002 * length)
-        strain = ca.vertcat(ca.SX.zeros(len(self.model.node.strains) - 1), bend)
+        strain = ca.vertcat(ca.SX.zeros(len(self.node.strains) - 1), bend)
         energy = self.section.density(strain, cell)
         return ca.Function("section_moment", [bend, self.p], [ca.gradient(energy, bend)])
 
@@ -214,20 +262,18 @@ class Lagrangian(Symbols):
 
     def work_along(self, segment: Segment, forces: list[ca.SX]) -> ca.SX:
         """Work of `forces_on` a segment along it [J]."""
-        kind = self.model.chain.kind
-        nodes, weights = kind.rule
+        nodes, weights = self.kind.rule
         shares = ca.vertsplit(self.share_symbols)
         work = ca.SX(0)
         for force, u, weight in zip(forces, nodes, weights, strict=False):
-            work += weight * segment.length * ca.dot(force, kind.tangent(segment, u))
+            work += weight * segment.length * ca.dot(force, self.kind.tangent(segment, u))
         for force, share in zip(forces[len(nodes) :], shares, strict=False):
-            work += ca.dot(force, kind.advance(segment, share))
+            work += ca.dot(force, self.kind.advance(segment, share))
         return work
 
     def forces_on(self, segment: Segment) -> list[ca.SX]:
         """Dead forces [N] on a segment: at the points of its rule, then those on single places."""
-        nodes, _ = self.model.chain.kind.rule
-        spread = [self.resultant(segment.start + u * segment.length) for u in nodes]
+        spread = [self.resultant(segment.start + u * segment.length) for u in self.kind.rule[0]]
         return [*spread, *(force.force for force in self.dead_forces)]
 
     @cached_property
@@ -250,17 +296,12 @@ class Lagrangian(Symbols):
 
     def work_of_multipliers(self, segment: Segment) -> ca.SX:
         """Work of the multipliers of places, the end's and the springs', along a segment [J]."""
-        kind = self.model.chain.kind
         work = ca.SX(0)
         if self.model.end != "free":
-            work = ca.dot(self.lam[: self.model.node.dimension], kind.advance(segment))
-        shares = (
-            ca.vertsplit(self.share_symbols)[len(self.dead_forces) :]
-            if self.model.n_springs
-            else []
-        )
-        for k, share in enumerate(shares):
-            work += ca.dot(self.spring_unknowns(k)[1], kind.advance(segment, share))
+            work = ca.dot(self.lam[: self.node.dimension], self.kind.advance(segment))
+        for k in range(self.model.n_springs):
+            share = self.share_symbols[len(self.dead_forces) + k]
+            work += ca.dot(self.spring_unknowns(k)[1], self.kind.advance(segment, share))
         return work
 
     @cached_property
@@ -277,8 +318,8 @@ class Lagrangian(Symbols):
 
         which is exact for dead loads; the inner unknowns are eliminated.
         """
-        kind, h = self.model.chain.kind, self.model.chain.h
-        ratio, inner = ca.SX.sym("ratio"), ca.SX.sym("inner", kind.n_inner)
+        kind, h = self.kind, self.model.chain.h
+        ratio, inner = ca.SX.sym("ratio"), self.inner
         segment = self.segment(ratio, inner, inner**2)
         plain = self.segment_energy(segment) + self.work_of_multipliers(segment)
 
@@ -310,7 +351,7 @@ class Lagrangian(Symbols):
             Force on the end's holder, then the springs' pulls.
         numbers : SegmentNumbers
         """
-        spread, dead = len(self.model.chain.kind.rule[0]), len(self.dead_forces)
+        spread, dead = len(self.kind.rule[0]), len(self.dead_forces)
         weights = np.zeros((spread + dead + self.model.n_springs, pulls.shape[1]))
         weights[:spread, 0] = -1.0
         weights[spread + dead :, 1:] = -np.eye(self.model.n_springs)
@@ -318,17 +359,17 @@ class Lagrangian(Symbols):
         own = numbers.p, numbers.rest, numbers.place, numbers.deviation, numbers.shares
 
         def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
-            local = ca.vertcat(ca.DM(self.model.node.identity), phi)
+            local = ca.vertcat(ca.DM(self.node.identity), phi)
             return ca.SX(self.segment_in_frame(local, inner, forces, *own))
 
         total = ca.SX(loads) + pulls @ ca.DM(weights.T)
-        return SegmentInFrame(self.model.chain.kind, energy, x, Forces(total, weights))
+        return SegmentInFrame(self.kind, energy, x, Forces(total, weights))
 
     @cached_property
     def segment_forces(self) -> ca.Function:
         """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `segment_in_frame`."""
         forces = self.forces_on(self.segment(self.stretch, self.inner, ca.SX(0)))
-        forces += [ca.SX.zeros(self.model.node.dimension)] * self.model.n_springs
+        forces += [ca.SX.zeros(self.node.dimension)] * self.model.n_springs
         arguments = [self.p, self.place, self.deviation]
         return ca.Function("segment_forces", arguments, [ca.horzcat(*forces)])
 
@@ -340,34 +381,29 @@ class Lagrangian(Symbols):
         that a segment and the forces on it may be turned together: the energy stays. Multipliers of
         the end's place and of the springs' are such forces, too, see `in_frame`.
         """
-        kind, h = self.model.chain.kind, self.model.chain.h
-        ratio, inner = ca.SX.sym("ratio"), self.inner
-        segment = self.segment(ratio, inner, inner**2)
+        kind, h, inner = self.kind, self.model.chain.h, self.inner
+        ratio, local = ca.SX.sym("ratio"), ca.SX.sym("local", self.local.numel())
+        segment = self.segment(ratio, inner, inner**2, local)
         count = len(self.forces_on(segment)) + self.model.n_springs
-        forces = ca.SX.sym("force", self.model.node.dimension, count)
+        forces = ca.SX.sym("force", self.node.dimension, count)
         energy = self.elastic_energy(segment) - self.work_along(segment, ca.horzsplit(forces))
         tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
         lagrangian = kind.expanded(segment, energy, self.elastic_energy)
         lagrangian -= self.axial_compliance * h * tension**2 / 2
-        local, step = self.local
         own = [self.p, self.rest_strains, self.place, self.deviation, self.share_symbols]
-        found = ca.substitute([lagrangian], [ratio, step], [self.stretch, ca.SX.zeros(step.shape)])
-        return ca.Function("segment_in_frame", [local, inner, forces, *own], found)
+        found = ca.substitute(lagrangian, ratio, self.stretch)
+        return ca.Function("segment_in_frame", [local, inner, forces, *own], [found])
 
     @cached_property
     def compliance_of(self) -> dict[int, ca.SX]:
         """What the conditions of clamps that give way give per multiplier, by their places."""
-        sides = {"start": ca.SX(0), "end": ca.SX(0)}
+        total = [ca.SX(0), ca.SX(0)]
         for effect, local in self.effects_of(BoundaryEffect):
-            if effect.gives:
-                for side, compliance in zip(sides, effect.compliance(local), strict=True):
-                    sides[side] += compliance
-        turns = {f"{side}_{turn}": c for side, c in sides.items() for turn in self.model.node.turns}
-        return {
-            k: turns[name]
-            for k, name in enumerate(self.model.condition_names)
-            if name in turns and not turns[name].is_zero()
-        }
+            total = [c + own for c, own in zip(total, effect.compliance(local), strict=True)]
+        sides = zip(("start", "end"), total, strict=True)
+        turns = {f"{side}_{turn}": c for side, c in sides for turn in self.node.turns}
+        names = enumerate(self.model.condition_names)
+        return {k: turns[name] for k, name in names if name in turns and not turns[name].is_zero()}
 
     @cached_property
     def compliances(self) -> ca.Function:
@@ -383,14 +419,11 @@ class Lagrangian(Symbols):
     @cached_property
     def ends_lagrangian(self) -> ca.SX:
         """Lagrangian of the ends: holders, end conditions, and the loads' work at the start."""
-        node = self.model.chain.kind.node
-        x, delta = self.nodes
-        first = node.retract(x[: node.coordinates], delta[: node.increment])
-        last = node.retract(x[node.coordinates :], delta[node.increment :])
-        held = self.true_ends
+        first, last = self.moved
+        held, gap = self.true_ends, self.node.difference
         gaps = [] if self.model.end == "free" else [held.start - held.end]
-        gaps += [node.gap(held.start_frame, first)] if self.model.start == "clamped" else []
-        gaps += [node.gap(held.end_frame, last)] if self.model.end == "clamped" else []
+        gaps += [gap(held.start_frame, first)] if self.model.start == "clamped" else []
+        gaps += [gap(held.end_frame, last)] if self.model.end == "clamped" else []
         total = ca.dot(self.lam[: self.model.n_conditions], ca.vertcat(*gaps)) if gaps else ca.SX(0)
         for effect, local in self.effects_of(BoundaryEffect):
             total += effect.energy(first, last, local)

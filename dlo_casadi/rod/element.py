@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -50,17 +50,17 @@ class Cell:
         return Cell(self.low, half, self.mesh / 2), Cell(self.middle, half, self.mesh / 2)
 
 
-class Law(Protocol):
-    """A section law with its parameters: factors on the elastic energy, see `SectionLaw`."""
+@dataclass(frozen=True)
+class Law:
+    """A section law with its parameters: factors on the elastic energy, see `SectionLaw`.
 
-    def along(self, cell: Cell) -> ca.SX:
-        """Factor on bending and torsion in a cell."""
+    `along` is on bending and torsion in a cell, `of_bend` on the energy of bending alone, by the
+    square of the bend, `tangent` on the stiffness against a small change of such a bend.
+    """
 
-    def of_bend(self, square: ca.SX) -> ca.SX:
-        """Factor on the energy of bending alone, by the square of the bend."""
-
-    def tangent(self, square: ca.SX) -> ca.SX:
-        """Factor on the stiffness against a small change of such a bend."""
+    along: Callable[[Cell], ca.SX]
+    of_bend: Callable[[ca.SX], ca.SX]
+    tangent: Callable[[ca.SX], ca.SX]
 
 
 @dataclass(frozen=True)
@@ -230,6 +230,8 @@ class Element(ABC):
         it, else by chords.
     plain : str
         Name of the element without the inner unknowns, on the same nodes.
+    framed : bool
+        Whether its Lagrangian is differentiated in the frame in its middle, see `in_frame`.
     n_inner : int
         Number of unknowns inside an element that are eliminated from it.
     rule : (nodes, weights)
@@ -242,6 +244,7 @@ class Element(ABC):
     smooth: ClassVar[bool]
     plain: ClassVar[str]
     nodes_are: ClassVar[str]
+    framed: ClassVar[bool] = False
     n_inner: ClassVar[int] = 0
     rule: ClassVar[tuple[FloatArray, FloatArray]]
 
@@ -250,19 +253,8 @@ class Element(ABC):
         """Nodes and segments of a cable of n elements; `clamped`: its start, its end."""
 
     def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
-        """Local coordinates (n_local,) of two nodes: what the element is written in.
-
-        Derivatives are taken by their increments, and passed on to those of the nodes.
-        """
+        """Local coordinates (n_local,) of two nodes: what the element is written in."""
         return ca.vertcat(first, last)
-
-    def local_moved(self, local: ca.SX, step: ca.SX) -> ca.SX:
-        """Local coordinates moved by increments (2 b,)."""
-        return local + step
-
-    def local_gap(self, local: ca.SX, other: ca.SX) -> ca.SX:
-        """Increments (2 b,) that move local coordinates to others."""
-        return other - local
 
     @abstractmethod
     def strain(self, segment: Segment) -> ca.SX:

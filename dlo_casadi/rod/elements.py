@@ -209,6 +209,7 @@ class Helix(Element):
     plain = "arc"
     nodes_are = "at the nodes"
     node = Frame
+    framed = True
     order = 2
     smooth = True
     rule = Arc.rule
@@ -230,14 +231,6 @@ class Helix(Element):
         half, w = halves[0]
         middle = quaternion_product(ca.vertsplit(first), (*ca.vertsplit(half), w))
         return ca.vertcat(*middle, phi)
-
-    def local_moved(self, local: ca.SX, step: ca.SX) -> ca.SX:
-        """The frame turned, the rotation vector added to."""
-        return ca.vertcat(Frame.retract(local[:4], step[:3]), local[4:] + step[3:])
-
-    def local_gap(self, local: ca.SX, other: ca.SX) -> ca.SX:
-        """Turn of the frame, difference of the rotation vectors."""
-        return ca.vertcat(Frame.gap(local[:4], other[:4]), other[4:] - local[4:])
 
     def strain(self, segment: Segment) -> ca.SX:
         """Mean twist, and mean curvatures about the axes y and z."""

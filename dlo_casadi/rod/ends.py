@@ -74,9 +74,8 @@ class EndConditions:
 
     def turned(self, start: ca.SX | None = None, end: ca.SX | None = None) -> EndConditions:
         """Return a copy whose clamps are turned by increments about their own axes."""
-        first, last = self.start_frame, self.end_frame
-        if start is not None:
-            first = self.node.retract(first, start)
-        if end is not None:
-            last = self.node.retract(last, end)
+        first, last = (
+            frame if turn is None else self.node.moved(frame, turn)
+            for frame, turn in ((self.start_frame, start), (self.end_frame, end))
+        )
         return replace(self, start_frame=first, end_frame=last)

@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.floating]
 
+_CASADI = (ca.SX, ca.MX, ca.DM)
+
 # sin(x) / x in powers of x^2: to 2e-15 for x = 0.65, to 3e-14 for half of a quarter turn.
 SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(7))
 
@@ -47,23 +49,16 @@ class Node(ABC):
 
     @staticmethod
     @abstractmethod
-    def retract(x: ca.SX, delta: ca.SX) -> ca.SX:
-        """Coordinates (coordinates,) of the node moved by the increment (increment,) [rad]."""
+    def moved(x: Any, delta: Any) -> Any:
+        """Nodes (..., coordinates) moved by increments (..., increment) [rad].
+
+        Arrays, or expressions of one node; so are those of `difference` and `to_world`.
+        """
 
     @staticmethod
     @abstractmethod
-    def gap(x: ca.SX, y: ca.SX) -> ca.SX:
-        """Increment (increment,) [rad] that moves x to y: of headings, whole turns included."""
-
-    @staticmethod
-    @abstractmethod
-    def moved(x: FloatArray, delta: FloatArray) -> FloatArray:
-        """`retract` of many nodes: (..., coordinates), (..., increment) -> (..., coordinates)."""
-
-    @staticmethod
-    @abstractmethod
-    def difference(x: FloatArray, y: FloatArray) -> FloatArray:
-        """Increments (..., increment) [rad] that move x to y, both (..., coordinates)."""
+    def difference(x: Any, y: Any) -> Any:
+        """Increments (..., increment) [rad] that move x to y: of headings, whole turns included."""
 
     @staticmethod
     @abstractmethod
@@ -82,13 +77,8 @@ class Node(ABC):
 
     @staticmethod
     @abstractmethod
-    def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
+    def to_world(x: Any, moments: Any) -> Any:
         """Moments (..., increment) about the axes of nodes (..., coordinates), to the world's."""
-
-    @staticmethod
-    @abstractmethod
-    def in_world(x: ca.SX, moment: ca.SX) -> ca.SX:
-        """`to_world` of one moment (increment,) as an expression."""
 
     @classmethod
     @abstractmethod
@@ -117,22 +107,12 @@ class Heading(Node):
     identity = (0.0,)
 
     @staticmethod
-    def retract(x: ca.SX, delta: ca.SX) -> ca.SX:
-        """Add the angle."""
-        return x + delta
-
-    @staticmethod
-    def gap(x: ca.SX, y: ca.SX) -> ca.SX:
-        """Angle from x to y."""
-        return y - x
-
-    @staticmethod
-    def moved(x: FloatArray, delta: FloatArray) -> FloatArray:
+    def moved(x: Any, delta: Any) -> Any:
         """Add the angles."""
         return x + delta
 
     @staticmethod
-    def difference(x: FloatArray, y: FloatArray) -> FloatArray:
+    def difference(x: Any, y: Any) -> Any:
         """Angles from x to y, whole turns included."""
         return y - x
 
@@ -153,14 +133,9 @@ class Heading(Node):
         return (x + y) / 2
 
     @staticmethod
-    def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
+    def to_world(x: Any, moments: Any) -> Any:
         """A moment in a plane is the same about both."""
-        return vectors
-
-    @staticmethod
-    def in_world(x: ca.SX, moment: ca.SX) -> ca.SX:
-        """A moment in a plane is the same about both."""
-        return moment
+        return moments
 
     @classmethod
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
@@ -195,34 +170,24 @@ class Frame(Node):
     identity = (0.0, 0.0, 0.0, 1.0)
 
     @staticmethod
-    def retract(x: ca.SX, delta: ca.SX) -> ca.SX:
-        """Turn about the frame's own axes."""
-        half = [d / 2 for d in ca.vertsplit(delta)]
-        scale = 1 / ca.sqrt(1 + sum((h * h for h in half), start=ca.SX(0)))
-        return ca.vertcat(*quaternion_product(ca.vertsplit(x), (*half, ca.SX(1)))) * scale
-
-    @staticmethod
-    def gap(x: ca.SX, y: ca.SX) -> ca.SX:
-        """2 tan(angle / 2) about the axis of the rotation from x to y, in the frame x."""
-        *vector, w = quaternion_product(conjugate(ca.vertsplit(x)), ca.vertsplit(y))
-        return ca.vertcat(*(2 * v / w for v in vector))
-
-    @staticmethod
-    def moved(x: FloatArray, delta: FloatArray) -> FloatArray:
+    def moved(x: Any, delta: Any) -> Any:
         """Turn about the frames' own axes."""
-        half = np.moveaxis(delta, -1, 0) / 2
-        product = quaternion_product(np.moveaxis(x, -1, 0), (*half, np.ones_like(half[0])))
-        out = np.stack(np.broadcast_arrays(*product), axis=-1)
-        return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+        half = [part / 2 for part in components(delta)]
+        turned = quaternion_product(components(x), (*half, 1.0))
+        if isinstance(x, _CASADI):
+            scale = 1 / ca.sqrt(1 + sum((h * h for h in half), start=ca.SX(0)))
+            return ca.vertcat(*turned) * scale
+        out = np.stack(np.broadcast_arrays(*turned), axis=-1)
+        return out / np.linalg.norm(out, axis=-1, keepdims=True)
 
     @staticmethod
-    def difference(x: FloatArray, y: FloatArray) -> FloatArray:
+    def difference(x: Any, y: Any) -> Any:
         """2 tan(angle / 2) about the axis of the rotation from x to y, in the frame x."""
-        first, last = np.moveaxis(x, -1, 0), np.moveaxis(y, -1, 0)
-        *vector, w = quaternion_product(conjugate(first), last)
+        *vector, w = quaternion_product(conjugate(components(x)), components(y))
+        if isinstance(x, _CASADI):
+            return ca.vertcat(*(2 * v / w for v in vector))
         # Turned by half a turn there is no such increment; it is then as long as can be told.
-        least = np.where(w < 0, -1e-12, 1e-12)
-        w = np.where(np.abs(w) < 1e-12, least, w)
+        w = np.where(np.abs(w) < 1e-12, np.where(w < 0, -1e-12, 1e-12), w)
         return np.stack([2 * v / w for v in vector], axis=-1)
 
     @staticmethod
@@ -249,14 +214,11 @@ class Frame(Node):
         return (x + y) / ca.norm_2(x + y)
 
     @staticmethod
-    def to_world(x: FloatArray, vectors: FloatArray) -> FloatArray:
+    def to_world(x: Any, moments: Any) -> Any:
         """Turned by the frames."""
-        return Rotation.from_quat(x).apply(vectors)
-
-    @staticmethod
-    def in_world(x: ca.SX, moment: ca.SX) -> ca.SX:
-        """Turned by the frame."""
-        return rotated(x, moment)
+        if isinstance(x, _CASADI):
+            return rotated(x, moments)
+        return Rotation.from_quat(x).apply(moments)
 
     @classmethod
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
@@ -264,6 +226,11 @@ class Frame(Node):
         gap = cls.difference(x, y)
         gap[:, 0] -= gap[:, 0].mean()
         return bool(np.abs(gap).max() < tolerance)
+
+
+def components(x: Any) -> Any:
+    """Components of a vector: the rows of an expression, or the last axis of an array."""
+    return ca.vertsplit(x) if isinstance(x, _CASADI) else np.moveaxis(x, -1, 0)
 
 
 def quaternion_product(p: Any, q: Any) -> tuple[Any, Any, Any, Any]:

@@ -41,7 +41,7 @@ class Ipopt:
         frames, turns = ca.SX.sym("frames", 4 * count), ca.SX.sym("turns", 3 * count)
         inner = problem.coordinates[4 * count :]
         moved = [
-            node.retract(frames[4 * i : 4 * i + 4], turns[3 * i : 3 * i + 3]) for i in range(count)
+            node.moved(frames[4 * i : 4 * i + 4], turns[3 * i : 3 * i + 3]) for i in range(count)
         ]
         energy, conditions = ca.substitute(
             [problem.energy, problem.conditions],
