@@ -134,6 +134,11 @@ class _Mapped:
         return [out.transpose(0, 1, 3, 2) for out in outputs]
 
 
+def _repeated(rows: FloatArray, count: int) -> FloatArray:
+    """Rows (m, k) of poses, the same for `count` segments or stations (m, count, k)."""
+    return np.broadcast_to(rows[:, None], (len(rows), count, rows.shape[1]))
+
+
 class Assembly:
     """A model evaluated over poses.
 
@@ -146,6 +151,8 @@ class Assembly:
         self.model = model
         self.chain, self.node = model.chain, model.chain.kind.node
         self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
+        # Rows of the first node, of the last, and of the border.
+        self._parts = slice(0, self.b), slice(self.b, 2 * self.b), slice(2 * self.b, None)
         self._segments = self.chain.n_segments
         # Numbers that tell the rest strains inside a segment.
         self.n_inside = 3 * len(self.node.strains)
@@ -165,15 +172,16 @@ class Assembly:
 
     def _call_segments(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """A function of a segment for all segments: outputs (m, n_segments, rows, columns)."""
-        m = len(shapes.x)
-        both = np.concatenate([shapes.x[:, : self._segments], shapes.x[:, self._next]], axis=2)
+        count, places = self._segments, self.chain.layout.segments
         own = self.chain.rest_inside(given.rest[..., None])[..., 0]
         alike = (shapes.lam, given.p, shapes.deviation)
-        lam, p, deviation = (
-            np.broadcast_to(one[:, None], (m, self._segments, one.shape[1])) for one in alike
-        )
-        place = np.broadcast_to(self.chain.layout.segments, (m, *self.chain.layout.segments.shape))
-        return self._mapped(name, self._segments)(both, lam, p, own, place, deviation)
+        lam, p, deviation = (_repeated(one, count) for one in alike)
+        place = np.broadcast_to(places, (len(shapes.x), *places.shape))
+        return self._mapped(name, count)(self._both(shapes.x), lam, p, own, place, deviation)
+
+    def _both(self, nodes: FloatArray) -> FloatArray:
+        """Rows (m, n_segments, 2 k, ...) of both nodes of segments, of (m, n_nodes, k, ...)."""
+        return np.concatenate([nodes[:, : self._segments], nodes[:, self._next]], axis=2)
 
     def _call_ends(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """A function of both ends: outputs (m, rows, columns)."""
@@ -182,16 +190,26 @@ class Assembly:
         rows = [both, *(one[:, None] for one in others)]
         return [out[:, 0] for out in self._mapped(name, 1)(*rows)]
 
+    def _at_nodes(
+        self, first: FloatArray, last: FloatArray, start: FloatArray, end: FloatArray
+    ) -> FloatArray:
+        """Blocks of both nodes of segments (m, n_segments, ...) and of the ends, at the nodes."""
+        count = self._segments
+        total = np.zeros((len(first), max(count + 1, self.n), *first.shape[2:]))
+        total[:, :count] += first
+        total[:, 1 : count + 1] += last
+        total = total[:, : self.n]
+        total[:, 0] += start
+        total[:, -1] += end
+        return total
+
     def _added(self, segments: FloatArray, ends: FloatArray) -> Vector:
         """Rows (2b + k, q) of the segments and the ends, added up to nodes and border."""
-        m, b = len(segments), self.b
-        x = np.zeros((m, max(self._segments + 1, self.n), b, segments.shape[3]))
-        x[:, : self._segments] += segments[:, :, :b]
-        x[:, 1 : self._segments + 1] += segments[:, :, b : 2 * b]
-        x = x[:, : self.n]
-        x[:, 0] += ends[:, :b]
-        x[:, -1] += ends[:, b : 2 * b]
-        return Vector(x, segments[:, :, 2 * b :].sum(axis=1) + ends[:, 2 * b :])
+        first, last, border = self._parts
+        x = self._at_nodes(
+            segments[:, :, first], segments[:, :, last], ends[:, first], ends[:, last]
+        )
+        return Vector(x, segments[:, :, border].sum(axis=1) + ends[:, border])
 
     # ---- balance -------------------------------------------------------------------------------
 
@@ -223,22 +241,12 @@ class Assembly:
         return self._added(slope, end_slope)
 
     def _band(self, bend: FloatArray, ends: FloatArray) -> BandMatrix:
-        m, b, k, n = len(bend), self.b, self.k, self.n
-        size = max(self._segments + 1, n)
-        diagonal = np.zeros((m, size, b, b))
-        diagonal[:, : self._segments] += bend[:, :, :b, :b]
-        diagonal[:, 1 : self._segments + 1] += bend[:, :, b : 2 * b, b : 2 * b]
-        diagonal = diagonal[:, :n]
-        diagonal[:, 0] += ends[:, :b, :b]
-        diagonal[:, -1] += ends[:, b : 2 * b, b : 2 * b]
-        border = np.zeros((m, size, b, k))
-        border[:, : self._segments] += bend[:, :, :b, 2 * b :]
-        border[:, 1 : self._segments + 1] += bend[:, :, b : 2 * b, 2 * b :]
-        border = border[:, :n]
-        border[:, 0] += ends[:, :b, 2 * b :]
-        border[:, -1] += ends[:, b : 2 * b, 2 * b :]
-        corner = bend[:, :, 2 * b :, 2 * b :].sum(axis=1) + ends[:, 2 * b :, 2 * b :]
-        return BandMatrix(diagonal, bend[:, : n - 1, :b, b : 2 * b].copy(), border, corner)
+        first, last, border = self._parts
+        own, at_ends = bend[:, :, last, last], ends[:, last, last]
+        diagonal = self._at_nodes(bend[:, :, first, first], own, ends[:, first, first], at_ends)
+        columns = self._added(bend[..., border], ends[..., border])
+        upper = bend[:, : self.n - 1, first, last].copy()
+        return BandMatrix(diagonal, upper, columns.x, columns.y)
 
     def energy(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers."""
@@ -255,12 +263,19 @@ class Assembly:
         (segments,) = self._call_segments("segment_sensitivity", shapes, given)
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
         n_p = along.p.shape[1]
-        moved = segments[..., :n_p] @ along.p[:, None]
-        n_r = n_p + self.n_inside
-        moved += segments[..., n_p:n_r] @ self.chain.rest_inside(along.rest)
-        moved += segments[..., n_r:] @ along.deviation[:, None]
         at_ends = ends[..., :n_p] @ along.p + ends[..., n_p:] @ along.deviation
-        return self._added(moved, at_ends)
+        return self._added(self.add_by_numbers(0.0, segments, along), at_ends)
+
+    def add_by_numbers(
+        self, total: FloatArray | float, blocks: FloatArray, along: Tangents
+    ) -> FloatArray:
+        """Add to a total the change along p, rest and deviation, of derivatives of segments."""
+        n_p = along.p.shape[1]
+        n_r = n_p + self.n_inside
+        total = total + blocks[..., :n_p] @ along.p[:, None]
+        total += blocks[..., n_p:n_r] @ self.chain.rest_inside(along.rest)
+        total += blocks[..., n_r:] @ along.deviation[:, None]
+        return np.asarray(total)
 
     # ---- the curve ------------------------------------------------------------------------------
 
@@ -289,9 +304,7 @@ class Assembly:
         m, count = len(shapes.x), self.chain.n + 1
         places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
         x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
-        p, ends = (
-            np.broadcast_to(a[:, None], (m, count, a.shape[1])) for a in (given.p, given.poses)
-        )
+        p, ends = _repeated(given.p, count), _repeated(given.poses, count)
         return self._mapped(name, count)(places, rates, x, p, ends)
 
     def curve_slopes(self, shapes: Shapes, given: Inputs) -> CurveSlopes:
@@ -379,17 +392,12 @@ class CurveSlopes:
     def along(self, directions: Tangents) -> FloatArray:
         """Change (m, n + 1, d or 2 d, q) of the measured curves."""
         a, d = self.assembly, directions
-        n_p, b = d.p.shape[1], a.b
-        nodes = np.concatenate([d.x[:, : a._segments], d.x[:, a._next]], axis=2)
-        steps = self.by_moving[..., : 2 * b] @ nodes
-        steps += self.by_moving[..., 2 * b :] @ d.lam[:, None]
-        steps += self.by_others[..., :n_p] @ d.p[:, None]
-        n_r = n_p + a.n_inside
-        steps += self.by_others[..., n_p:n_r] @ a.chain.rest_inside(d.rest)
-        steps += self.by_others[..., n_r:] @ d.deviation[:, None]
+        by_nodes, by_lam = np.split(self.by_moving, [2 * a.b], axis=-1)
+        steps: FloatArray = by_nodes @ a._both(d.x) + by_lam @ d.lam[:, None]
+        steps = a.add_by_numbers(steps, self.by_others, d)
         start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))
         places, rates = a._stations(steps, start)
-        shape = (len(steps), a.chain.n + 1, 2 * b, steps.shape[3])
+        shape = (len(steps), a.chain.n + 1, 2 * a.b, steps.shape[3])
         own = d.x[:, a.chain.layout.stations].reshape(shape)
         moved = self.by_station @ np.concatenate([places, rates, own], axis=2)
         return np.asarray(moved + self.by_p @ d.p[:, None])

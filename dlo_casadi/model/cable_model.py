@@ -227,7 +227,8 @@ class CableModel:
         """
         held = "clamped" in (self.start, self.end)
         laws = [effect for effect in self.effects if isinstance(effect, SectionLaw)]
-        return self.in_space and not held and all(law.isotropic for law in laws)
+        twists = "twist" in self.node.strains
+        return twists and not held and all(law.isotropic for law in laws)
 
     @property
     def shape_dependent_loads(self) -> tuple[str, ...]:
@@ -279,10 +280,13 @@ class CableModel:
     @cached_property
     def condition_names(self) -> tuple[str, ...]:
         """Names of the end conditions: end position, then frames of clamps."""
-        axes, turns = self.node.axes, self.node.turns
-        names = [] if self.end == "free" else [f"end_position_{axis}" for axis in axes]
-        names += [f"start_{turn}" for turn in turns] if self.start == "clamped" else []
-        names += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
+        return self._held("end_position")
+
+    def _held(self, place: str) -> tuple[str, ...]:
+        """Components of what is held: of the end's place, as it is called, and of clamps."""
+        names = [] if self.end == "free" else [f"{place}_{axis}" for axis in self.node.axes]
+        for side, kind in (("start", self.start), ("end", self.end)):
+            names += [f"{side}_{turn}" for turn in self.node.turns if kind == "clamped"]
         return tuple(names)
 
     @cached_property
@@ -299,12 +303,8 @@ class CableModel:
     @cached_property
     def deviations(self) -> tuple[str, ...]:
         """Which deviations of a pose can matter for these boundaries."""
-        axes, turns = self.node.axes, self.node.turns
-        used = [] if self.end == "free" else [f"end_{axis}" for axis in axes]
-        used += [f"start_{turn}" for turn in turns] if self.start == "clamped" else []
-        used += [f"end_{turn}" for turn in turns] if self.end == "clamped" else []
-        used += [name for effect in self.effects for name in effect.per_pose(self.cable)]
-        return tuple(used)
+        own = [name for effect in self.effects for name in effect.per_pose(self.cable)]
+        return (*self._held("end"), *own)
 
 
 @dataclass(frozen=True)

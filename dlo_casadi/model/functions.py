@@ -109,16 +109,17 @@ class Functions:
     @cached_property
     def _framed(self) -> SegmentInFrame:
         """The segment in space, at this model's own symbols."""
-        starts = [] if self.model.end == "free" else [0]
-        starts += [self.model.n_conditions + 6 * k + 3 for k in range(self.model.n_springs)]
-        pulls = [self.terms.lam[k : k + 3] for k in starts]
-        if self.model.end == "free":
-            pulls = [ca.SX.zeros(3), *pulls]
-        shares = ca.SX(self.terms.shares(self.terms.p, self.terms.place))
-        numbers = SegmentNumbers(
-            self.terms.p, self.terms.rest_strains, self.terms.place, self.terms.deviation, shares
-        )
+        free, lam = self.model.end == "free", self.terms.lam
+        pulls = [ca.SX.zeros(3)] * free + [lam[k : k + 3] for k in self._pull_rows]
+        _, _, p, rest, place, deviation = self._segment_arguments
+        numbers = SegmentNumbers(p, rest, place, deviation, ca.SX(self.terms.shares(p, place)))
         return self.terms.in_frame(self.terms.x, ca.horzcat(*pulls), numbers)
+
+    @property
+    def _pull_rows(self) -> list[int]:
+        """First rows in the multipliers of the force on the end's holder and of springs' pulls."""
+        springs = [self.model.n_conditions + 6 * k + 3 for k in range(self.model.n_springs)]
+        return springs if self.model.end == "free" else [0, *springs]
 
     @cached_property
     def _about_nodes(self) -> SegmentDerivatives:
@@ -129,19 +130,10 @@ class Functions:
     @property
     def _of_pulls(self) -> ca.DM:
         """Matrix from both nodes and the pulls to both nodes and all multipliers."""
-        rows = np.zeros(
-            (
-                2 * self.model.node.increment + self.model.n_border,
-                6 + 3 * (1 + self.model.n_springs),
-            )
-        )
-        rows[:6, :6] = np.eye(6)
-        if self.model.end != "free":
-            rows[6:9, 6:9] = np.eye(3)
-        for k in range(self.model.n_springs):
-            at = 6 + self.model.n_conditions + 6 * k + 3
-            rows[at : at + 3, 9 + 3 * k : 12 + 3 * k] = np.eye(3)
-        return ca.sparsify(ca.DM(rows))
+        every = np.eye(6 + self.model.n_border)
+        none = [np.zeros((len(every), 3))] * (self.model.end == "free")
+        pulls = [every[:, 6 + k : 9 + k] for k in self._pull_rows]
+        return ca.sparsify(ca.DM(np.hstack([every[:, :6], *none, *pulls])))
 
     @cached_property
     def at_ends(self) -> ca.Function:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -32,15 +30,15 @@ class PoseSymbols:
     @classmethod
     def of(cls, model: CableModel) -> PoseSymbols:
         """Fresh symbols."""
-        chain = model.chain
-        return cls(
-            ca.SX.sym("x", chain.n_nodes * chain.kind.node.coordinates),
-            ca.SX.sym("lam", model.n_border),
-            ca.SX.sym("p", len(model.parameters)),
-            ca.SX.sym("kappa_0", chain.n_rests),
-            ca.SX.sym("pose", model.n_pose),
-            ca.SX.sym("deviation", len(model.deviation_names)),
-        )
+        sizes = {
+            "x": model.chain.n_nodes * model.node.coordinates,
+            "lam": model.n_border,
+            "p": len(model.parameters),
+            "rest": model.chain.n_rests,
+            "pose": model.n_pose,
+            "deviation": len(model.deviation_names),
+        }
+        return cls(**{name: ca.SX.sym(name, size) for name, size in sizes.items()})
 
 
 @dataclass(frozen=True)
@@ -62,66 +60,49 @@ def potential(model: CableModel) -> Potential:
     The coordinates are the nodes', the places of springs, the unknowns inside the segments, then
     those of clamps that give way: a clamp of the compliance c turns by sqrt(c) a and stores a^2/2.
     """
-    s, chain = PoseSymbols.of(model), model.chain
-    inner = ca.SX.sym("inner", model.n_inner, chain.n_segments)
-    energy, gradient, _ = functions_of(model).at_ends(*_end_arguments(model, s))
-    conditions = gradient[2 * chain.kind.node.increment :]
-    for j, arguments in enumerate(_segment_arguments(model, s)):
-        own, reached = functions_of(model).segment_potential(*arguments, inner[:, j])
-        energy, conditions = energy + own, conditions + reached
+    s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
+    inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
+    energy, gradient, _ = functions.at_ends(*_end_arguments(model, s))
+    own, reached = functions.segment_potential(*_segment_arguments(model, s), inner)
+    energy = sum(ca.horzsplit(own), start=energy)
+    conditions = sum(ca.horzsplit(reached), start=gradient[2 * model.node.increment :])
     multipliers = np.flatnonzero(model.are_multipliers).tolist()
     places = np.flatnonzero(~model.are_multipliers).tolist()
-    zero = ca.SX.zeros(len(multipliers))
-    given_way = ca.SX.sym("given_way", len(lagrangian_of(model).compliant))
-    if lagrangian_of(model).compliant:
+    given_way = ca.SX.sym("given_way", len(lagrangian.compliant))
+    if lagrangian.compliant:
         energy += ca.sumsqr(given_way) / 2
-        conditions[lagrangian_of(model).compliant] -= (
-            ca.sqrt(lagrangian_of(model).compliances(s.p)) * given_way
-        )
-    given = [energy, conditions[multipliers]]
+        conditions[lagrangian.compliant] -= ca.sqrt(lagrangian.compliances(s.p)) * given_way
+    given, zero = [energy, conditions[multipliers]], ca.SX.zeros(len(multipliers))
     energy, conditions = ca.substitute(given, [s.lam[multipliers]], [zero])
+    coordinates = ca.vertcat(s.x, *(s.lam[i] for i in places), ca.vec(inner), given_way)
     parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
-    held = [s.lam[i] for i in places]
-    coordinates = ca.vertcat(s.x, *held, *ca.vertsplit(ca.vec(inner)), given_way)
     return Potential(coordinates, parameters, energy, conditions)
 
 
 def balance(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Gradient of the Lagrangian by increments and multipliers: force balance, then conditions."""
-    node, segments = model.chain.kind.node, model.chain.n_segments
-    b, n = node.increment, model.chain.n_nodes
-    rows = [ca.SX.zeros(b) for _ in range(max(n, segments + 1))]
-    _, ends, _ = functions_of(model).at_ends(*_end_arguments(model, s))
-    border = ends[2 * b :]
-    for j, arguments in enumerate(_segment_arguments(model, s)):
-        _, gradient, _ = functions_of(model).segment(*arguments)
-        rows[j] += gradient[:b]
-        rows[j + 1] += gradient[b : 2 * b]
-        border += gradient[2 * b :]
-    rows[0] += ends[:b]
-    rows[n - 1] += ends[b : 2 * b]
-    return ca.vertcat(*rows[:n], border)
+    b, functions = model.node.increment, functions_of(model)
+    _, ends, _ = functions.at_ends(*_end_arguments(model, s))
+    gradient = functions.segment_slope(*_segment_arguments(model, s))
+    none = ca.SX.zeros(b)
+    rows = ca.horzcat(none, gradient[b : 2 * b, :]) + ca.horzcat(gradient[:b, :], none)
+    rows = rows[:, : model.chain.n_nodes]
+    rows[:, 0] += ends[:b]
+    rows[:, -1] += ends[b : 2 * b]
+    return ca.vertcat(ca.vec(rows), sum(ca.horzsplit(gradient[2 * b :, :]), start=ends[2 * b :]))
 
 
 def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Measured curve ((n + 1) d or 2 d,): place, and slope of smooth elements, node by node."""
-    chain, layout = model.chain, model.chain.layout
-    c, d = chain.kind.node.coordinates, chain.kind.node.dimension
-    arguments = _segment_arguments(model, s)
-    steps = [functions_of(model).segment_curve(*arguments[j]) for j in layout.advancing]
-    rates = [step[d:] for step in steps]
-    rates = [
-        rates[0],
-        *((a + b) / 2 for a, b in pairwise(rates)),
-        rates[-1],
-    ]
-    point, rows = s.pose[:d], []
-    for i, (first, last) in enumerate(layout.stations):
-        both = ca.vertcat(s.x[first * c : (first + 1) * c], s.x[last * c : (last + 1) * c])
-        rows.append(functions_of(model).station(point, rates[i], both, s.p, s.pose))
-        if i < chain.n:
-            point = point + steps[i][:d]
-    return ca.vertcat(*rows)
+    layout, d, functions = model.chain.layout, model.node.dimension, functions_of(model)
+    steps = functions.segment_curve(*_segment_arguments(model, s))[:, layout.advancing.tolist()]
+    points = ca.cumsum(ca.horzcat(s.pose[:d], steps[:d, :]), 1)
+    rates = steps[d:, :]
+    rates = ca.horzcat(rates[:, 0], (rates[:, :-1] + rates[:, 1:]) / 2, rates[:, -1])
+    first, last = layout.stations.T.tolist()
+    x = ca.reshape(s.x, model.node.coordinates, model.chain.n_nodes)
+    both = ca.vertcat(x[:, first], x[:, last])
+    return ca.vec(functions.station(points, rates, both, s.p, s.pose))
 
 
 def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
@@ -131,28 +112,22 @@ def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
 
 def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Rest curvature (n_rests,) [1/m] that the pose leaves behind."""
-    arguments = _segment_arguments(model, s)
-    rests: list[Any] = [
-        functions_of(model).segment_state(*arguments[j])[0].T for j in model.chain.layout.bends
-    ]
-    return ca.vec(ca.vertcat(*rests))
+    after, *_ = functions_of(model).segment_state(*_segment_arguments(model, s))
+    return ca.vec(after[:, model.chain.layout.bends.tolist()].T)
 
 
 def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
-    c = model.chain.kind.node.coordinates
+    c = model.node.coordinates
     both = ca.vertcat(s.x[:c], s.x[s.x.numel() - c :])
     return [both, s.lam, s.p, s.pose, s.deviation]
 
 
-def _segment_arguments(model: CableModel, s: PoseSymbols) -> list[list[ca.SX]]:
+def _segment_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
+    """A column for each segment, one column of what is alike in all."""
     chain = model.chain
-    c, last = chain.kind.node.coordinates, chain.n_nodes - 1
-    cells, weights = chain.rest_stencils
-    rows: list[list[Any]] = []
-    for j in range(chain.n_segments):
-        k = min(j + 1, last)
-        both = ca.vertcat(s.x[j * c : (j + 1) * c], s.x[k * c : (k + 1) * c])
-        axes = ca.vertsplit(s.rest, chain.n_cells)
-        own = ca.vertcat(*(ca.DM(weights[j]) @ axis[cells[j].tolist()] for axis in axes))
-        rows.append([both, s.lam, s.p, own, ca.DM(chain.layout.segments[j]), s.deviation])
-    return rows
+    x = ca.reshape(s.x, model.node.coordinates, chain.n_nodes)
+    after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)
+    both = ca.vertcat(x[:, : chain.n_segments], x[:, after.tolist()])
+    inside = chain.rest_inside(np.eye(chain.n_rests)).reshape((-1, chain.n_rests))
+    rest = ca.reshape(ca.sparsify(ca.DM(inside)) @ s.rest, -1, chain.n_segments)
+    return [both, s.lam, s.p, rest, ca.DM(chain.layout.segments.T), s.deviation]
