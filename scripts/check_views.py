@@ -67,10 +67,7 @@ def main() -> None:
             {name: every[name] for name in pose["files"]},
             board,
             camera or found.camera,
-            start=pose["start"],
-            end=pose.get("end"),
-            diameter=cable["diameter"],
-            length=cable["length"],
+            vision.KnownCable(pose["start"], pose.get("end"), cable["diameter"], cable["length"]),
         )
         each = (time.process_time() - began) / len(pose["files"])
         key = f"pose_{number:02d}"

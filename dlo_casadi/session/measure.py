@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import fields, replace
 from typing import Any
 
@@ -128,7 +129,7 @@ def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
         image = vision.read_image(pose.paths[0])
         free = pose.model_copy(update={"end": None})
         view = view_of(config, image)
-        return vision.extract_centerline(image, view, **_held(config, free)).points
+        return vision.extract_centerline(image, view, _held(config, free)).points
     except MeasurementError:
         return None
 
@@ -170,7 +171,7 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
         images,
         board_of(measurement),
         _camera(measurement.camera),
-        **_held(config, pose),
+        _held(config, pose),
     )
     problems += views.problems.values()
     if not views.curves:
@@ -195,7 +196,7 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
     image = vision.read_image(pose.paths[0])
     try:
         view = view_of(config, image)
-        line = vision.extract_centerline(image, view, **_held(config, pose))
+        line = vision.extract_centerline(image, view, _held(config, pose))
     except MeasurementError as error:
         hint = _turned(config, pose, image)
         raise MeasurementError(f"{error.message}{hint}") from None
@@ -218,15 +219,9 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
     )
 
 
-def _held(config: Config, pose: DeclaredPose) -> dict[str, Any]:
-    """What is known of the cable in a photograph, as `vision` takes it."""
-    cable = config.cable
-    return {
-        "start": pose.start,
-        "end": pose.end,
-        "diameter": cable.diameter,
-        "length": cable.length,
-    }
+def _held(config: Config, pose: DeclaredPose) -> vision.KnownCable:
+    """What is known of the cable in a photograph."""
+    return vision.KnownCable(pose.start, pose.end, config.cable.diameter, config.cable.length)
 
 
 def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
@@ -241,7 +236,8 @@ def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
     """
     if _reader(config, pose) is _read_csv:
         return {}
-    steps = _steps_in_space if config.experiment.in_space else _steps_in_plane
+    measurement, cable = config.experiment.measurement, _held(config, pose)
+    assert measurement.kind == "images"
     drawn: dict[str, np.ndarray] = {}
     unread = None
     for name, path in pose.photographs.items():
@@ -250,41 +246,20 @@ def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
         except MeasurementError as error:
             unread = error
             continue
-        drawn |= {f"{name}_{step}": shown for step, shown in steps(config, pose, image).items()}
+        workings = vision.Workings()
+        with suppress(MeasurementError):  # the pictures show how far it came; the table says why
+            if config.experiment.in_space:
+                assert measurement.camera is not None
+                camera = _camera(measurement.camera)
+                viewpoint = vision.locate_camera(image, board_of(measurement), camera)
+                vision.see_cable(image, viewpoint, cable, workings)
+            else:
+                vision.extract_centerline(image, view_of(config, image), cable, workings)
+        steps = vision.draw_steps(image, workings)
+        drawn |= {f"{name}_{step}": shown for step, shown in steps.items()}
     if unread is not None and not drawn:
         raise unread
     return drawn
-
-
-def _steps_in_plane(config: Config, pose: DeclaredPose, image: np.ndarray) -> dict[str, np.ndarray]:
-    view, line, workings = None, None, vision.Workings()
-    try:
-        view = view_of(config, image)
-        line = vision.extract_centerline(image, view, **_held(config, pose), workings=workings)
-    except MeasurementError:  # the pictures show how far it came; the table says why
-        pass
-    pixels, gaps = (None, ()) if line is None else (line.pixels, line.gaps)
-    return vision.draw_steps(image, view, workings, pixels, pose.start, pose.end, gaps)
-
-
-def _steps_in_space(config: Config, pose: DeclaredPose, image: np.ndarray) -> dict[str, np.ndarray]:
-    measurement = config.experiment.measurement
-    assert measurement.kind == "images"
-    assert measurement.camera is not None
-    view, pixels, workings = None, None, vision.Workings()
-    fixtures = [at for at in (pose.start, pose.end) if at is not None]
-    flat = np.zeros((2, 2))
-    try:
-        viewpoint = vision.locate_camera(image, board_of(measurement), _camera(measurement.camera))
-        distance = float(viewpoint.in_camera(fixtures)[:, 2].mean())
-        view, flat = viewpoint.facing(distance), viewpoint.flattened(fixtures, distance)
-        held = _held(config, pose)
-        pixels = vision.see_cable(image, viewpoint, **held, workings=workings).pixels
-    except MeasurementError:  # as above
-        pass
-    return vision.draw_steps(
-        image, view, workings, pixels, flat[0], flat[1] if len(fixtures) == 2 else None
-    )
 
 
 def _turned(config: Config, pose: DeclaredPose, image: np.ndarray) -> str:
@@ -299,7 +274,7 @@ def _turned(config: Config, pose: DeclaredPose, image: np.ndarray) -> str:
     for quarters, how in turns.items():
         turned = np.ascontiguousarray(np.rot90(image, quarters))
         try:
-            vision.extract_centerline(turned, view_of(config, turned), **_held(config, pose))
+            vision.extract_centerline(turned, view_of(config, turned), _held(config, pose))
         except MeasurementError:
             continue
         return (

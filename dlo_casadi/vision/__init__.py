@@ -4,7 +4,6 @@ from dlo_casadi.vision.board import Board, locate_board, locate_camera
 from dlo_casadi.vision.calibration import Calibration, calibrate_camera
 from dlo_casadi.vision.camera import (
     Camera,
-    Outline,
     View,
     Viewpoint,
     compare_pixels,
@@ -16,6 +15,7 @@ from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.image import draw_steps, encoded, read_image
 from dlo_casadi.vision.image_curve import ImageCurve, nearest_in_order, places_along, see_cable
 from dlo_casadi.vision.space_line import SpaceLine, Views, measure_views
+from dlo_casadi.vision.workplane import KnownCable
 
 __all__ = [
     "Board",
@@ -23,7 +23,7 @@ __all__ = [
     "Camera",
     "Centerline",
     "ImageCurve",
-    "Outline",
+    "KnownCable",
     "SpaceLine",
     "View",
     "Viewpoint",

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -72,7 +72,7 @@ class Calibration:
     @property
     def focal_uncertainty(self) -> float:
         """Standard deviation of the focal lengths over themselves, the larger of both."""
-        return _relative(self.camera.matrix, self.matrix_std)
+        return float(max(self.matrix_std[:2] / np.diag(self.camera.matrix)[:2]))
 
 
 def calibrate_camera(photographs: Mapping[str, NDArray[np.uint8]], board: Board) -> Calibration:
@@ -118,45 +118,21 @@ def calibrate_camera(photographs: Mapping[str, NDArray[np.uint8]], board: Board)
             )
         else:
             seen[name] = markers
-    solved = _solve(seen, board, size, problems)
-    misplaced = {
-        name: {n: q for n, q in seen[name].items() if errors[n] < MAX_ERROR_PX}
-        for name, errors in solved.errors.items()
+    found, errors = _solve(seen, board, size, problems)
+    placed = {
+        name: {n: q for n, q in seen[name].items() if off[n] < MAX_ERROR_PX}
+        for name, off in errors.items()
     }
-    if misplaced != seen:
+    if placed != seen:
         for name in seen:
-            if len(misplaced[name]) < LEAST_MARKERS:
-                del misplaced[name]
+            if len(placed[name]) < LEAST_MARKERS:
+                del placed[name]
                 problems[name] = (
                     f"{name}: its markers are more than {MAX_ERROR_PX:g} px off the places that "
                     "the other photographs give them. Try: marker_centers? was a marker moved?"
                 )
-        solved = _solve(misplaced, board, size, problems)
-    rms = {
-        n: float(np.sqrt(np.mean(np.square(list(e.values()))))) for n, e in solved.errors.items()
-    }
-    return Calibration(
-        Camera(solved.matrix, solved.distortion),
-        solved.std,
-        solved.spread,
-        solved.rms,
-        rms,
-        problems,
-        tuple(_advice(solved, size)),
-    )
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """A calibration of one lens, and the errors [px] of each marker in each photograph."""
-
-    matrix: Array
-    distortion: Array
-    std: Array
-    rms: float
-    errors: dict[str, dict[int, float]]
-    spread: float
-    corners: Array
+        found, _ = _solve(placed, board, size, problems)
+    return found
 
 
 def _solve(
@@ -164,34 +140,31 @@ def _solve(
     board: Board,
     size: tuple[int, int],
     problems: dict[str, str],
-) -> _Solved:
-    """Calibrate with each lens and keep the one that is worth its numbers."""
+) -> tuple[Calibration, dict[str, dict[int, float]]]:
+    """Calibrate with the lens that is worth its numbers; errors [px] of each marker by picture."""
     if len(seen) < _LEAST_PHOTOGRAPHS:
         raise VisionError(
             f"a calibration needs {_LEAST_PHOTOGRAPHS} photographs with {LEAST_MARKERS} markers "
             f"each, and there are {len(seen)}. Try: more photographs of the board, from directions "
             f"{_APART}.\n" + "\n".join(f"  {problem}" for problem in problems.values())
         )
-    places = [
+    solid = [
         np.vstack([np.column_stack([board.corners(n), np.zeros(4)]) for n in markers])
         for markers in seen.values()
     ]
     pixels = [np.vstack(list(markers.values())) for markers in seen.values()]
-    solid, flat = ([a.astype(np.float32) for a in arrays] for arrays in (places, pixels))
+    rounded, seen_at = ([a.astype(np.float32) for a in arrays] for arrays in (solid, pixels))
     count = 2 * sum(len(a) for a in pixels) / CORNERS_THAT_SHARE
-    best: tuple[float, tuple] | None = None
-    fitted = 0
+    trials = []
     for numbers, flags in _LENSES.items():
-        found = cv2.calibrateCamera(solid, flat, size, None, None, flags=flags)
-        score = 2 * count * np.log(found[0]) + numbers * np.log(count)
-        if best is None or score < best[0]:
-            best, fitted = (score, found), numbers
-    assert best is not None
-    rms, matrix, lens, turns, shifts = best[1]
+        solved = cv2.calibrateCamera(rounded, seen_at, size, None, None, flags=flags)
+        score = 2 * count * np.log(solved[0]) + numbers * np.log(count)
+        trials.append((score, numbers, solved))
+    _, fitted, (rms, matrix, lens, turns, shifts) = min(trials, key=lambda trial: trial[0])
     slopes, displaced = [], []
     errors: dict[str, dict[int, float]] = {}
     for (name, markers), corners, turn, shift in zip(
-        seen.items(), places, turns, shifts, strict=True
+        seen.items(), solid, turns, shifts, strict=True
     ):
         projected, slope = cv2.projectPoints(corners, turn, shift, matrix, lens)
         slopes.append(slope[:, : 10 + fitted])
@@ -207,15 +180,17 @@ def _solve(
         errors[name] = dict(zip(markers, np.sqrt(np.mean(off**2, axis=1)), strict=True))
     ahead = np.array([cv2.Rodrigues(turn)[0][2] for turn in turns])
     spread = float(np.degrees(np.arccos(np.clip((ahead @ ahead.T).min(), -1.0, 1.0))))
-    return _Solved(
-        np.asarray(matrix, float),
-        np.asarray(lens, float).ravel()[:5],
+    found = Calibration(
+        Camera(matrix, np.asarray(lens, float).ravel()[:5]),
         _matrix_std(slopes, displaced, float(rms)),
-        float(rms),
-        errors,
         spread,
-        np.vstack(pixels),
+        float(rms),
+        {n: float(np.sqrt(np.mean(np.square(list(e.values()))))) for n, e in errors.items()},
+        problems,
+        (),
     )
+    filled = float(cv2.contourArea(cv2.convexHull(np.vstack(seen_at)))) / (size[0] * size[1])
+    return replace(found, advice=tuple(_advice(found, filled))), errors
 
 
 def _matrix_std(slopes: list[Array], displaced: list[Array], rms: float) -> Array:
@@ -266,32 +241,22 @@ def _common_size(photographs: Mapping[str, NDArray[np.uint8]]) -> tuple[int, int
     return int(width), int(height)
 
 
-def _relative(matrix: Array, std: Array) -> float:
-    """The larger standard deviation of both focal lengths, over them."""
-    return float(max(std[0] / matrix[0, 0], std[1] / matrix[1, 1]))
-
-
-def _advice(solved: _Solved, size: tuple[int, int]) -> list[str]:
-    """Sentences on how to do better."""
-    advice = []
-    relative = _relative(solved.matrix, solved.std)
-    if relative > _GOOD_FOCAL or solved.spread < _TILTED:
-        advice.append(
-            f"the focal length is known to {100 * relative:.1f} % only, from photographs whose "
-            f"directions lie within {solved.spread:.0f} degrees: a longer focal length and a "
-            "larger distance look alike. Try: photographs of the whole board from directions "
-            f"{_APART}, or measurement.camera with the matrix of an earlier calibration"
+def _advice(found: Calibration, filled: float) -> Iterator[str]:
+    """Sentences on how to do better; corners are seen in the share `filled` of the picture."""
+    if found.focal_uncertainty > _GOOD_FOCAL or found.spread < _TILTED:
+        yield (
+            f"the focal length is known to {100 * found.focal_uncertainty:.1f} % only, from "
+            f"photographs whose directions lie within {found.spread:.0f} degrees: a longer focal "
+            "length and a larger distance look alike. Try: photographs of the whole board from "
+            f"directions {_APART}, or measurement.camera with the matrix of an earlier calibration"
         )
-    hull = cv2.convexHull(solved.corners.astype(np.float32))
-    filled = float(cv2.contourArea(hull)) / (size[0] * size[1])
     if filled < _FILLED:
-        advice.append(
+        yield (
             f"markers were seen in {100 * filled:.0f} % of the picture only; beyond, the lens is a "
             "guess. Try: photographs with markers in the corners of the picture"
         )
-    if solved.rms > 1.0:
-        advice.append(
-            f"corners are {solved.rms:.1f} px RMS off. Try: marker_size and marker_centers in "
-            "metres? one focus and zoom for all? a flat board?"
+    if found.reprojection_error > 1.0:
+        yield (
+            f"corners are {found.reprojection_error:.1f} px RMS off. Try: marker_size and "
+            "marker_centers in metres? one focus and zoom for all? a flat board?"
         )
-    return advice

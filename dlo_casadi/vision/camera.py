@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from dlo_casadi.errors import VisionError
 
@@ -62,21 +63,12 @@ class Camera:
         return np.asarray(rays, float).reshape(-1, 2)
 
 
-@dataclass(frozen=True)
-class View:
-    """Map between the pixels of one photograph and the plane of the cable.
-
-    A plane point (x, y) and the ray through its pixel satisfy, up to the factor w,
-
-        w [a, b, 1]^T = H [x, y, 1]^T
-
-    where (a, b) is the undistorted ray in normalised camera coordinates when a camera is known,
-    and the pixel (u, v) itself when not.
+@dataclass(frozen=True, kw_only=True)
+class Photograph:
+    """A picture's camera, and what it shows of the board.
 
     Parameters
     ----------
-    homography : (3, 3)
-        H: board frame [m] to rays [-], or to pixels [px] without a camera.
     shape : (height, width) [px]
         Size of the photograph.
     camera : Camera, optional
@@ -91,13 +83,32 @@ class View:
         Which markers were not used, and why.
     """
 
-    homography: Array
     shape: tuple[int, int]
     camera: Camera | None = None
     reprojection_error: float = 0.0
     markers: Array = field(default_factory=lambda: np.zeros((0, 4, 2)))
     numbers: tuple[int, ...] = ()
     messages: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(Photograph):
+    """Map between the pixels of one photograph and the plane of the cable.
+
+    A plane point (x, y) and the ray through its pixel satisfy, up to the factor w,
+
+        w [a, b, 1]^T = H [x, y, 1]^T
+
+    where (a, b) is the undistorted ray in normalised camera coordinates when a camera is known,
+    and the pixel (u, v) itself when not.
+
+    Parameters
+    ----------
+    homography : (3, 3)
+        H: board frame [m] to rays [-], or to pixels [px] without a camera.
+    """
+
+    homography: Array
 
     def to_board(self, pixels: ArrayLike) -> Array:
         """Points of the cable's plane [m] seen at pixels (K, 2) [px]; shape (K, 2)."""
@@ -127,87 +138,14 @@ class View:
         """Pixels per metre about the middle of the picture."""
         height, width = self.shape
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
-        corners = self.to_board(middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
-        x, y = corners.T
+        x, y = self.to_board(middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).T
         area = abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
         return float(np.sqrt(4.0 / area))
 
 
-@dataclass(frozen=True)
-class Viewpoint:
-    """Where the camera of one photograph stands.
-
-    A point p of the board frame (x right, y up, z out of the board) is at
-
-        q = R p + t
-
-    in the camera's frame (x right, y down, z ahead), and is seen at the pixel distort(q_xy / q_z).
-
-    Parameters
-    ----------
-    camera : Camera
-        Intrinsic matrix and lens.
-    rotation : (3, 3)
-        R, from the board's axes to the camera's.
-    translation : (3,) [m]
-        t, the board's origin in the camera's frame.
-    shape : (height, width) [px]
-        Size of the photograph.
-    covariance : (6, 6) [rad, m]
-        Of a small rotation w and a shift d of the board in the camera's frame, q -> q + w x q + d,
-        from the scatter of the corners.
-    reprojection_error : scalar [px]
-        Root mean square over the corners of the markers.
-    markers : (n, 4, 2) [px]
-        Corners of the markers that were used.
-    numbers : tuple of int
-        Their numbers.
-    messages : tuple of str
-        Which markers were not used, and why.
-    """
-
-    camera: Camera
-    rotation: Array
-    translation: Array
-    shape: tuple[int, int]
-    covariance: Array
-    reprojection_error: float
-    markers: Array
-    numbers: tuple[int, ...]
-    messages: tuple[str, ...] = ()
-
-    @property
-    def center(self) -> Array:
-        """Where the camera stands (3,) [m] in the board frame, C = -R^T t."""
-        return -self.rotation.T @ self.translation
-
-    def in_camera(self, points: ArrayLike) -> Array:
-        """Points (K, 3) [m] of the board frame in the camera's frame."""
-        return np.asarray(points, float).reshape(-1, 3) @ self.rotation.T + self.translation
-
-    def to_pixels(self, points: ArrayLike) -> Array:
-        """Pixels (K, 2) [px] at which points (K, 3) [m] are seen."""
-        return self.project(points)[0]
-
-    def project(self, points: ArrayLike) -> tuple[Array, Array]:
-        """Pixels (K, 2) [px] of points (K, 3) [m], and d(pixel)/d(point) (K, 2, 3) [px/m]."""
-        pixels, slopes = self.camera.project(self.in_camera(points))
-        return pixels, slopes @ self.rotation
-
-    def rays(self, pixels: ArrayLike) -> Array:
-        """Undistorted rays (K, 2), q_xy / q_z, of pixels (K, 2) [px]."""
-        return self.camera.undistort(np.asarray(pixels, float).reshape(-1, 2))
-
-    def flattened(self, points: ArrayLike, distance: float) -> Array:
-        """Places (K, 2) [m] in the plane of `facing` at which points (K, 3) [m] are seen."""
-        at = self.in_camera(points)
-        return np.asarray(at[:, :2] / at[:, 2:] * distance * [1.0, -1.0])
-
-    def facing(self, distance: float) -> View:
-        """View of the plane q_z = `distance` [m]: the undistorted photograph in metres, y up."""
-        homography = np.diag([1.0, -1.0, distance])
-        rms, markers, numbers = self.reprojection_error, self.markers, self.numbers
-        return View(homography, self.shape, self.camera, rms, markers, numbers)
+def _apply(homography: NDArray[np.floating], points: Array) -> Array:
+    mapped = points @ homography[:, :2].T + homography[:, 2]
+    return mapped[:, :2] / mapped[:, 2:]
 
 
 def from_reference(pixels: ArrayLike, points: ArrayLike, shape: tuple[int, ...]) -> View:
@@ -240,41 +178,85 @@ def from_reference(pixels: ArrayLike, points: ArrayLike, shape: tuple[int, ...])
         )
     a = (q[1] - q[0]) / (z[1] - z[0])
     b = q[0] - a * z[0]
-    homography = np.array(
-        [[a.real, -a.imag, b.real], [-a.imag, -a.real, -b.imag], [0.0, 0.0, 1.0]],
-    )
-    return View(homography, (int(shape[0]), int(shape[1])))
+    homography = np.array([[a.real, -a.imag, b.real], [-a.imag, -a.real, -b.imag], [0, 0, 1]])
+    return View(homography=homography, shape=(int(shape[0]), int(shape[1])))
 
 
-def _apply(homography: NDArray[np.floating], points: Array) -> Array:
-    mapped = points @ homography[:, :2].T + homography[:, 2]
-    return mapped[:, :2] / mapped[:, 2:]
+@dataclass(frozen=True, kw_only=True)
+class Viewpoint(Photograph):
+    """Where the camera of one photograph stands.
 
+    A point p of the board frame (x right, y up, z out of the board) is at
 
-@dataclass(frozen=True)
-class Outline:
-    """The projected outline of a cable at points of its axis.
+        q = R p + t
+
+    in the camera's frame (x right, y down, z ahead), and is seen at the pixel distort(q_xy / q_z).
 
     Parameters
     ----------
-    pixels : (K, 2) [px]
-        Middle between the two edges, across the projected axis.
-    normals : (K, 2)
-        Unit vectors across the projected axis.
-    slopes : (K, 2, 3) [px/m]
-        d(pixel)/d(point) in the board frame, that of the axis: the middle follows it to a part in
-        1e-4.
+    rotation : (3, 3)
+        R, from the board's axes to the camera's.
+    translation : (3,) [m]
+        t, the board's origin in the camera's frame.
+    covariance : (6, 6) [rad, m]
+        Of a small rotation w and a shift d of the board in the camera's frame, q -> q + w x q + d,
+        from the scatter of the corners.
     """
 
-    pixels: Array
-    normals: Array
-    slopes: Array
+    camera: Camera
+    rotation: Array
+    translation: Array
+    covariance: Array
+
+    @property
+    def center(self) -> Array:
+        """Where the camera stands (3,) [m] in the board frame, C = -R^T t."""
+        return -self.rotation.T @ self.translation
+
+    def in_camera(self, points: ArrayLike) -> Array:
+        """Points (K, 3) [m] of the board frame in the camera's frame."""
+        return np.asarray(points, float).reshape(-1, 3) @ self.rotation.T + self.translation
+
+    def to_pixels(self, points: ArrayLike) -> Array:
+        """Pixels (K, 2) [px] at which points (K, 3) [m] are seen."""
+        return self.project(points)[0]
+
+    def project(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Pixels (K, 2) [px] of points (K, 3) [m], and d(pixel)/d(point) (K, 2, 3) [px/m]."""
+        pixels, slopes = self.camera.project(self.in_camera(points))
+        return pixels, slopes @ self.rotation
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Undistorted rays (K, 2), q_xy / q_z, of pixels (K, 2) [px]."""
+        return self.camera.undistort(np.asarray(pixels, float).reshape(-1, 2))
+
+    def moved(self, motion: Array) -> Viewpoint:
+        """Turn the board by the rotation vector w and shift it by d in the camera's frame."""
+        turn = Rotation.from_rotvec(motion[:3]).as_matrix()
+        shift = turn @ self.translation + motion[3:]
+        return replace(self, rotation=turn @ self.rotation, translation=shift)
+
+    def flattened(self, points: ArrayLike, distance: float) -> Array:
+        """Places (K, 2) [m] in the plane of `facing` at which points (K, 3) [m] are seen."""
+        at = self.in_camera(points)
+        return np.asarray(at[:, :2] / at[:, 2:] * distance * [1.0, -1.0])
+
+    def facing(self, distance: float) -> View:
+        """View of the plane q_z = `distance` [m]: the undistorted photograph in metres, y up."""
+        return View(
+            homography=np.diag([1.0, -1.0, distance]),
+            shape=self.shape,
+            camera=self.camera,
+            reprojection_error=self.reprojection_error,
+            markers=self.markers,
+            numbers=self.numbers,
+        )
 
 
 def project_outline(
     viewpoint: Viewpoint, points: ArrayLike, tangents: ArrayLike, diameter: float
-) -> Outline:
-    """Project a cable.
+) -> tuple[Array, Array, Array]:
+    """Project the outline of a round cable.
 
     Parameters
     ----------
@@ -284,6 +266,16 @@ def project_outline(
         Of its axis, in the board frame; unit tangents.
     diameter : scalar [m]
         Of the cable.
+
+    Returns
+    -------
+    pixels : (K, 2) [px]
+        Middle between the two edges, across the projected axis.
+    normals : (K, 2)
+        Unit vectors across the projected axis.
+    slopes : (K, 2, 3) [px/m]
+        d(pixel)/d(point) in the board frame, that of the axis: the middle follows it to a part in
+        1e-4.
 
     The two planes through the camera that touch a straight cylinder of radius r about the axis
     through p (in the camera's frame) along t are at +-a from the plane of the axis, with sin a =
@@ -319,11 +311,8 @@ def project_outline(
     step = np.einsum("kij,kj->ki", by_ray, across)
     along = np.einsum("kij,kj->ki", slopes, np.asarray(tangents, float).reshape(-1, 3))
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    return Outline(
-        pixels + off[:, None] * step,
-        np.column_stack([-along[:, 1], along[:, 0]]),
-        slopes,
-    )
+    normals = np.column_stack([-along[:, 1], along[:, 0]])
+    return pixels + off[:, None] * step, normals, slopes
 
 
 def compare_pixels(
@@ -337,20 +326,18 @@ def compare_pixels(
 
     Parameters
     ----------
-    viewpoint : Viewpoint
-        Where the camera stands.
     pixels : (K, 2) [px]
         Measured middles of the outline, as photographed.
     points, tangents : (K, 3) [m], [-]
         Of the curve, at the nearest place to each pixel in the picture: there the distance does
         not change to first order with the place.
-    diameter : scalar [m]
-        Of the cable.
+    viewpoint, diameter
+        As `project_outline` takes them.
 
     Returns
     -------
     Distances (K,) [px], and their slopes d(distance)/d(point) (K, 3) [px/m].
     """
-    seen = project_outline(viewpoint, points, tangents, diameter)
-    distance = np.sum((np.asarray(pixels, float) - seen.pixels) * seen.normals, axis=1)
-    return distance, -np.einsum("ki,kij->kj", seen.normals, seen.slopes)
+    middle, normals, slopes = project_outline(viewpoint, points, tangents, diameter)
+    distance = np.sum((np.asarray(pixels, float) - middle) * normals, axis=1)
+    return distance, -np.einsum("ki,kij->kj", normals, slopes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
@@ -14,12 +14,17 @@ from dlo_casadi.vision.camera import Array, Viewpoint
 from dlo_casadi.vision.centerline import FINE, measure_line
 from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.curves import chord_length, normals
-from dlo_casadi.vision.workplane import ExpectedLine
+from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
 _NEAREST = 0.2  # m: least distance from which a cable is photographed
 _BESIDE = 1.6  # widths between two stretches below which they share an edge
 _APART = 2.0  # widths along the line from which two places are different stretches
 TIP = 4.0  # widths from a fixture beyond which a message names the line's end
+_CAP = 3.0  # standard deviations at which a pair costs as much as a pixel that is left over
+_GOOD = 2.0  # largest distance of the pixels of a pair, standard deviations
+_STEP = 0.05  # cost of a pair: prefers the shortest of equal ways along an epipolar line
+_NEAR_PX = 2.0  # how far off a curve may be seen; pixels three times as far are not of it
+_POSE_PX = 0.5  # error of an epipolar line from the cameras' places
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,15 @@ class ImageCurve:
         return float(np.median(np.linalg.norm(np.diff(self.pixels, axis=0), axis=1)))
 
     @property
+    def independent_std(self) -> Array:
+        """Standard deviations (K,) [px] of independent pixels that tell as much.
+
+        Pixels a distance h apart whose errors are correlated over the length c (the integral of the
+        correlation, on both sides) are worth h / (2 c) independent ones.
+        """
+        return self.std * np.sqrt(max(2.0 * self.correlation / max(self.spacing, 1e-6), 1.0))
+
+    @property
     def rays(self) -> Array:
         """Undistorted rays (K, 2) of the pixels."""
         return self.viewpoint.rays(self.pixels)
@@ -84,11 +98,7 @@ class ImageCurve:
 def see_cable(
     image: NDArray[np.uint8],
     viewpoint: Viewpoint,
-    *,
-    start: ArrayLike,
-    end: ArrayLike | None,
-    diameter: float,
-    length: float,
+    cable: KnownCable,
     workings: Workings | None = None,
 ) -> ImageCurve:
     """Find the cable in front of the board, order it from start to end, refine it to sub-pixel.
@@ -101,10 +111,8 @@ def see_cable(
         The photograph, blue, green, red.
     viewpoint : Viewpoint
         Where the camera stands.
-    start, end : (3,) [m]
-        The fixtures in the board frame; `end` is None for a free end.
-    diameter, length : scalar [m]
-        Of the cable.
+    cable : KnownCable
+        Its fixtures, (3,) [m] each, and its size.
     workings : Workings, optional
         Is filled with what the steps have seen, also where one of them fails.
 
@@ -113,68 +121,70 @@ def see_cable(
     VisionError
         If no cable or more than one is found, or if it does not lead to the fixtures.
     """
-    declared = [np.asarray(at, float) for at in (start, end) if at is not None]
-    fixtures = viewpoint.in_camera(np.array(declared))
-    if fixtures[:, 2].min() < _NEAREST:
+    diameter, workings = cable.diameter, workings or Workings()
+    depths = viewpoint.in_camera(cable.fixtures)[:, 2]
+    if depths.min() < _NEAREST:
         raise VisionError(
-            f"a fixture would be {fixtures[:, 2].min():.2f} m before the camera. "
+            f"a fixture would be {depths.min():.2f} m before the camera. "
             "Try: start and end in metres and in the board frame, z out of the board?"
         )
-    distance = float(fixtures[:, 2].mean())
+    distance = float(depths.mean())
     view = viewpoint.facing(distance)
-    flat = viewpoint.flattened(declared, distance)
-    expected = _expected_line(fixtures, flat, distance, length, diameter)
-    line = measure_line(image, view, expected, workings or Workings())
-    trace = line.trace
-    pixel = 1.0 / view.scale
-    width = trace.shape.width
-    beside = other_stretches(trace.points, trace.t, width)
-    hidden = np.isfinite(beside) & trace.inside
-    step = np.median(np.diff(trace.t[line.kept]))
-    every = max(1, round(step / np.median(np.diff(trace.t))))
+    line = measure_line(image, view, _expected_line(cable, viewpoint, distance), workings)
+    if line.unreached:
+        name, fixture, tip, _ = line.unreached[0]
+        (u, v), (at_u, at_v) = view.to_pixels([fixture, tip])
+        raise VisionError(
+            f"the cable does not reach its {name}: the line found ends at ({at_u:.0f}, "
+            f"{at_v:.0f}) px, and the {name} is declared where ({u:.0f}, {v:.0f}) px shows it. "
+            f"Try: {name} in metres and in the board frame? Is the photograph of this pose? Is "
+            "the cable hidden there?"
+        )
+    trace, pixel, width = line.trace, 1.0 / view.scale, line.trace.shape.width
+    hidden = np.isfinite(other_stretches(trace.points, trace.t, width)) & trace.inside
+    every = max(1, round(np.median(np.diff(trace.t[line.kept])) / np.median(np.diff(trace.t))))
     shared = np.nonzero(hidden)[0][::every]
     kept = np.sort(np.concatenate([line.kept[~hidden[line.kept]], shared]))
-    pixels = view.to_pixels(trace.points[kept])
+    workings.pixels = view.to_pixels(trace.points[kept])
     tips = [
         f"the line in the photograph ends {away / pixel:.0f} px from where the {name} is declared"
-        for name, _, _, away in expected.tips(trace.points[kept])
+        for name, _, _, away in workings.expected.tips(trace.points[kept])
         if away > TIP * width
     ]
     return ImageCurve(
-        viewpoint,
-        pixels,
-        np.where(hidden[kept], 0.5 * width, trace.std[kept]) / pixel,
-        ~hidden[kept],
-        width / pixel,
-        trace.width_std / pixel,
-        diameter,
-        distance,
-        FINE * np.sqrt(np.pi) * diameter / pixel,
-        line.confidence,
-        (*line.messages, *tips),
-        trace.direction,
-        trace.shape.blur / pixel,
+        viewpoint=viewpoint,
+        pixels=workings.pixels,
+        std=np.where(hidden[kept], 0.5 * width, trace.std[kept]) / pixel,
+        whole=~hidden[kept],
+        width=width / pixel,
+        width_std=trace.width_std / pixel,
+        diameter=diameter,
+        distance=distance,
+        correlation=FINE * np.sqrt(np.pi) * diameter / pixel,
+        confidence=line.confidence,
+        messages=(*line.messages, *tips),
+        direction=trace.direction,
+        blur=trace.shape.blur / pixel,
     )
 
 
-def _expected_line(
-    fixtures: Array, flat: Array, distance: float, length: float, diameter: float
-) -> ExpectedLine:
+def _expected_line(cable: KnownCable, viewpoint: Viewpoint, distance: float) -> ExpectedLine:
     """The line in the facing plane, and how long it may be there.
 
     At least the way between the fixtures there, or some diameters. At most the cable where it is
-    nearest: half of what is not needed to reach from one fixture to the other can lead ahead.
+    nearest: half of what is not needed to reach from one fixture to the other can lead ahead, all
+    of it where the end is free.
     """
-    if len(fixtures) == 1:
-        nearest, shortest, end = fixtures[0, 2] - length, 0.0, None
-    else:
-        chord, end = float(np.linalg.norm(fixtures[1] - fixtures[0])), flat[1]
-        ahead = 0.5 * np.sqrt(max(length**2 - chord**2, 0.0))
-        nearest = fixtures[:, 2].min() - 0.5 * ahead
-        shortest = float(np.linalg.norm(flat[1] - flat[0]))
-    shortest = max(shortest, 10 * diameter)
+    flat = viewpoint.flattened(cable.fixtures, distance)
+    fixtures, length = viewpoint.in_camera(cable.fixtures), cable.length
+    ahead = length
+    if len(fixtures) == 2:
+        chord = float(np.linalg.norm(fixtures[1] - fixtures[0]))
+        ahead = 0.25 * np.sqrt(max(length**2 - chord**2, 0.0))
+    nearest = fixtures[:, 2].min() - ahead
+    shortest = max(float(np.linalg.norm(flat[-1] - flat[0])), 10 * cable.diameter)
     longest = max(length * distance / max(nearest, 0.5 * distance), length)
-    return ExpectedLine(flat[0], end, diameter, shortest, longest, in_space=True)
+    return ExpectedLine(flat, cable.diameter, shortest, longest, BEFORE_BOARD)
 
 
 def other_stretches(points: Array, t: Array, width: float) -> Array:
@@ -220,13 +230,6 @@ def loops_either_way(curve: ImageCurve) -> list[ImageCurve]:
     return ways
 
 
-_CAP = 3.0  # standard deviations at which a pair costs as much as a pixel that is left over
-_GOOD = 2.0  # largest distance of the pixels of a pair, standard deviations
-_STEP = 0.05  # cost of a pair: prefers the shortest of equal ways along an epipolar line
-_NEAR_PX = 2.0  # how far off a curve may be seen; pixels three times as far are not of it
-_POSE_PX = 0.5  # error of an epipolar line from the cameras' places
-
-
 @dataclass(frozen=True)
 class Match:
     """Pairs of pixels of two photographs, in order along the cable."""
@@ -253,11 +256,16 @@ def match_lines(one: ImageCurve, other: ImageCurve) -> Match:
     Sampson's distance: Hartley, Zisserman, Multiple View Geometry, 2004, section 11.4.3. Ordering:
     Ohta, Kanade, Stereo by intra- and inter-scanline search, 1985.
     """
-    off = _epipolar_distance(one, other)
-    variance = one.std[:, None] ** 2 + other.std[None, :] ** 2 + _POSE_PX**2
-    off /= np.sqrt(variance)
-    cost = np.minimum(off, _CAP) ** 2 + _STEP
-    first, second = _cheapest_way(cost)
+    R = other.viewpoint.rotation @ one.viewpoint.rotation.T
+    t = other.viewpoint.translation - R @ one.viewpoint.translation
+    E = np.cross(t, R, axisb=0, axisc=0)
+    a, b = (np.column_stack([seen.rays, np.ones(len(seen.pixels))]) for seen in (one, other))
+    in_other, in_one = a @ E.T, b @ E
+    slope = np.sum(in_other[:, :2] ** 2, axis=1)[:, None] + np.sum(in_one[:, :2] ** 2, axis=1)
+    focal = np.sqrt(one.viewpoint.camera.focal * other.viewpoint.camera.focal)
+    off = focal * np.abs(in_other @ b.T) / np.sqrt(slope)
+    off /= np.sqrt(one.std[:, None] ** 2 + other.std[None, :] ** 2 + _POSE_PX**2)
+    first, second = _cheapest_way(np.minimum(off, _CAP) ** 2 + _STEP)
     good = off[first, second] < _GOOD
     first, second = first[good], second[good]
     found = len(np.unique(first)) + len(np.unique(second))
@@ -314,19 +322,6 @@ def triangulate(one: ImageCurve, other: ImageCurve, match: Match) -> Array:
     A, b = np.concatenate(rows, axis=1), np.concatenate(sides, axis=1)
     normal = np.einsum("pki,pkj->pij", A, A)
     return np.linalg.solve(normal, np.einsum("pki,pk->pi", A, b)[..., None])[..., 0]
-
-
-def _epipolar_distance(one: ImageCurve, other: ImageCurve) -> Array:
-    """Sampson's distance (K, L) [px] of all pairs of pixels."""
-    R = other.viewpoint.rotation @ one.viewpoint.rotation.T
-    t = other.viewpoint.translation - R @ one.viewpoint.translation
-    E = np.cross(t, R, axisb=0, axisc=0)
-    a = np.column_stack([one.rays, np.ones(len(one.pixels))])
-    b = np.column_stack([other.rays, np.ones(len(other.pixels))])
-    in_other, in_one = a @ E.T, b @ E
-    slope = np.sum(in_other[:, :2] ** 2, axis=1)[:, None] + np.sum(in_one[:, :2] ** 2, axis=1)
-    focal = np.sqrt(one.viewpoint.camera.focal * other.viewpoint.camera.focal)
-    return np.asarray(focal * np.abs(in_other @ b.T) / np.sqrt(slope))
 
 
 def _cheapest_way(cost: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter1d, median_filter
 
 from dlo_casadi.vision.camera import Array, View
-from dlo_casadi.vision.curves import SmoothCurve
+from dlo_casadi.vision.curves import normals
 
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
 _BESIDE = 2.2  # where the surroundings begin, in blurs beyond the edge
@@ -20,7 +21,7 @@ _LOCAL = 2.0  # diameters along the cable, over which steps are averaged
 # a rendered cable lines on a board are 0.93 mm off with 2, 0.73 mm with 5 and 0.69 mm with 12.
 _LIT = 5.0
 _INNER = 0.15  # of the width: nearer to the middle both sides look alike
-_CLEAR = 1.3  # blurs inside an edge: there nine tenths of the step are behind
+_CLEAR = 1.3  # blurs inside an edge: there nine tenths of the step are behind; beyond, blur counts
 _MOST_SHADE = 0.5  # of the step: a larger difference is not shading
 _FAINT = 0.3  # of the usual step: smaller ones are not the cable
 _BARE = 0.35  # share of the cable's width that no highlight reaches
@@ -34,6 +35,11 @@ class Profiles:
     offset: Array  # (M,) [m], where across it, positive to the left
     values: Array  # (K, M, 3), colours
     inside: NDArray[np.bool_]  # (K,), the cable and its edges lie in the photograph
+
+    def core_and_rim(self, diameter: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Colours (K, 3) of the cable in each profile, and the offsets (M,) of its surroundings."""
+        core = self.values[:, np.abs(self.offset) < 0.3 * diameter].mean(axis=1)
+        return core, np.abs(self.offset) > 0.8 * diameter
 
     def average(self, trusted: NDArray[np.bool_], along: float) -> Profiles:
         """Average trusted profiles along the curve, with a Gaussian of deviation `along` [m].
@@ -69,20 +75,19 @@ class Crossings:
 
 
 def sample_profiles(
-    image: NDArray[np.float32], view: View, curve: SmoothCurve, t: Array, diameter: float
+    image: NDArray[np.float32], view: View, curve: BSpline, t: Array, diameter: float
 ) -> Profiles:
     """Read the photograph along the normals of the curve.
 
     Profiles that leave the photograph are marked, and hold the colours of its border.
     """
-    pixel = 1.0 / view.scale
+    pixel, (high, wide) = 1.0 / view.scale, view.shape
     half = 1.2 * diameter + 3 * pixel
     count = int(np.clip(2 * half / min(0.5 * pixel, diameter / 10), 24, 64))
     offset = np.linspace(-half, half, count)
-    centre, normal = curve.position(t), curve.normal(t)
+    centre, normal = curve(t), normals(curve(t, 1))
     points = centre[:, None, :] + offset[None, :, None] * normal[:, None, :]
     at = view.to_pixels(points.reshape(-1, 2)).reshape(len(t), count, 2)
-    high, wide = view.shape
     needed = np.abs(offset) < 0.5 * diameter + 2.5 * pixel
     inside = np.all((at[:, needed] >= 0) & (at[:, needed] <= [wide - 1, high - 1]), axis=(1, 2))
     values = cv2.remap(
@@ -99,21 +104,17 @@ def cable_direction(profiles: Profiles, trusted: NDArray[np.bool_], diameter: fl
 
         g ~ (C_cable + C_around)^-1 (mean_cable - mean_around)
     """
-    values = profiles.values[trusted]
-    core = values[:, np.abs(profiles.offset) < 0.3 * diameter].mean(axis=1)
-    rim = np.abs(profiles.offset) > 0.8 * diameter
-    around = values[:, rim].mean(axis=1)
-    spread = np.cov((core - np.median(core, axis=0)).T) + np.cov(
-        (values[:, rim].reshape(-1, 3) - np.repeat(around, rim.sum(), axis=0)).T
-    )
+    core, rim = profiles.core_and_rim(diameter)
+    core, beside = core[trusted], profiles.values[trusted][:, rim]
+    around = beside.mean(axis=1)
+    scatter = (beside.reshape(-1, 3) - np.repeat(around, rim.sum(), axis=0)).T
+    spread = np.cov((core - np.median(core, axis=0)).T) + np.cov(scatter)
     step = np.median(core - around, axis=0)
     spread += 4.0 * np.eye(3)
     fisher = np.linalg.solve(spread, step)
     grey_signal = abs(_LUMINANCE @ step) / np.sqrt(_LUMINANCE @ spread @ _LUMINANCE)
     fisher_signal = np.sqrt(fisher @ step)
-    if grey_signal > 0.3 * fisher_signal:
-        return _LUMINANCE
-    return fisher / np.linalg.norm(fisher)
+    return _LUMINANCE if grey_signal > 0.3 * fisher_signal else fisher / np.linalg.norm(fisher)
 
 
 def local_directions(
@@ -127,8 +128,8 @@ def local_directions(
 
         g_k = h d_k / |d_k|^2,  d_k the step in all colours
     """
-    core = profiles.values[:, np.abs(profiles.offset) < 0.3 * diameter].mean(axis=1)
-    around = profiles.values[:, np.abs(profiles.offset) > 0.8 * diameter].mean(axis=1)
+    core, rim = profiles.core_and_rim(diameter)
+    around = profiles.values[:, rim].mean(axis=1)
     deviation = _LOCAL * diameter / float(np.median(np.diff(profiles.t)))
     step = gaussian_filter1d(core - around, deviation, axis=0, mode="nearest")
     usual = float(np.median((step @ direction)[trusted]))
@@ -143,9 +144,7 @@ def find_edges(
 ) -> Crossings:
     """Find both edges of every profile, and the middle between them.
 
-    The direction (3,) or (K, 3) weighs the colours.
-
-    An edge is where the brightness is half-way between the cable and its surroundings, those of
+    The direction (3,) or (K, 3) weighs the colours. An edge is where the brightness is half-way between the cable and its surroundings, those of
     its own side and close by: a shadow that falls beside the cable changes the level of one side,
     not the place of the edge. Instead of one crossing the mean over all levels from 1/4 to 3/4 is
     taken; with q the share of the way from surroundings (0) to cable (1), and Q(x) the largest q
@@ -154,40 +153,36 @@ def find_edges(
         x_edge = integral_0^out clip(2 Q(x) - 1/2, 0, 1) dx
 
     The cable's level is the one that differs most from the surroundings, over a third of it; with
-    `lit_aside` it is another one on the side that is turned to the light.
+    `lit_aside` it is another one on the side that is turned to the light: by half the median
+    difference of places that mirror each other, which passes over a highlight.
     """
-    data = np.einsum(
-        "kmc,kc->km", profiles.values, np.broadcast_to(direction, (len(profiles.t), 3))
-    )
+    weights = np.broadcast_to(direction, (len(profiles.t), 3))
+    data = np.einsum("kmc,kc->km", profiles.values, weights)
     near = max(1, round(2 * _LIT * shape.width / float(np.median(np.diff(profiles.t)))))
     centre = np.zeros(len(data))
     out = 0.5 * shape.width + _BESIDE * shape.blur
     reach = np.linspace(0.0, out, 64)
     step = reach[1]
     body = max(2, int(_BODY * shape.width / step))
+    clear = (reach > _INNER * shape.width) & (reach < 0.5 * shape.width - _CLEAR * shape.blur)
     for _ in range(3):
         left = _interpolate(profiles.offset, data, centre[:, None] - reach)
         right = _interpolate(profiles.offset, data, centre[:, None] + reach)
-        sides = [(side, side[:, -3:].mean(axis=1)) for side in (left, right)]
-        around = 0.5 * (sides[0][1] + sides[1][1])
+        beside = [side[:, -3:].mean(axis=1) for side in (left, right)]
+        around = 0.5 * (beside[0] + beside[1])
         core = _own_level(np.hstack([left[:, :body], right[:, :body]]), around)
         tilt = np.zeros(len(data))
-        if lit_aside:
-            shade = _shading(left, right, reach, shape)
+        if lit_aside and clear.any():
+            shade = 0.5 * np.median(right[:, clear] - left[:, clear], axis=1)
             shade[np.abs(shade) > _MOST_SHADE * np.abs(core - around)] = 0.0
             tilt = median_filter(shade, size=near, mode="nearest")
-        places = [
-            _mean_crossing(side, core + sign * tilt, level, step)
-            for sign, (side, level) in zip((-1, 1), sides, strict=True)
-        ]
-        move = np.clip(0.5 * (places[1][0] - places[0][0]), -0.3 * shape.width, 0.3 * shape.width)
+        (to_left, left_blur), (to_right, right_blur) = (
+            _mean_crossing(left, core - tilt, beside[0], step),
+            _mean_crossing(right, core + tilt, beside[1], step),
+        )
+        move = np.clip(0.5 * (to_right - to_left), -0.3 * shape.width, 0.3 * shape.width)
         centre = np.clip(centre + move, -0.5 * shape.width, 0.5 * shape.width)
-    return Crossings(
-        centre,
-        places[0][0] + places[1][0],
-        0.5 * (places[0][1] + places[1][1]),
-        core - around,
-    )
+    return Crossings(centre, to_left + to_right, 0.5 * (left_blur + right_blur), core - around)
 
 
 def edge_shape(
@@ -213,18 +208,6 @@ def _own_level(body: Array, around: Array) -> Array:
     outer = np.hstack([body[:, half // 2 : half], body[:, half + half // 2 :]])
     brighter = np.median(outer.mean(axis=1) - around) > 0
     return np.asarray(np.quantile(body, 1 - _BARE if brighter else _BARE, axis=1))
-
-
-def _shading(left: Array, right: Array, reach: Array, shape: EdgeShape) -> Array:
-    """How much (K,) brighter than the middle its right side is: one is turned to the light.
-
-    Half the median difference of places that mirror each other, of both sides (K, M): that passes
-    over a highlight. Nearer to the edges their blur would count.
-    """
-    clear = (reach > _INNER * shape.width) & (reach < 0.5 * shape.width - _CLEAR * shape.blur)
-    if not clear.any():
-        return np.zeros(len(left))
-    return np.asarray(0.5 * np.median(right[:, clear] - left[:, clear], axis=1))
 
 
 def _mean_crossing(side: Array, core: Array, around: Array, step: float) -> tuple[Array, Array]:

@@ -8,18 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import find_objects, label
-from scipy.spatial.transform import Rotation
 
 from dlo_casadi.vision.camera import Array, Viewpoint, compare_pixels
 from dlo_casadi.vision.centerline import FINE
-from dlo_casadi.vision.curves import chord_length, fit_curve, length_of, normals
+from dlo_casadi.vision.curves import DEGREE, SpaceCurve, chord_length, fit_curve, normals
 from dlo_casadi.vision.image_curve import ImageCurve, other_stretches, places_along
 from dlo_casadi.vision.profiles import EdgeShape, find_edges, sample_profiles
 
-_DEGREE = 3
 _GRID = 401  # places along the curve among which a pixel's nearest is searched
 _TANGENTIAL = 1e-5  # m: std of the prior that holds a curve along itself, which no picture shows
 _HUBER = 3.0  # standard deviations beyond which a pixel counts less
@@ -27,44 +24,6 @@ _HUBER = 3.0  # standard deviations beyond which a pixel counts less
 # 0 <= t <= 1: from a bow of 0.3 L to waves of 300 L; afterwards those near the last.
 _WANDER, _WANDER_NEXT = np.logspace(-1.0, 5.0, 13), np.array([0.3, 0.6, 1.0, 1.7, 3.0])
 _LOOPS, _SETTLED = 15, 3e-5  # m: a quarter of the smallest std of a line from three photographs
-
-
-@dataclass(frozen=True)
-class SpaceCurve:
-    """A cubic B-spline r(t), 0 <= t <= 1, with t close to arc length over the whole."""
-
-    coefficients: Array  # (n, 3) [m], in the board frame
-
-    def design(self, t: Array) -> Array:
-        """Basis functions (K, n) at t (K,)."""
-        return _design(t, len(self.coefficients))
-
-    def position(self, t: Array) -> Array:
-        """Points (K, 3) [m]."""
-        return self.design(t) @ self.coefficients
-
-    def tangent(self, t: Array) -> Array:
-        """Give the unit tangents (K, 3)."""
-        slope = np.asarray(BSpline(_knots(len(self.coefficients)), self.coefficients, 3)(t, 1))
-        return slope / np.linalg.norm(slope, axis=1, keepdims=True)
-
-    @property
-    def length(self) -> float:
-        """Arc length [m]."""
-        return length_of(self.position(_fine()))
-
-    def away_from(self, fixtures: Sequence[Array]) -> Array:
-        """Distances [m] of its ends from the fixtures: one of the start alone, or both."""
-        ends = self.position(np.array([0.0, 1.0]))[: len(fixtures)]
-        return np.asarray(np.linalg.norm(ends - np.array(fixtures), axis=1))
-
-    def evenly(self) -> SpaceCurve:
-        """Give the same curve with t proportional to its arc length."""
-        grid = _fine()
-        s = chord_length(self.position(grid))
-        at = np.interp(grid * s[-1], s, grid)
-        even = np.linalg.lstsq(self.design(grid), self.position(at), rcond=None)[0]
-        return SpaceCurve(np.asarray(even, float))
 
 
 @dataclass(frozen=True)
@@ -96,9 +55,9 @@ class CurveFit:
 
 def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
     """Smooth curve of `spans` polynomials through points (P, 3) [m], `along` it in this order."""
-    t = (along - along[0]) / (along[-1] - along[0])
-    n = spans + _DEGREE
-    basis, rough = _design(t, n), np.diff(np.eye(n), 3, axis=0)
+    n = spans + DEGREE
+    basis = SpaceCurve(np.zeros((n, 3))).design((along - along[0]) / (along[-1] - along[0]))
+    rough = np.diff(np.eye(n), 3, axis=0)
     # a point weighs as much as a wave of three spans that is as high as it is off
     normal = basis.T @ basis + len(points) / n * rough.T @ rough
     return SpaceCurve(np.asarray(np.linalg.solve(normal, basis.T @ points), float)).evenly()
@@ -130,16 +89,21 @@ def fit_curve_to_images(
     grid = np.linspace(0.0, 1.0, _GRID)
     params = list(params or [places_along(seen, curve.position(grid)) for seen in curves])
     motions = np.zeros((m, 6))
-    whitened = [_independent_std(seen) for seen in curves]
     rigid = [np.linalg.inv(seen.viewpoint.covariance) for seen in curves]
     prior = block_diag(np.zeros((3 * n, 3 * n)), *rigid)
-    rough = block_diag(_roughness(n), np.zeros((6 * m, 6 * m)))
+    # c^T K c = integral |r'''|^2 dt, constant within a span
+    third = np.diff(np.eye(n), 3, axis=0)
+    rough = np.kron(third.T @ third * (n - DEGREE) ** 5, np.eye(3))
+    rough = block_diag(rough, np.zeros((6 * m, 6 * m)))
     wander = _WANDER * curve.length**2
     for loop in range(_LOOPS):
-        still = np.hstack([_along_itself(curve), np.zeros((3 * n, 6 * m))])
-        rows, errors, residuals = [still], [np.zeros(3 * n)], []
-        for v, (seen, std) in enumerate(zip(curves, whitened, strict=True)):
-            camera = moved_camera(seen.viewpoint, motions[v])
+        # Rows that hold the curve where it is along itself, where no photograph does.
+        t = np.linspace(0.0, 1.0, 3 * n)
+        still = curve.design(t)[:, :, None] * curve.tangent(t)[:, None, :] / _TANGENTIAL
+        rows = [np.hstack([still.reshape(3 * n, -1), np.zeros((3 * n, 6 * m))])]
+        errors, residuals = [np.zeros(3 * n)], []
+        for v, seen in enumerate(curves):
+            camera = seen.viewpoint.moved(motions[v])
             params[v] = _nearest(curve, seen, camera, params[v])
             by_curve, by_motion, error = _linearise(curve, seen, camera, motions[v], params[v])
             residuals.append(error)
@@ -147,16 +111,18 @@ def fit_curve_to_images(
             whole = np.zeros((len(by_curve), 3 * n + 6 * m))
             whole[:, : 3 * n] = by_curve
             whole[:, 3 * n + 6 * v : 3 * n + 6 * v + 6] = by_motion
-            scaled = error[used] / std[used]
+            std = seen.independent_std[used]
+            scaled = error[used] / std
             weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(scaled), 1e-9)))
-            rows.append(whole * (weight / std[used])[:, None])
+            rows.append(whole * (weight / std)[:, None])
             errors.append(scaled * weight)
         A, e = np.vstack(rows), np.concatenate(errors)
         x = np.concatenate([curve.coefficients.ravel(), motions.ravel()])
         solved = _solve(A, e, x, rough, prior, wander)
         wander = solved.q * _WANDER_NEXT
         x = x + solved.step
-        moved = float(np.abs(_design(_fine(), n) @ solved.step[: 3 * n].reshape(n, 3)).max())
+        change = SpaceCurve(solved.step[: 3 * n].reshape(n, 3))
+        moved = float(np.abs(change.position(np.linspace(0.0, 1.0, 1001))).max())
         motions = x[3 * n :].reshape(m, 6)
         curve = SpaceCurve(x[: 3 * n].reshape(n, 3)).evenly()
         if loop > 2 and moved < _SETTLED:
@@ -188,17 +154,10 @@ def _solve(A: Array, e: Array, x: Array, rough: Array, prior: Array, wander: Arr
         step = cho_solve(factor, gradient - rough @ x / q)
         y = x + step
         surprise = np.sum((e - A @ step) ** 2) + y @ prior @ y + y @ rough @ y / q
-        surprise += 2.0 * np.log(np.diag(factor[0])).sum() + 2 * (n - _DEGREE) * np.log(q)
+        surprise += 2.0 * np.log(np.diag(factor[0])).sum() + 2 * (n - DEGREE) * np.log(q)
         return _Step(step, factor, float(surprise), q)
 
     return min(map(step_of, wander.tolist()), key=lambda found: found.surprise)
-
-
-def _along_itself(curve: SpaceCurve) -> Array:
-    """Rows (3 n, 3 n) that hold a curve where it is along itself, where no photograph does."""
-    t = np.linspace(0.0, 1.0, 3 * len(curve.coefficients))
-    rows = curve.design(t)[:, :, None] * curve.tangent(t)[:, None, :] / _TANGENTIAL
-    return rows.reshape(len(t), -1)
 
 
 def _linearise(
@@ -217,16 +176,6 @@ def _linearise(
     return by_curve, np.hstack([np.cross(turned, by_shift), by_shift]), error
 
 
-def moved_camera(viewpoint: Viewpoint, motion: Array) -> Viewpoint:
-    """Turn the board by the rotation vector w and shift it by d in the camera's frame."""
-    turn = Rotation.from_rotvec(motion[:3]).as_matrix()
-    return replace(
-        viewpoint,
-        rotation=turn @ viewpoint.rotation,
-        translation=turn @ viewpoint.translation + motion[3:],
-    )
-
-
 def _nearest(curve: SpaceCurve, seen: ImageCurve, camera: Viewpoint, t: Array) -> Array:
     """Nearest places on the projected curve, from near ones; nan beyond its ends."""
     t = t.copy()
@@ -239,36 +188,6 @@ def _nearest(curve: SpaceCurve, seen: ImageCurve, camera: Viewpoint, t: Array) -
         moved = t[used] + np.clip(step, -2.0 / _GRID, 2.0 / _GRID)
         t[used] = np.where((moved >= 0.0) & (moved <= 1.0), moved, np.nan)
     return t
-
-
-def _independent_std(seen: ImageCurve) -> Array:
-    """Standard deviations (K,) [px] of independent pixels that tell as much.
-
-    Pixels a distance h apart whose errors are correlated over the length c (the integral of the
-    correlation, on both sides) are worth h / (2 c) independent ones.
-    """
-    return seen.std * np.sqrt(max(2.0 * seen.correlation / max(seen.spacing, 1e-6), 1.0))
-
-
-def _roughness(n: int) -> Array:
-    """K (3 n, 3 n): c^T K c = integral |r'''|^2 dt, constant within a span."""
-    third = np.diff(np.eye(n), 3, axis=0)
-    return np.asarray(np.kron(third.T @ third * (n - _DEGREE) ** 5, np.eye(3)), float)
-
-
-def _knots(n: int) -> Array:
-    return np.asarray(np.arange(-_DEGREE, n + 1) / (n - _DEGREE))
-
-
-def _design(t: Array, n: int) -> Array:
-    if not len(t):
-        return np.zeros((0, n))
-    inside = np.clip(t, 0.0, 1.0 - 1e-12)
-    return np.asarray(BSpline.design_matrix(inside, _knots(n), _DEGREE).toarray())
-
-
-def _fine() -> NDArray[np.float64]:
-    return np.linspace(0.0, 1.0, 1001)
 
 
 def measure_shared_outlines(
@@ -347,9 +266,15 @@ def see_beside(
         both = EdgeShape(usual + float(np.abs(beside[run]).max()), seen.blur * pixel)
         found = find_edges(smooth, seen.direction, both)
         apart = np.maximum(found.width - width[run], 0.0)
-        side = _sides(beside[run], apart, crossed)
+        side = np.sign(beside[run])  # on which the other stretch lies: 1 to the left
+        if crossed is not None:
+            widest_last = abs(beside[run][-1]) > abs(beside[run][0])
+            side = np.full(len(side), side[-1 if widest_last else 0])
+            narrowest = int(np.argmin(apart))
+            beyond = slice(None, narrowest) if widest_last else slice(narrowest, None)
+            side[beyond] *= -1 if crossed else 1
         offset = (found.offset - 0.5 * side * apart)[:, None]
-        points = line.position(t[run]) + offset * line.normal(t[run])
+        points = line(t[run]) + offset * normals(line(t[run], 1))
         good = profiles.inside & (np.abs(apart - np.abs(beside[run])) < 0.5 * usual)
         good &= np.diff(np.floor(t[run] / spacing), prepend=-1.0) > 0
         if not good.any():
@@ -365,16 +290,3 @@ def see_beside(
     pixels_again, std_again = np.vstack(pixels)[order], np.concatenate(std)[order]
     whole = np.ones(len(order), bool)
     return replace(seen, pixels=pixels_again, std=std_again, whole=whole), along[order]
-
-
-def _sides(beside: Array, apart: Array, crossed: bool | None) -> Array:
-    """Side (K,) on which the other stretch lies: 1 to the left, -1 to the right."""
-    if crossed is None:
-        return np.sign(beside)
-    widest_last = abs(beside[-1]) > abs(beside[0])
-    side = np.full(len(beside), np.sign(beside[-1 if widest_last else 0]))
-    if crossed:
-        narrowest = int(np.argmin(apart))
-        beyond = slice(None, narrowest) if widest_last else slice(narrowest, None)
-        side[beyond] *= -1
-    return side

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from dlo_casadi.vision.camera import Array
 
 _SIGNIFICANT = 5.0  # standard deviations of the background's noise
+_MAX_STRANDS = 60
+_NARROWEST, _WIDEST = 0.4, 1.8  # of the cable's width
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,9 @@ def local_contrast(
     Slow changes of the light and steps at the rims of larger objects remain in the median and so
     cancel; a cable, whether darker, brighter or of another colour, does not.
     """
-    window = 2 * round(2.0 * width_px) + 1
-    background = cv2.medianBlur(image, window)
+    background = cv2.medianBlur(image, 2 * round(2.0 * width_px) + 1)
     difference = image.astype(np.float32) - background.astype(np.float32)
-    sample = difference[reachable]
-    noise = np.maximum(1.4826 * np.median(np.abs(sample), axis=0), 1.0)
+    noise = np.maximum(1.4826 * np.median(np.abs(difference[reachable]), axis=0), 1.0)
     return Contrast(difference / noise.astype(np.float32), reachable, noise)
 
 
@@ -80,29 +80,22 @@ def _upper_level(values: NDArray[np.float32], area: float) -> float:
     """Value that is exceeded in `area` pixels; zero where nothing significant is left."""
     high = values[values > _SIGNIFICANT]
     rank = int(max(area, 1))
-    if high.size < rank:
-        return 0.0
-    return float(np.partition(high, high.size - rank)[high.size - rank])
+    return (
+        0.0 if high.size < rank else float(np.partition(high, high.size - rank)[high.size - rank])
+    )
 
 
-_MAX_STRANDS = 60
-_NARROWEST, _WIDEST = 0.4, 1.8  # of the cable's width
-
-
-@dataclass(frozen=True)
-class Strand:
-    """One unbranched line of the skeleton."""
-
-    points: Array  # (K, 2) [px], column and row of neighbouring pixels, in order
-    width: float  # [px], median width of the mask about it
-
-
-def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[Strand]:
+def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[tuple[NDArray[np.intp], float]]:
     """Thin a mask (Zhang and Suen) and cut it into strands, longest first.
 
     A highlight along the cable is closed first. Parts of the wrong width, junctions and spurs
     shorter than the cable is wide are left out: whether the strands on both sides of a cut
     continue each other is decided by their directions, not by the pixels between them.
+
+    Returns
+    -------
+    Column and row (K, 2) of the neighbouring pixels of each strand, in order, and the median width
+    [px] of the mask about it.
     """
     whole = mask.astype(np.uint8) * 255
     x, y, wide, high = cv2.boundingRect(whole)
@@ -111,13 +104,24 @@ def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[Strand]:
     x, y = max(x - 2, 0), max(y - 2, 0)
     part = whole[y : y + high + 4, x : x + wide + 4]
     core = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+    square = np.ones((3, 3), np.uint8)
     filled = cv2.morphologyEx(part, cv2.MORPH_CLOSE, core)
-    thick = _thick(filled, width_px)
-    filled[thick > 0] = 0
+    # Bodies wider than two cables are holders, occluders, markers: left out with a rim.
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * round(width_px) + 1,))
+    filled[cv2.dilate(cv2.morphologyEx(filled, cv2.MORPH_OPEN, disc), square) > 0] = 0
     depth = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
     lines = cv2.ximgproc.thinning(filled, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN) > 0
     lines &= depth < _WIDEST / 2 * width_px + 0.5
-    lines &= ~_junctions(lines)
+    # Three or more lines meet where that many steps lead from off to on around a pixel: a corner of
+    # a staircase has many neighbours but only two such steps.
+    padded, ring = (
+        np.pad(lines, 1),
+        [(0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0)],
+    )
+    height, width = lines.shape
+    around = np.array([padded[i : i + height, j : j + width] for i, j in ring])
+    meeting = lines & (np.sum(~around & np.roll(around, -1, axis=0), axis=0) >= 3)
+    lines &= cv2.dilate(meeting.astype(np.uint8), square) == 0
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         lines.astype(np.uint8), connectivity=8
     )
@@ -126,55 +130,25 @@ def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[Strand]:
     strands = []
     for label in large[:_MAX_STRANDS]:
         left, top, wide, high = stats[label, :4]
-        window = labels[top : top + high, left : left + wide] == label
-        rows, columns = np.nonzero(window)
+        rows, columns = np.nonzero(labels[top : top + high, left : left + wide] == label)
         points = _walk(np.column_stack([columns + left, rows + top]))
-        width = 2 * float(np.median(depth[points[:, 1], points[:, 0]]))
-        if width > _NARROWEST * width_px:
-            strands.append(Strand(points + np.array([x, y], float), width))
+        strand_px = 2 * float(np.median(depth[points[:, 1], points[:, 0]]))
+        if strand_px > _NARROWEST * width_px:
+            strands.append((points + [x, y], strand_px))
     return strands
-
-
-def _thick(filled: NDArray[np.uint8], width_px: float) -> NDArray[np.uint8]:
-    """Bodies wider than two cables, grown by a rim: holders, occluders, markers."""
-    size = 2 * round(width_px) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    bodies = cv2.morphologyEx(filled, cv2.MORPH_OPEN, disc)
-    return cv2.dilate(bodies, np.ones((3, 3), np.uint8))
-
-
-def _junctions(lines: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels at which three or more lines meet, with their neighbours.
-
-    Counted are the steps from off to on around a pixel: a corner of a staircase has many
-    neighbours but only two such steps.
-    """
-    padded = np.pad(lines, 1).astype(np.int8)
-    ring = [(0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0)]
-    height, width = lines.shape
-    around = [padded[i : i + height, j : j + width] for i, j in ring]
-    steps = sum(
-        (here < following).astype(np.int8)
-        for here, following in zip(around, [*around[1:], around[0]], strict=True)
-    )
-    crossing = ((np.asarray(steps) >= 3) & lines).astype(np.uint8)
-    return cv2.dilate(crossing, np.ones((3, 3), np.uint8)) > 0
 
 
 def _walk(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
     """Order the pixels (K, 2) of an unbranched 8-connected line from one end to the other."""
-    places = {(int(x), int(y)) for x, y in pixels}
+    places = {(x, y) for x, y in pixels.tolist()}
     steps = [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)]
 
     def neighbours(p: tuple[int, int]) -> list[tuple[int, int]]:
         return [(p[0] + i, p[1] + j) for i, j in steps if (p[0] + i, p[1] + j) in places]
 
-    ends = [p for p in sorted(places) if len(neighbours(p)) == 1]
-    at = ends[0] if ends else min(places)
-    line = [at]
-    places.discard(at)
-    while following := neighbours(at):
-        at = following[0]
-        line.append(at)
-        places.discard(at)
+    line = [min((p for p in places if len(neighbours(p)) == 1), default=min(places))]
+    places.discard(line[0])
+    while following := neighbours(line[-1]):
+        line.append(following[0])
+        places.discard(following[0])
     return np.array(line)

@@ -1,4 +1,4 @@
-"""A weights picture of the cable's plane, coarse enough to find the cable quickly."""
+"""A picture of the cable's plane, coarse enough to find the cable quickly."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, View
@@ -14,14 +14,53 @@ from dlo_casadi.vision.camera import Array, View
 CABLE_PX = 6.0  # width of the cable in this picture
 _MAX_PIXELS = 3.0e6
 _MAX_ENLARGEMENT = 1.5
-_LONGEST_SIDE = 32767
-"""Pixels of one side of this picture at most: what `cv2.remap` takes."""
-
+_LONGEST_SIDE = 32767  # pixels of one side of this picture at most: what `cv2.remap` takes
+# Sides of a photograph, shrunk until the cable is CABLE_PX wide: below, nothing of it is left.
 _LEAST_PIXELS = 8
-"""Sides of a photograph, shrunk until the cable is CABLE_PX wide: below, nothing of it is left."""
-
-_AROUND = 0.3  # of the length: how far beyond its reach other cables are looked for
 _MARKER_MARGIN = 1.45  # of the marker: its white margin is one cell of six or more
+
+
+@dataclass(frozen=True)
+class KnownCable:
+    """What is known of a cable before it is seen.
+
+    Parameters
+    ----------
+    start, end : (2,) or (3,) [m]
+        The fixtures in the board frame; `end` is None for a free end.
+    diameter, length : scalar [m]
+        Of the cable.
+    """
+
+    start: ArrayLike
+    end: ArrayLike | None
+    diameter: float
+    length: float
+
+    @property
+    def fixtures(self) -> Array:
+        """Places (1, d) or (2, d) [m] of the ends that are held."""
+        return np.array([at for at in (self.start, self.end) if at is not None], float)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """How a cable may look, and what may be around it."""
+
+    around: float  # of the length: how far beyond its reach other cables are looked for
+    good: float  # cost per length of a cable that is seen nearly from fixture to fixture
+    turn: float  # price of a turn between strands, in diameters per rad^2
+    short: float  # diameters between strands up to which a turn may lie anywhere in the gap
+    sharpest: tuple[float, float]  # [rad], largest turn between strands, and that in a short gap
+    varied: bool  # its background changes on the way, and it may go forth and back
+
+
+ALONG_BOARD = Scene(0.3, -0.7, 2.0, 1.5, (2.5, 1.0), varied=False)
+"""Close to the board, and all of it in one plane."""
+
+BEFORE_BOARD = Scene(0.0, -0.9, 0.5, 6.0, (np.inf, np.inf), varied=True)
+"""It may turn back sharply, as a bend seen from its side does, and pass in front of other things
+than the board. Its length in the picture is not known beforehand: more of it must be seen."""
 
 
 @dataclass(frozen=True)
@@ -30,22 +69,14 @@ class ExpectedLine:
 
     Its length lies between `shortest` and `longest`: both are the cable's where that lies in the
     plane; in front of it the picture may show less (a part that points to the camera) or more (a
-    near one). In space it may turn back sharply, as a bend seen from its side does, and pass in
-    front of other things than the board.
+    near one).
     """
 
-    start: Array  # (2,) [m]
-    end: Array | None  # (2,) [m], None where it is free
+    fixtures: Array  # (1, 2) or (2, 2) [m], the start, and the end unless that is free
     diameter: float  # [m]
     shortest: float  # [m]
     longest: float  # [m]
-    in_space: bool = False
-
-    @property
-    def fixtures(self) -> dict[str, Array]:
-        """Places (2,) [m] of the ends that are held, by their names."""
-        held = {"start": self.start, "end": self.end}
-        return {name: at for name, at in held.items() if at is not None}
+    scene: Scene
 
     @property
     def typical(self) -> float:
@@ -54,8 +85,8 @@ class ExpectedLine:
 
     def tips(self, points: Array) -> list[tuple[str, Array, Array, float]]:
         """Name and place of each fixture, the line's end there, and how far [m] that is off."""
-        pairs = zip(self.fixtures.items(), points[[0, -1]], strict=False)
-        return [(name, at, tip, float(np.linalg.norm(tip - at))) for (name, at), tip in pairs]
+        ends = zip(("start", "end"), self.fixtures, points[[0, -1]], strict=False)
+        return [(name, at, tip, float(np.linalg.norm(tip - at))) for name, at, tip in ends]
 
 
 @dataclass(frozen=True)
@@ -80,19 +111,24 @@ class WorkPlane:
 def rectify(image: NDArray[np.uint8], view: View, expected: ExpectedLine) -> WorkPlane:
     """Resample the photograph onto the cable's plane, where the cable is `CABLE_PX` wide.
 
-    A cable of length L between two fixtures stays inside the ellipse |p - start| + |p - end| <= L;
+    A cable of length L between two fixtures stays inside the ellipse |p - start| + |p - end| <= L,
+    which with the foci +-c and the long half axis a has the half sides sqrt(a^2 - |c|^2 + c_i^2);
     with a free end inside the disc |p - start| <= L. Both are widened a little, since the scale
-    may be off. In a plane the picture goes on beyond, where a second cable is looked for.
+    may be off. The picture goes on beyond where a second cable is looked for.
     """
     height, width = image.shape[:2]
-    start, end, diameter, length = expected.start, expected.end, expected.diameter, expected.longest
+    fixtures, diameter, length = expected.fixtures, expected.diameter, expected.longest
     reach = 1.08 * length + 2 * diameter
-    centre, half = _reachable_box(start, end, reach)
-    if not expected.in_space:
-        half = half + _AROUND * length
-    seen = _border(view)
-    lower = np.maximum(centre - half, seen.min(axis=0))
-    upper = np.minimum(centre + half, seen.max(axis=0))
+    focus = (fixtures[-1] - fixtures[0]) / 2
+    spare = max((reach / len(fixtures)) ** 2 - float(focus @ focus), 0.0)
+    half = np.sqrt(spare + focus**2) + expected.scene.around * length
+    centre = (fixtures[0] + fixtures[-1]) / 2
+    share = np.linspace(0.0, 1.0, 33)
+    zero, one = np.zeros_like(share), np.ones_like(share)
+    u, v = np.concatenate([share, one, share, zero]), np.concatenate([zero, share, one, share])
+    border = view.to_board(np.column_stack([u, v]) * [view.shape[1] - 1, view.shape[0] - 1])
+    lower = np.maximum(centre - half, border.min(axis=0))
+    upper = np.minimum(centre + half, border.max(axis=0))
     size = np.maximum(upper - lower, diameter)
     pixel = max(
         diameter / CABLE_PX,
@@ -106,67 +142,36 @@ def rectify(image: NDArray[np.uint8], view: View, expected: ExpectedLine) -> Wor
             "not that of this photograph.\n"
             "  Try: board.marker_size, board.marker_centers, reference.points in metres?"
         )
-    columns, rows = (np.ceil(size / pixel)).astype(int) + 1
+    columns, rows = ((np.ceil(size / pixel)).astype(int) + 1).tolist()
     origin = np.array([lower[0], upper[1]])
-    at = _sources(view, origin, pixel, int(rows), int(columns))
+    at = _sources(view, origin, pixel, rows, columns)
     inside = np.all((at >= 1) & (at <= [width - 2, height - 2]), axis=2)
 
-    shrink = 1.0 / (view.scale * pixel)
-    if shrink > 1.0 / 1.5:
-        small, factor = image, 1.0
+    small, factor = image, 1.0 / (view.scale * pixel)
+    if factor > 1.0 / 1.5:
+        factor = 1.0
+    elif factor * min(height, width) < _LEAST_PIXELS:
+        raise VisionError(
+            f"a cable of {diameter:.4g} m in diameter would be {diameter * view.scale:.4g} "
+            f"pixels wide in a photograph of {width} x {height}: too wide to be followed.\n"
+            "  Try: cable.diameter in metres? board.marker_size, reference.points?"
+        )
     else:
-        factor = shrink
-        if factor * min(height, width) < _LEAST_PIXELS:
-            raise VisionError(
-                f"a cable of {diameter:.4g} m in diameter would be {diameter * view.scale:.4g} "
-                f"pixels wide in a photograph of {width} x {height}: too wide to be followed.\n"
-                "  Try: cable.diameter in metres? board.marker_size, reference.points?"
-            )
         small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     maps = ((at + 0.5) * factor - 0.5).astype(np.float32)
     flat = cv2.remap(small, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    inside &= ~_marker_mask(view, origin, pixel, int(rows), int(columns))
-    x = origin[0] + pixel * np.arange(columns, dtype=np.float32)
-    y = origin[1] - pixel * np.arange(rows, dtype=np.float32)[:, None]
-    far = np.hypot(x - start[0], y - start[1])
-    if end is not None:
-        far = far + np.hypot(x - end[0], y - end[1])
-    return WorkPlane(np.asarray(flat, np.uint8), pixel, origin, inside, inside & (far <= reach))
-
-
-def _reachable_box(start: Array, end: Array | None, reach: float) -> tuple[Array, Array]:
-    """Centre (2,) and half sides (2,) [m] of the box about all that the cable can reach.
-
-    An ellipse with the foci +-c and the long half axis a has the half sides
-    sqrt(a^2 - |c|^2 + c_i^2).
-    """
-    if end is None:
-        return start, np.full(2, reach)
-    focus = (end - start) / 2
-    spare = max((reach / 2) ** 2 - float(focus @ focus), 0.0)
-    return (start + end) / 2, np.sqrt(spare + focus**2)
-
-
-def _border(view: View) -> Array:
-    """Board coordinates (K, 2) [m] along the border of the photograph."""
-    share = np.linspace(0.0, 1.0, 33)
-    zero, one = np.zeros_like(share), np.ones_like(share)
-    u, v = np.concatenate([share, one, share, zero]), np.concatenate([zero, share, one, share])
-    return view.to_board(np.column_stack([u, v]) * [view.shape[1] - 1, view.shape[0] - 1])
-
-
-def _marker_mask(
-    view: View, origin: Array, pixel: float, rows: int, columns: int
-) -> NDArray[np.bool_]:
-    """Where the board's markers, with their white margin, are seen."""
-    mask = np.zeros((rows, columns), np.uint8)
+    markers = np.zeros(inside.shape, np.uint8)
     for marker in view.markers:
         corners = (view.to_board(marker) - origin) / pixel * [1.0, -1.0]
         middle = corners.mean(axis=0)
         margin = middle + _MARKER_MARGIN * (corners - middle)
-        cv2.fillConvexPoly(mask, np.round(margin).astype(np.int32), 1)
-    return mask > 0
+        cv2.fillConvexPoly(markers, np.round(margin).astype(np.int32), 1)
+    inside &= markers == 0
+    x = origin[0] + pixel * np.arange(columns, dtype=np.float32)
+    y = origin[1] - pixel * np.arange(rows, dtype=np.float32)[:, None]
+    far = np.sum([np.hypot(x - at[0], y - at[1]) for at in fixtures], axis=0)
+    return WorkPlane(np.asarray(flat, np.uint8), pixel, origin, inside, inside & (far <= reach))
 
 
 def _sources(view: View, origin: Array, pixel: float, rows: int, columns: int) -> Array:

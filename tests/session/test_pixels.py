@@ -27,7 +27,12 @@ def viewpoint(angle):
     turn = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
     at = np.array([0.4 - 1.2 * np.sin(angle), 0.0, 1.2 * np.cos(angle)])
     return Viewpoint(
-        CAMERA, turn, -turn @ at, (960, 1280), 1e-8 * np.eye(6), 0.1, np.zeros((0, 4, 2)), ()
+        shape=(960, 1280),
+        camera=CAMERA,
+        rotation=turn,
+        translation=-turn @ at,
+        covariance=1e-8 * np.eye(6),
+        reprojection_error=0.1,
     )
 
 
@@ -47,9 +52,9 @@ def curve(bend=2.0):
 def sensor(angle, shown, together=0.0):
     """What a camera sees of a curve, without an error."""
     camera = viewpoint(angle)
-    outline = project_outline(camera, shown.at(S), shown.at(S, 1), DIAMETER)
+    pixels, _, _ = project_outline(camera, shown.at(S), shown.at(S, 1), DIAMETER)
     shared = together * np.ones((len(S), 6))
-    return Pixels(camera, outline.pixels, DIAMETER, shown.at(S), np.ones(len(S)), 1.2e-3, shared)
+    return Pixels(camera, pixels, DIAMETER, shown.at(S), np.ones(len(S)), 1.2e-3, shared)
 
 
 def test_a_curve_is_where_it_is_seen():

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from dlo_casadi.vision import (
     Board,
     Camera,
+    KnownCable,
     extract_centerline,
     from_reference,
     locate_board,
@@ -56,10 +57,7 @@ def measure(config, truth_file):
         line = extract_centerline(
             image,
             view,
-            start=pose["start"],
-            end=pose["end"],
-            diameter=cable["diameter"],
-            length=cable["length"],
+            KnownCable(pose["start"], pose["end"], cable["diameter"], cable["length"]),
         )
         curve = dense(truth[Path(pose["file"]).stem])
         nearest = cKDTree(curve).query(line.points)[1]
@@ -121,10 +119,7 @@ def test_the_real_black_wire_agrees_with_the_clicked_points():
     line = extract_centerline(
         image,
         view,
-        start=pose["start"],
-        end=pose["end"],
-        diameter=cable["diameter"],
-        length=cable["length"],
+        KnownCable(pose["start"], pose["end"], cable["diameter"], cable["length"]),
     )
     clicked = np.loadtxt(ROOT / "configs/real/black_wire/trial_0.csv", delimiter=",", skiprows=1)
     curve = dense(clicked)

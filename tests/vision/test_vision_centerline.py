@@ -5,7 +5,7 @@ import pytest
 from drawing import SCALE, arc, draw, normal_distance_px, square_view, to_pixels
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision import extract_centerline
+from dlo_casadi.vision import KnownCable, extract_centerline
 
 WIDTH_PX = 6.0
 CABLE = arc()
@@ -13,14 +13,10 @@ CABLE = arc()
 
 def extract(image, truth, width_px=WIDTH_PX, length=None, **fixtures):
     steps = np.linalg.norm(np.diff(truth, axis=0), axis=1)
-    fixtures = {"start": truth[0], "end": truth[-1], **fixtures}
-    return extract_centerline(
-        image,
-        square_view(image.shape),
-        diameter=width_px / SCALE,
-        length=steps.sum() if length is None else length,
-        **fixtures,
-    )
+    ends = {"start": truth[0], "end": truth[-1], **fixtures}
+    length = steps.sum() if length is None else length
+    cable = KnownCable(**ends, diameter=width_px / SCALE, length=length)
+    return extract_centerline(image, square_view(image.shape), cable)
 
 
 # RMS [px] allowed: a drawn cable without a trick is found to 0.02 px; noise and shadow cost more
@@ -102,9 +98,8 @@ def test_a_cable_that_leaves_the_picture_and_returns_is_one_cable():
     cut = image[top:]
     view = square_view(cut.shape)
     moved = bow + np.array([0.0, top / SCALE])
-    line = extract_centerline(
-        cut, view, start=moved[0], end=moved[-1], diameter=WIDTH_PX / SCALE, length=0.8
-    )
+    cable = KnownCable(moved[0], moved[-1], WIDTH_PX / SCALE, 0.8)
+    line = extract_centerline(cut, view, cable)
     assert normal_distance_px(line.points, moved).max() < 1.0
     assert len(line.gaps) == 1
     assert "outside the picture" in line.messages[0]

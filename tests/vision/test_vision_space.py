@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision import (
     Camera,
+    KnownCable,
     compare_pixels,
     locate_camera,
     measure_views,
@@ -32,16 +33,12 @@ def pictures():
     }
 
 
+def known(curve):
+    return KnownCable(curve[0], curve[-1], DIAMETER, length_of(curve))
+
+
 def measured(photographs, curve):
-    return measure_views(
-        photographs,
-        BOARD,
-        CAMERA,
-        start=curve[0],
-        end=curve[-1],
-        diameter=DIAMETER,
-        length=length_of(curve),
-    )
+    return measure_views(photographs, BOARD, CAMERA, known(curve))
 
 
 def true_pixels(curve, where):
@@ -93,7 +90,7 @@ def test_the_middle_of_an_outline_is_that_of_the_cylinders_surface(pictures):
         axis = view.center + view.rotation.T @ [*rng.uniform(-0.2, 0.2, 2), 0.5]
         tangent = rng.standard_normal(3)
         tangent /= np.linalg.norm(tangent)
-        seen = project_outline(view, axis, tangent, diameter)
+        (middle,), (normal,), _ = project_outline(view, axis, tangent, diameter)
         one = np.cross(tangent, [0.3, 0.5, 0.8])
         one /= np.linalg.norm(one)
         angle, s = np.meshgrid(np.linspace(0, 2 * np.pi, 361), np.linspace(-0.02, 0.02, 801))
@@ -102,11 +99,12 @@ def test_the_middle_of_an_outline_is_that_of_the_cylinders_surface(pictures):
         surface = axis + 0.5 * diameter * ring + s[..., None] * tangent
         shape = (*angle.shape, 2)
         off = view.to_pixels(surface.reshape(-1, 3)).reshape(shape) - view.to_pixels(axis)
-        across = off @ seen.normals[0]
-        profile = across[np.abs(off @ [seen.normals[0, 1], -seen.normals[0, 0]]) < 0.1]
+        across = off @ normal
+        profile = across[np.abs(off @ [normal[1], -normal[0]]) < 0.1]
         edges = profile.min(), profile.max()
-        middle = (seen.pixels - view.to_pixels(axis))[0] @ seen.normals[0]
-        assert middle == pytest.approx(np.mean(edges), abs=0.03)
+        assert (middle - view.to_pixels(axis)[0]) @ normal == pytest.approx(
+            np.mean(edges), abs=0.03
+        )
 
 
 @pytest.mark.parametrize("name", CURVES)
@@ -115,14 +113,7 @@ def test_the_line_in_a_photograph(pictures, name, where):
     """It crosses itself, its shadow and the outline of the board."""
     curve = CURVES[name]
     view = locate_camera(pictures[name][where], BOARD, CAMERA)
-    seen = see_cable(
-        pictures[name][where],
-        view,
-        start=curve[0],
-        end=curve[-1],
-        diameter=DIAMETER,
-        length=length_of(curve),
-    )
+    seen = see_cable(pictures[name][where], view, known(curve))
     truth = true_pixels(curve, where)
     away, nearest = cKDTree(truth).query(seen.pixels)
     # the picture's noise leaves 0.1 px; beside the squares of a marker single pixels are far off
@@ -208,20 +199,13 @@ def test_a_loop_that_was_read_the_wrong_way_round_is_turned(pictures):
     curve = CURVES["loop"]
     images = {where: pictures["loop"][where] for where in ("left", "right")}
     curves = {
-        where: see_cable(
-            image,
-            locate_camera(image, BOARD, CAMERA),
-            start=curve[0],
-            end=curve[-1],
-            diameter=DIAMETER,
-            length=length_of(curve),
-        )
+        where: see_cable(image, locate_camera(image, BOARD, CAMERA), known(curve))
         for where, image in images.items()
     }
     for where, seen in curves.items():
         for way in loops_either_way(seen)[1:]:
             found = {**curves, where: way}
-            fit = agreeing_fit(found, {}, [curve[0], curve[-1]], length_of(curve), 50)
+            fit = agreeing_fit(found, {}, known(curve))
             away = cKDTree(curve).query(fit.curve.position(np.linspace(0.05, 0.95, 200)))[0]
             assert rms(away) < 1e-3
 

@@ -8,7 +8,7 @@ import yaml
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from dlo_casadi.vision import Board, Camera, calibrate_camera, measure_views, read_image
+from dlo_casadi.vision import Board, Camera, KnownCable, calibrate_camera, measure_views, read_image
 
 DATA = Path(__file__).parents[1] / "data"
 SESSION = DATA / "space/space_photos"
@@ -29,10 +29,7 @@ def measured(pictures, number):
         pictures,
         BOARD,
         CAMERA,
-        start=pose["start"],
-        end=pose["end"],
-        diameter=cable["diameter"],
-        length=cable["length"],
+        KnownCable(pose["start"], pose["end"], cable["diameter"], cable["length"]),
     )
 
 

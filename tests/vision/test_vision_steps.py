@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision import (
     Board,
+    KnownCable,
     Workings,
     draw_steps,
     encoded,
@@ -25,17 +26,9 @@ def extract(image, workings=None, length=LENGTH):
     return extract_centerline(
         image,
         square_view(image.shape),
-        start=CABLE[0],
-        end=CABLE[-1],
-        diameter=WIDTH_PX / SCALE,
-        length=length,
-        workings=workings,
+        KnownCable(CABLE[0], CABLE[-1], WIDTH_PX / SCALE, length),
+        workings,
     )
-
-
-def steps(image, workings, line):
-    view = square_view(image.shape)
-    return draw_steps(image, view, workings, line, CABLE[0], CABLE[-1])
 
 
 def blue(picture):
@@ -45,8 +38,8 @@ def blue(picture):
 
 def test_the_steps_of_a_cable_that_is_found():
     image, workings = draw(CABLE), Workings()
-    line = extract(image, workings)
-    pictures = steps(image, workings, line.pixels)
+    extract(image, workings)
+    pictures = draw_steps(image, workings)
 
     assert list(pictures) == STEPS
     assert sum(map(len, workings.chosen)) > 100
@@ -67,10 +60,10 @@ def test_the_steps_of_a_cable_that_is_not_found():
     image, workings = np.full((420, 560, 3), 185, np.uint8), Workings()
     with pytest.raises(VisionError, match="no cable found"):
         extract(image, workings)
-    pictures = steps(image, workings, None)
+    pictures = draw_steps(image, workings)
     assert "1_workplane" in pictures
     assert not blue(pictures["4_centerline"]).any()
-    assert list(draw_steps(image, None, Workings(), None, (0, 0), None)) == ["4_centerline"]
+    assert list(draw_steps(image, Workings())) == ["4_centerline"]
 
 
 def test_a_picture_is_encoded_by_the_ending_of_its_file():

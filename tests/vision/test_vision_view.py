@@ -113,7 +113,7 @@ def test_round_trip_is_exact_to_rounding(picture):
 @pytest.mark.parametrize("count", [0, 4, 5, 8, 12, 14])
 def test_every_coefficient_of_a_lens_counts_both_ways(count):
     """To the corners of the picture; to the fixed point's own tolerance of 1e-10 focal lengths."""
-    view = View(np.eye(3), SHAPE, Camera(MATRIX, LENS[:count]))
+    view = View(homography=np.eye(3), shape=SHAPE, camera=Camera(MATRIX, LENS[:count]))
     a, b = (axis.ravel() for axis in np.meshgrid([-0.45, 0.0, 0.2, 0.5], [-0.35, -0.1, 0.0, 0.35]))
     seen = np.stack([*bend(a, b, LENS[:count]), np.ones_like(a)], axis=1) @ MATRIX[:2].T
     rays = np.stack([a, b], axis=1)
