@@ -51,7 +51,7 @@ class Trace:
     glare: NDArray[np.bool_]  # (K,), half of the cable's width is white beyond measure
     direction: Array = field(default_factory=lambda: np.zeros(3))
     """Weights (3,) of blue, green and red by which most of the cable stands out."""
-    shape: EdgeShape = EdgeShape(0.0, 0.0)  # typical; a width of 0 where no edges were found
+    shape: EdgeShape = field(default_factory=EdgeShape)  # typical; 0 where no edges were found
     width_std: float = 0.0  # [m], scatter of the width along the line
 
 

@@ -130,7 +130,8 @@ def see_cable(
         )
     distance = float(depths.mean())
     view = viewpoint.facing(distance)
-    line = measure_line(image, view, _expected_line(cable, viewpoint, distance), workings)
+    expected = _expected_line(cable, viewpoint, distance)
+    line = measure_line(image, view, expected, workings)
     if line.unreached:
         name, fixture, tip, _ = line.unreached[0]
         (u, v), (at_u, at_v) = view.to_pixels([fixture, tip])
@@ -148,7 +149,7 @@ def see_cable(
     workings.pixels = view.to_pixels(trace.points[kept])
     tips = [
         f"the line in the photograph ends {away / pixel:.0f} px from where the {name} is declared"
-        for name, _, _, away in workings.expected.tips(trace.points[kept])
+        for name, _, _, away in expected.tips(trace.points[kept])
         if away > TIP * width
     ]
     return ImageCurve(

@@ -60,8 +60,8 @@ class Profiles:
 class EdgeShape:
     """How wide the cable is in the photograph, and how blurred its edges."""
 
-    width: float  # [m], distance of the two edges
-    blur: float  # [m], standard deviation of an edge's blur
+    width: float = 0.0  # [m], distance of the two edges
+    blur: float = 0.0  # [m], standard deviation of an edge's blur
 
 
 @dataclass(frozen=True)
@@ -144,11 +144,12 @@ def find_edges(
 ) -> Crossings:
     """Find both edges of every profile, and the middle between them.
 
-    The direction (3,) or (K, 3) weighs the colours. An edge is where the brightness is half-way between the cable and its surroundings, those of
-    its own side and close by: a shadow that falls beside the cable changes the level of one side,
-    not the place of the edge. Instead of one crossing the mean over all levels from 1/4 to 3/4 is
-    taken; with q the share of the way from surroundings (0) to cable (1), and Q(x) the largest q
-    from x outwards, which passes over a highlight wherever it lies,
+    The direction (3,) or (K, 3) weighs the colours. An edge is where the brightness is half-way
+    between the cable and its surroundings, those of its own side and close by: a shadow that falls
+    beside the cable changes the level of one side, not the place of the edge. Instead of one
+    crossing the mean over all levels from 1/4 to 3/4 is taken; with q the share of the way from
+    surroundings (0) to cable (1), and Q(x) the largest q from x outwards, which passes over a
+    highlight wherever it lies,
 
         x_edge = integral_0^out clip(2 Q(x) - 1/2, 0, 1) dx
 

@@ -93,8 +93,8 @@ def fit_curve_to_images(
     prior = block_diag(np.zeros((3 * n, 3 * n)), *rigid)
     # c^T K c = integral |r'''|^2 dt, constant within a span
     third = np.diff(np.eye(n), 3, axis=0)
-    rough = np.kron(third.T @ third * (n - DEGREE) ** 5, np.eye(3))
-    rough = block_diag(rough, np.zeros((6 * m, 6 * m)))
+    bending = np.kron(third.T @ third * (n - DEGREE) ** 5, np.eye(3))
+    rough = np.asarray(block_diag(bending, np.zeros((6 * m, 6 * m))), float)
     wander = _WANDER * curve.length**2
     for loop in range(_LOOPS):
         # Rows that hold the curve where it is along itself, where no photograph does.

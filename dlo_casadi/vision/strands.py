@@ -80,9 +80,9 @@ def _upper_level(values: NDArray[np.float32], area: float) -> float:
     """Value that is exceeded in `area` pixels; zero where nothing significant is left."""
     high = values[values > _SIGNIFICANT]
     rank = int(max(area, 1))
-    return (
-        0.0 if high.size < rank else float(np.partition(high, high.size - rank)[high.size - rank])
-    )
+    if high.size < rank:
+        return 0.0
+    return float(np.partition(high, high.size - rank)[high.size - rank])
 
 
 def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[tuple[NDArray[np.intp], float]]:
@@ -114,11 +114,8 @@ def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[tuple[NDArray
     lines &= depth < _WIDEST / 2 * width_px + 0.5
     # Three or more lines meet where that many steps lead from off to on around a pixel: a corner of
     # a staircase has many neighbours but only two such steps.
-    padded, ring = (
-        np.pad(lines, 1),
-        [(0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0)],
-    )
-    height, width = lines.shape
+    ring = [(0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0)]
+    padded, (height, width) = np.pad(lines, 1), lines.shape
     around = np.array([padded[i : i + height, j : j + width] for i, j in ring])
     meeting = lines & (np.sum(~around & np.roll(around, -1, axis=0), axis=0) >= 3)
     lines &= cv2.dilate(meeting.astype(np.uint8), square) == 0
@@ -134,7 +131,7 @@ def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[tuple[NDArray
         points = _walk(np.column_stack([columns + left, rows + top]))
         strand_px = 2 * float(np.median(depth[points[:, 1], points[:, 0]]))
         if strand_px > _NARROWEST * width_px:
-            strands.append((points + [x, y], strand_px))
+            strands.append((points + np.array([x, y]), strand_px))
     return strands
 
 
