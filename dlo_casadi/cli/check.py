@@ -15,8 +15,8 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.report.check_table import advice_lines, check_dict, check_table
-from dlo_casadi.session.checks import find_suspicions
 from dlo_casadi.session.measure import calibrated, draw_steps, read_inputs
+from dlo_casadi.session.plausibility import find_suspicions
 from dlo_casadi.vision import encoded
 
 EXAMPLES = """\

@@ -11,8 +11,8 @@ from rich.table import Table
 
 from dlo_casadi.config import Config
 from dlo_casadi.report.json_report import finite
+from dlo_casadi.session.hypotheses import Suspicion
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.session.plausibility import Suspicion
 
 
 def check_dict(

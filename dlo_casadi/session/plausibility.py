@@ -1,416 +1,432 @@
-"""Mistakes that the measured lines themselves give away: units, frames, files out of step.
+"""What was read, held against what is declared of it: the list of questions, and those to shapes.
 
-Pure functions on arrays. The lines of a session are compared with what is declared of them: their
-lengths with the cable's, the places where they end with the fixtures. A wrong unit shows as a
-factor of a thousand, an axis that points the other way as ends that fit once they are mirrored,
-a list out of step as ends that fit another pose.
+A question compares the session with hypotheses on what it may have been meant as. Those on units,
+frames and the order of files are in `ends`, those on directions and readings in `clamps`; here are
+those that quick fits of a few poses decide: exchanged ends, and gravity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import product
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 
-from dlo_casadi.errors import counted
-from dlo_casadi.session.frames import exchanges, named
+from dlo_casadi.config import Config, Pose
+from dlo_casadi.errors import EstimationError, MeasurementError, counted
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
+from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.session.clamps import Compared, misread, wrong_directions
+from dlo_casadi.session.ends import (
+    counted_from_the_end,
+    out_of_step,
+    repeated,
+    single_poses,
+    stretched,
+    wrong_frame,
+    wrong_units,
+)
+from dlo_casadi.session.fitting import declared_model
+from dlo_casadi.session.hypotheses import (
+    Hypothesis,
+    Session,
+    Suspicion,
+    clamp_axes,
+    exchanges,
+    named,
+    shown_pull,
+    spread,
+)
+from dlo_casadi.session.measure import conditions
+from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import (
+    BEYOND_EFFECTS,
+    BIC_APART,
     CONTRADICTS,
     FITS,
+    HEADING_OFF,
     MUCH_BETTER,
-    NEAR_UNIT,
-    NEARLY_ALL,
-    OUT_OF_STEP,
-    STRETCHED,
-    TOO_LONG,
+    UNEXPLAINED,
 )
 
 FloatArray = NDArray[np.floating]
 
-# A rotation so near to exchanged axes is told by their names [rad].
-_NAMED = 0.3
-# Fits of a frame, each followed by a new choice of which end of a line is which.
-_FITS_OF_FRAME = 4
+NEVERTHELESS = (
+    "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless."
+)
+# Poses of a comparison, points of a line, elements of the mesh, coefficients of the rest curvature.
+_POSES, _POINTS, _MESH, _REST = 8, 24, 12, 4
+_DECADES = (0, -1, 1)
+# Poses that tell whether ends are exchanged: a misfit of a twentieth of the length shows in two.
+_FEW = 2
+# Stiffness over weight is known if its relative standard deviation is below this: units are told
+# where forces are five times off.
+_SIZED = 0.5
+# What is exchanged -> the keys of a pose.
+_EXCHANGED = {
+    "start and end exchanged": ("",),
+    "start and end exchanged, and their directions": ("", "_heading", "_orientation"),
+}
 
-UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
 
+def without_implausible(
+    config: Config, inputs: Sequence[PoseInput]
+) -> tuple[tuple[PoseInput, ...], list[str]]:
+    """Leave out single poses that contradict the configuration.
 
-class Suspicion(NamedTuple):
-    """What looks like a mistake, and what to do about it.
+    With the option `estimation.plausibility` off, all poses stay.
 
-    It is certain where nothing else explains the whole session; of a single pose it tells the name.
+    Returns
+    -------
+    inputs : tuple of PoseInput
+        Those left out have no points and say why.
+    odd : list of str
+        What looks like a mistake but stays.
+
+    Raises
+    ------
+    MeasurementError
+        If the measured lines of the session contradict the configuration beyond doubt, or if those
+        of most poses do.
     """
+    found = find_suspicions(config, inputs)
+    if not config.estimation.plausibility:
+        return tuple(inputs), [item.message for item in found]
+    bad = {item.pose: item.message for item in found if item.pose}
+    read = [item for item in inputs if len(item.points)]
+    fit_left = [item for item in read if item.role == "fit" and item.name not in bad]
+    refused = [item.message for item in found if item.certain]
+    if not refused and bad and (2 * len(bad) > len(read) or not fit_left):
+        refused = [
+            f"the configuration is contradicted by {len(bad)} of {counted(len(read), 'pose')}:",
+            *(f"  {message}" for message in bad.values()),
+        ]
+    if refused:
+        raise MeasurementError("\n".join([*refused, NEVERTHELESS]))
+    kept = list(inputs)
+    for k, item in enumerate(inputs):
+        if item.name in bad:
+            reason = bad[item.name].removeprefix(item.name).lstrip(": ")
+            kept[k] = PoseInput(item.name, item.role, np.zeros((0, 2)), problem=reason)
+    return tuple(kept), [item.message for item in found if not item.pose]
 
-    message: str
-    certain: bool
-    pose: str = ""
 
-    @classmethod
-    def of_pose(cls, name: str, text: str) -> Self:
-        """What looks like a mistake in a single pose."""
-        return cls(f"{name}: {text}", False, name)
+def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Everything in a session that looks like a mistake, see `QUESTIONS`."""
+    read = tuple(item for item in inputs if len(item.points))
+    session = Session(config, read)
+    found: tuple[Suspicion, ...] = ()
+    if not session.lines.names:
+        return found
+    for questions in QUESTIONS:
+        for alternatives in questions:
+            found += next(filter(None, (ask(session) for ask in alternatives)), ())
+        if any(item.certain for item in found):
+            break
+        doubtful = {item.pose for item in found}
+        session = Session(config, tuple(item for item in read if item.name not in doubtful))
+    return found
 
 
-@dataclass(frozen=True)
-class Lines:
-    """Measured lines beside what is declared of them.
+# ---- fits ---------------------------------------------------------------------------------------
+
+
+class Comparison(NamedTuple):
+    """The declared session beside the hypothesis that explains its shapes best, both fitted.
 
     Parameters
     ----------
-    names : tuple of str
-        Of the m poses.
-    declared : (m, 2, d) [m]
-        Start and end fixture of each pose; NaN for a free end.
-    measured : (m, 2, d) [m]
-        The two ends of each measured line, in any order unless it is known.
-    lengths : (m,) [m]
-        Along each measured line, from point to point; of markers so much longer as the cable is.
+    what : str
+        The hypothesis.
+    own, other : Fit or None
+        None where no stiffness gives equilibria near the shapes.
     length : float [m]
         Of the cable.
-    gaps : (m, 2) [m]
-        Arc lengths between the fixtures and the ends of what was measured, as far as that is to
-        be expected: of markers, and of lines whose points are far apart; else zero.
-    known : (m,) of bool, optional
-        Of which line it is known where it begins, as of markers; of none by default.
     """
 
-    names: tuple[str, ...]
-    declared: FloatArray
-    measured: FloatArray
-    lengths: FloatArray
+    what: str
+    own: Fit | None
+    other: Fit | None
     length: float
-    gaps: FloatArray
-    known: NDArray[np.bool_] | None = None
 
     @property
-    def ordered(self) -> NDArray[np.bool_]:
-        """Of which line (m,) it is known where it begins."""
-        return np.zeros(len(self.names), dtype=bool) if self.known is None else self.known
+    def misfits(self) -> tuple[float, float]:
+        """RMS distances [m] that the declaration and the hypothesis leave.
 
-    @property
-    def whole(self) -> bool:
-        """Whether nearly all were measured from fixture to fixture."""
-        return bool(np.mean(self.gaps.max(axis=1) < FITS * self.length) >= NEARLY_ALL)
-
-    def misfit(self, measured: FloatArray, declared: FloatArray) -> FloatArray:
-        """Distance of ends from fixtures over the length: the better order, RMS over both.
-
-        Less the gaps that are to be expected.
-        Shapes (m, ..., 2, 2) and (..., 2, 2) -> (m, ...).
+        Without a fit as far as ends that contradict a pose.
         """
-        gaps = self.gaps.reshape((len(self.gaps), *(1,) * (measured.ndim - 3), 2))
-        ways = [
-            np.maximum(np.linalg.norm(ends - declared, axis=-1) - gaps, 0.0)
-            for ends in (measured, measured[..., ::-1, :])
-        ]
-        given, turned = (np.sqrt(np.nanmean(way**2, axis=-1)) for way in ways)
-        known = self.ordered.reshape((-1, *(1,) * (given.ndim - 1)))
-        return np.where(known, given, np.minimum(given, turned)) / self.length
+        pair = (self.own, self.other)
+        left = [CONTRADICTS * self.length if fit is None else fit.residual_rms for fit in pair]
+        return left[0], left[1]
+
+    @property
+    def told(self) -> str:
+        """What both leave, in words."""
+        own, other = self.misfits
+        left = f"the lines are {own:.3g} m RMS from the shapes of any stiffness, but"
+        if self.own is None:
+            left = "no stiffness gives equilibria near the lines, but they are within"
+        return f"{left} {other:.3g} m with {self.what}"
+
+    @property
+    def better(self) -> bool:
+        """Whether the declaration leaves more than noise, and the hypothesis clearly less.
+
+        Where the declaration has no fit the hypothesis has to show a weight: a fit of few points
+        may fail, or not, by chance.
+        """
+        if self.own is None and not tells_weight(self.other):
+            return False
+        own, other = self.misfits
+        return own > UNEXPLAINED * self.length and other < MUCH_BETTER * own
+
+    @property
+    def certain(self) -> bool:
+        """Whether it is clearly better, and no effect that is missing explains it."""
+        return self.better and self.misfits[0] > BEYOND_EFFECTS * self.length
+
+    @property
+    def shows_weight(self) -> bool:
+        """Whether only the hypothesis shows a weight, and it explains the shapes, and better.
+
+        Under gravity against the weight the best fit is a cable too stiff to show any.
+        """
+        if self.other is None or not tells_weight(self.other) or tells_weight(self.own):
+            return False
+        own, other = self.misfits
+        if other > BEYOND_EFFECTS * self.length:
+            return False
+        # Difference of the BIC of two models with the same unknowns.
+        return bool(2 * self.other.problem.n_residuals * np.log(own / other) > BIC_APART)
 
 
-def suspicions(lines: Lines) -> tuple[Suspicion, ...]:
-    """All that looks like a mistake; the first kind that explains the ends is the only one.
+def compare(
+    session: Session, hypotheses: Sequence[Hypothesis[Session]], most: int = _POSES
+) -> Comparison | None:
+    """Fit the declared session, and each hypothesis until one explains all; the best one.
 
-    Parameters
-    ----------
-    lines : Lines
-        Poses that could be read; at least one.
+    Of so many poses at most. None where there is no hypothesis, or the declared session explains
+    its shapes and weight.
     """
-    if not len(lines.names):
+    if not hypotheses:
+        return None
+    length = session.config.cable.length
+    own = coarse_fit(session, most)
+    if own is not None and tells_weight(own) and own.residual_rms <= UNEXPLAINED * length:
+        return None
+    tried = []
+    for what, meant in hypotheses:
+        tried.append(Comparison(what, own, coarse_fit(meant, most), length))
+        if tried[-1].certain and tried[-1].misfits[1] < UNEXPLAINED * length:
+            break
+    return min(tried, key=lambda found: found.misfits)
+
+
+def coarse_fit(session: Session, most: int = _POSES) -> Fit | None:
+    """Fit of the declared cable without effects; None if none is found.
+
+    It takes all poses, whatever their role.
+    """
+    measured = []
+    for k in spread(len(session.read), most):
+        item = session.read[k]
+        kept = spread(len(item.points), _POINTS)
+        s = None if item.s is None else item.s[kept]
+        pose = conditions(session.declared[item.name])
+        measured.append(MeasuredPose.of_points(pose, item.points[kept], s=s))
+    model = declared_model(session.config).model
+    model = replace(model, effects=(), priors={}, n=_MESH, n_rest=_REST)
+    noise = UNEXPLAINED * session.config.cable.length
+    try:
+        return fit_model(model, measured, Tolerances(), noise, decades=_DECADES)
+    except EstimationError:
+        return None
+
+
+def tells_weight(fit: Fit | None) -> bool:
+    """Whether there is a fit, and its shapes tell stiffness over weight."""
+    if fit is None:
+        return False
+    return bool(fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS))
+
+
+def wrong_readings(session: Session) -> tuple[Suspicion, ...]:
+    """Readings held against the forces that the shapes need, by a coarse fit of some poses."""
+    fitted = [item for item in session.read if item.role == "fit" and not item.views]
+    fitted = [item for item in fitted if session.declared[item.name].readings]
+    shown = [fitted[k] for k in spread(len(fitted), _POSES)]
+    fit = coarse_fit(replace(session, read=tuple(shown))) if shown else None
+    if fit is None:
         return ()
-    for look in (wrong_units, counted_from_the_end, wrong_frame, out_of_step):
-        found = look(lines)
-        if found is not None:
-            return (found,)
-    return single_poses(lines)
-
-
-def single_poses(lines: Lines) -> tuple[Suspicion, ...]:
-    """Poses that are wrong by themselves; of each the first reason."""
-    single = (*too_long(lines), *exchanged(lines), *far_ends(lines))
-    first = {item.pose: item for item in reversed(single)}
-    return tuple(item for item in single if first[item.pose] is item)
-
-
-def wrong_units(lines: Lines) -> Suspicion | None:
-    """Lengths, or distances of the ends, that are off by the factor of a unit."""
-    ratio = lines.lengths / lines.length
-    typical = float(np.median(lines.lengths))
-    for unit, size in UNITS.items():
-        if _all_near(ratio, 1.0 / size):
-            return Suspicion(
-                f"the measured lines are {typical:.4g} m long (median), the cable "
-                f"{lines.length:.4g} m: the points look like {unit}. Try: write them in metres, "
-                "as the header x_m,y_m says.",
-                True,
+    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    rows = reaction_rows(fit.model.node)
+    compared = []
+    for name, at in rows.items():
+        side, kind = name.split("_")
+        poses = [session.declared[item.name] for item in shown]
+        own = [k for k, pose in enumerate(poses) if name in pose.readings]
+        if not own:
+            continue
+        held = getattr(fit.model, side) == "clamped"
+        forces = np.array([seen[k].readings[rows[f"{side}_force"]] for k in own])
+        compared.append(
+            Compared(
+                name,
+                np.array([poses[k].readings[name] for k in own]),
+                np.array([seen[k].readings[at] for k in own]),
+                np.array([clamp_axes(poses[k], side) for k in own]) if held else None,
+                forces if kind == "moment" else None,
             )
-        if _all_near(ratio, size):
-            return Suspicion(
-                f"the measured lines are {typical:.4g} m long (median), cable.length is "
-                f"{lines.length:.4g} m: it looks like {unit}. Try: cable.length: "
-                f"{lines.length * size:.6g}, and all lengths in metres.",
-                True,
-            )
-    declared = np.linalg.norm(np.diff(lines.declared, axis=1)[:, 0], axis=1)
-    measured = np.linalg.norm(np.diff(lines.measured, axis=1)[:, 0], axis=1)
-    apart = np.isfinite(declared) & (np.maximum(declared, measured) > CONTRADICTS * lines.length)
-    if apart.sum() < 2 or not lines.whole:
-        return None
-    spans = declared[apart] / np.maximum(measured[apart], 1e-12)
-    for unit, size in UNITS.items():
-        if _all_near(spans, size) or _all_near(spans, 1.0 / size):
-            return Suspicion(
-                f"the ends of the lines are {np.median(measured[apart]):.4g} m apart (median), "
-                f"start and end of their poses {np.median(declared[apart]):.4g} m: the factor of "
-                f"{unit}. Try: start and end of all poses in metres.",
-                True,
-            )
-    return None
-
-
-def wrong_frame(lines: Lines) -> Suspicion | None:
-    """Ends that fit all fixtures once the points are moved, turned or mirrored as a whole."""
-    own = overall(lines.misfit(lines.measured, lines.declared))
-    enough = min(FITS, MUCH_BETTER * own)
-    if own < FITS:
-        return None
-    several = len(lines.names) > 2  # to the ends of fewer, some turn and some origin fit
-    if own > CONTRADICTS:
-        shifted, shift = _moved(lines, lines.measured)
-        if shifted < enough:
-            return Suspicion(
-                f"all lines lie {_at(shift, '.4g')} m away from their start and end. Try: measure "
-                "fixtures and lines from the same origin; subtract this from the points, or add "
-                "it to start and end.",
-                True,
-            )
-        origins = (True, False) if several else (True,)
-        for in_place, axes in product(origins, exchanges(len(shift))[1:]):
-            turned, what = lines.measured @ axes.T, named(axes)
-            misfit, shift = _moved(lines, turned)
-            if in_place:
-                misfit = overall(lines.misfit(turned, lines.declared))
-            else:
-                what += f" and moved by {_at(-shift, '.4g')} m"
-            if misfit < enough:
-                return _in_frame(lines, own, misfit, what)
-    if several and np.all(np.isfinite(lines.declared)):
-        found = [_fitted(lines, axes) for axes in exchanges(lines.declared.shape[2])]
-        misfit, turn, shift = min(found, key=lambda item: item[0])
-        if misfit < enough:
-            return _in_frame(lines, own, misfit, _told(turn, shift))
-    return None
-
-
-def _in_frame(lines: Lines, own: float, misfit: float, what: str) -> Suspicion:
-    return Suspicion(
-        f"the lines do not end at start and end of their poses ({own * lines.length:.3g} m RMS), "
-        f"but do ({misfit * lines.length:.3g} m) with {what}. Try: points, start, end, "
-        "orientations and gravity in one frame, right-handed, in a plane x to the right and y up; "
-        "in pictures rows count downwards; a camera's points by its calibration.",
-        own > CONTRADICTS,
-    )
-
-
-def _fitted(lines: Lines, turn: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Misfit, rotation (d, d) and translation (d,) [m] of the frame that fits best, from a first.
-
-    Declared = rotation measured + translation, least squares (Kabsch 1976), of the handedness of
-    the first one; the middle of both ends needs no order of a line.
-    """
-    d, hand = len(turn), np.sign(np.linalg.det(turn))
-    shift = np.median(lines.declared.mean(axis=1) - lines.measured.mean(axis=1) @ turn.T, axis=0)
-    for _ in range(_FITS_OF_FRAME):
-        moved = lines.measured @ turn.T + shift
-        given, other = (
-            np.linalg.norm(ends - lines.declared, axis=(1, 2)) for ends in (moved, moved[:, ::-1])
         )
-        swapped = ~lines.ordered & (other < given)
-        source = np.where(swapped[:, None, None], lines.measured[:, ::-1], lines.measured)
-        source, goal = source.reshape(-1, d), lines.declared.reshape(-1, d)
-        centres = source.mean(axis=0), goal.mean(axis=0)
-        u, _, v = np.linalg.svd((goal - centres[1]).T @ (source - centres[0]))
-        turn = u @ np.diag([*np.ones(d - 1), hand * np.sign(np.linalg.det(u @ v))]) @ v
-        shift = centres[1] - turn @ centres[0]
-    moved = lines.measured @ turn.T + shift
-    return overall(lines.misfit(moved, lines.declared)), turn, shift
+    return misread(compared, sized=tells_weight(fit))
 
 
-def _told(turn: FloatArray, shift: FloatArray) -> str:
-    """A frame in words: exchanged axes by their names, else how far it is turned and moved."""
-    moved = f"moved by {_at(shift, '.3g')} m"
-    near = min(exchanges(len(turn)), key=lambda axes: float(np.linalg.norm(turn - axes)))
-    if np.linalg.norm(turn - near) < _NAMED * np.sqrt(2) and not np.allclose(
-        near, np.eye(len(turn))
-    ):
-        return f"{named(near)} and {moved}"
-    hand = np.sign(np.linalg.det(turn))
-    whole = hand * np.eye(3)
-    whole[: len(turn), : len(turn)] = turn
-    vector = Rotation.from_matrix(hand * whole).as_rotvec()
-    angle = float(np.linalg.norm(vector))
-    return (
-        f"the points {'mirrored, ' if hand < 0 else ''}turned by {np.degrees(angle):.3g} degrees "
-        f"about {_at(vector / max(angle, 1e-12), '.2g')} and {moved}"
+# ---- exchanged ends -----------------------------------------------------------------------------
+
+
+def ends_exchanged(session: Session) -> tuple[Suspicion, ...]:
+    """Whether lines that leave both clamps backwards fit with start and end exchanged.
+
+    Points far apart do not show the directions at the clamps, but the way to them does.
+    """
+    boundary = session.config.experiment.boundary
+    if not (len(session.read) and boundary.start == boundary.end == "clamped"):
+        return ()
+    own = _off(session)
+    if own < np.pi / 2:
+        return ()
+    meant = [Hypothesis(what, _exchanged(session, keys)) for what, keys in _EXCHANGED.items()]
+    found = compare(session, [item for item in meant if _off(item.meant) < HEADING_OFF], _FEW)
+    if found is None or not found.better:
+        return ()
+    text = (
+        f"the lines leave their clamps {np.degrees(own):.0f} degrees (median) off the declared "
+        f"directions; {found.told}. Try: start where the cable begins, and headings or x axes "
+        "along the cable from start to end, at both clamps."
     )
+    return (Suspicion(text, found.certain),)
 
 
-def out_of_step(lines: Lines) -> Suspicion | None:
-    """Ends that fit the fixtures of other poses: files and end positions in different orders."""
-    misfit = lines.misfit(lines.measured[:, None], lines.declared[None, :])
-    own = np.diag(misfit)
-    _, best = linear_sum_assignment(misfit**2)
-    other = misfit[np.arange(len(own)), best]
-    wrong = (own > OUT_OF_STEP) & (other < np.minimum(FITS, MUCH_BETTER * own))
-    if wrong.sum() < 2:
-        return None
-    pairs = [
-        f"{lines.names[i]} shows the ends of {lines.names[best[i]]}" for i in np.flatnonzero(wrong)
+def _exchanged(session: Session, keys: Sequence[str]) -> Session:
+    """The session with start and end exchanged; lines then begin where they ended."""
+    pairs = [(f"start{key}", f"end{key}") for key in keys]
+    both = [*pairs, *((b, a) for a, b in pairs)]
+    poses = tuple(
+        pose.model_copy(update={a: getattr(pose, b) for a, b in both})
+        for pose in session.config.experiment.poses
+    )
+    read = (x if x.s is not None else replace(x, points=x.points[::-1]) for x in session.read)
+    return replace(session, read=tuple(read)).with_experiment(poses=poses)
+
+
+def _off(session: Session) -> float:
+    """Median angle [rad] of clamps from the way to the points nearest to them."""
+    cosines = []
+    for item, (side, first, sign) in product(session.read, (("start", 0, 1), ("end", -1, -1))):
+        pose = session.declared[item.name]
+        way = sign * (item.points[first] - getattr(pose, side))
+        axes = clamp_axes(pose, side)
+        assert axes is not None
+        cosines.append(float(way @ axes[:, 0]) / max(float(np.linalg.norm(way)), 1e-300))
+    return float(np.arccos(np.clip(np.median(cosines), -1.0, 1.0)))
+
+
+# ---- gravity ------------------------------------------------------------------------------------
+
+
+def hangs_elsewhere(session: Session) -> tuple[Suspicion, ...]:
+    """Whether the shapes fit only with gravity turned, or the points mirrored.
+
+    Where the lines seem to be pulled along gravity nothing is fitted.
+    """
+    gravity = np.array(session.config.experiment.gravity)
+    if not (len(session.read) and gravity.any()):
+        return ()
+    pull = shown_pull(session)
+    if pull is not None and _angle(pull, gravity) < HEADING_OFF:
+        return ()
+    found = compare(session, list(_hung_otherwise(session, pull)))
+    if found is None or not (found.better or found.shows_weight):
+        return ()
+    weightless = ""
+    if found.own is not None and not tells_weight(found.own):
+        least = found.own.value(BENDING_STIFFNESS)
+        weightless = (
+            f"the lines show no weight, as if bending_stiffness were {least:.2g} N m^2 or more; "
+        )
+    up = f"{[*np.zeros(len(gravity) - 1).tolist(), -9.81]} with {'xyz'[len(gravity) - 1]} up"
+    text = (
+        f"the cable does not hang along gravity {_vector(gravity)} m/s^2: {weightless}"
+        f"{found.told}. Try: points, start, end and gravity in one frame, such as gravity: {up}."
+        + ("" if found.certain else " A strap that lifts the cable would look the same.")
+    )
+    return (Suspicion(text, found.certain),)
+
+
+def _hung_otherwise(session: Session, pull: FloatArray | None) -> Iterator[Hypothesis[Session]]:
+    """Gravity along other axes, and points with exchanged or mirrored axes that keep their ends.
+
+    Those alone along whose gravity the lines seem to be pulled; all if they show no pull.
+    """
+    experiment, length = session.config.experiment, session.config.cable.length
+    gravity = np.array(experiment.gravity)
+    frames = [
+        axes for axes in exchanges(len(gravity)) if _angle(pull, gravity @ axes) < HEADING_OFF
     ]
-    more = f", and {len(pairs) - 4} more" if len(pairs) > 4 else ""
-    step = set((best - np.arange(len(own)))[wrong].tolist())
-    shift = f" (all of them {abs(step.pop())} further in the list)" if len(step) == 1 else ""
-    return Suspicion(
-        f"{len(pairs)} of {len(own)} files belong to other entries of the list of poses{shift}: "
-        f"{'; '.join(pairs[:4])}{more}. Try: put file names and end positions in step.",
-        True,
-    )
-
-
-def counted_from_the_end(lines: Lines) -> Suspicion | None:
-    """Markers that fit their fixtures once they are counted from the other end."""
-    marked = np.flatnonzero(lines.ordered)
-    if not len(marked):
-        return None
-    own = lines.misfit(lines.measured, lines.declared)[marked]
-    turned = replace(lines, gaps=lines.gaps[:, ::-1])
-    other = turned.misfit(lines.measured[:, ::-1], lines.declared)[marked]
-    if not (overall(own) > FITS and overall(other) < min(FITS, MUCH_BETTER * overall(own))):
-        return None
-    return Suspicion(
-        f"the markers are {overall(own) * lines.length:.3g} m RMS from the declared start and end, "
-        f"but {overall(other) * lines.length:.3g} m once they are counted from the other end. Try: "
-        "s_m from the start; or are start and end of the poses exchanged?",
-        True,
-    )
-
-
-def too_long(lines: Lines) -> tuple[Suspicion, ...]:
-    """Single poses whose points, in their order, run to and fro."""
-    return tuple(
-        Suspicion.of_pose(
-            lines.names[i],
-            f"from point to point its line is {lines.lengths[i]:.4g} m long, the cable "
-            f"{lines.length:.4g} m. Try: are its points in order along the cable?",
-        )
-        for i in np.flatnonzero(lines.lengths > TOO_LONG * lines.length)
-    )
-
-
-def exchanged(lines: Lines) -> tuple[Suspicion, ...]:
-    """Poses whose end is where all others have their start, as if both were exchanged."""
-    starts, ends = lines.declared[:, 0], lines.declared[:, 1]
-    if len(starts) < 4:
-        return ()
-    common = np.median(starts, axis=0)
-    near = FITS * lines.length
-    regular = np.linalg.norm(starts - common, axis=1) < near
-    turned = ~regular & (np.linalg.norm(ends - common, axis=1) < near)
-    if regular.sum() < 3 * turned.sum():
-        return ()
-    return tuple(
-        Suspicion.of_pose(
-            lines.names[i],
-            f"its end {_at(ends[i], 'g')} m is where the other poses have their start. Try: are "
-            "start and end exchanged?",
-        )
-        for i in np.flatnonzero(turned)
-    )
-
-
-def far_ends(lines: Lines) -> tuple[Suspicion, ...]:
-    """Single poses whose line ends far from the fixtures."""
-    own = lines.misfit(lines.measured, lines.declared)
-    return tuple(
-        Suspicion.of_pose(
-            lines.names[i],
-            f"its line runs from {_at(lines.measured[i, 0])} to {_at(lines.measured[i, 1])} m, "
-            f"{own[i] * lines.length:.3g} m RMS away from the declared ends. Try: start and end "
-            "of this pose, and whether it is the right file.",
-        )
-        for i in np.flatnonzero(own > CONTRADICTS)
-    )
-
-
-def repeated(names: Sequence[str], points: Sequence[FloatArray]) -> tuple[Suspicion, ...]:
-    """Poses with exactly the same points (K, 2): one file under two names."""
-    seen: dict[bytes, str] = {}
-    found = []
-    for name, array in zip(names, points, strict=True):
-        key = np.ascontiguousarray(array, dtype=float).tobytes()
-        if key in seen:
-            found.append(
-                Suspicion(
-                    f"{name} holds exactly the points of {seen[key]}, and no two measurements "
-                    "agree to the last digit. Try: is one file there twice, under two names?",
-                    False,
-                    name,
-                )
+    tried = [gravity]
+    for way in (gravity @ axes for axes in frames):
+        if not any(np.allclose(way, other) for other in tried):
+            tried.append(way)
+            meant = session.with_experiment(gravity=tuple(way.tolist()))
+            yield Hypothesis(f"gravity {_vector(way)} m/s^2", meant)
+    if experiment.boundary.start == experiment.boundary.end == "pinned":
+        return  # between pins it is the same to turn the points, and gravity
+    kept = [_held(session.declared[item.name], length) for item in session.read]
+    for axes in frames:
+        if np.allclose(axes, np.eye(len(gravity))):
+            continue
+        if all(np.abs(held @ axes.T - held).max() < FITS for held in kept):
+            starts = [np.array(session.declared[item.name].start) for item in session.read]
+            read = tuple(
+                replace(item, points=(item.points - start) @ axes.T + start)
+                for item, start in zip(session.read, starts, strict=True)
             )
-        seen.setdefault(key, name)
-    return tuple(found)
+            yield Hypothesis(named(axes), replace(session, read=read))
 
 
-def stretched(
-    marked: Sequence[tuple[str, FloatArray, FloatArray]], length: float
-) -> tuple[Suspicion, ...]:
-    """Markers farther apart than the cable between them; pose, points (K, d) and s (K,) [m]."""
-    texts = {}
-    for name, place, along in marked:
-        chords = np.linalg.norm(np.diff(place, axis=0), axis=1)
-        beyond = chords - np.diff(along)
-        k = int(beyond.argmax()) if len(beyond) else 0
-        if len(beyond) and beyond[k] > STRETCHED * length:
-            texts[name] = (
-                f"its markers at s_m {along[k]:g} and {along[k + 1]:g} are {chords[k]:.4g} m "
-                f"apart, the cable between them is {along[k + 1] - along[k]:.4g} m long"
-            )
-    advice = ". Try: s_m in metres along the cable, each beside its own point."
-    if texts and 2 * len(texts) > len(marked):
-        name = next(iter(texts))
-        told = f"{len(texts)} of {counted(len(marked), 'pose')}"
-        said = f"s_m contradicts the points of {told}. {name}: "
-        return (Suspicion(said + texts[name] + advice, True),)
-    return tuple(Suspicion.of_pose(name, text + advice) for name, text in texts.items())
+def _held(pose: Pose, length: float) -> FloatArray:
+    """What turned points of a pose must keep (n, d): the end from the start, in lengths, clamps."""
+    kept: list[FloatArray] = [np.zeros(len(pose.start))]
+    if pose.end is not None:
+        kept.append((np.array(pose.end) - pose.start) / length)
+    axes = [clamp_axes(pose, side) for side in ("start", "end")]
+    kept += [own[:, 0] for own in axes if own is not None]
+    return np.array(kept)
 
 
-def _all_near(ratio: FloatArray, factor: float) -> bool:
-    """Whether nearly all ratios are the factor, up to a quarter."""
-    near = (ratio > factor / NEAR_UNIT) & (ratio < factor * NEAR_UNIT)
-    return bool(near.mean() >= NEARLY_ALL)
+def _vector(values: FloatArray) -> str:
+    return f"({', '.join(f'{value + 0.0:g}' for value in values)})"
 
 
-def overall(misfit: FloatArray) -> float:
-    """Root mean square over the poses, the worst fifth left out: a pose or two may be wrong."""
-    kept = np.sort(misfit)[: max(1, int(np.ceil(NEARLY_ALL * len(misfit))))]
-    return float(np.sqrt(np.mean(kept**2)))
+def _angle(pull: FloatArray | None, way: FloatArray) -> float:
+    """Angle [rad] of a direction from the pull that lines show; zero where they show none."""
+    if pull is None:
+        return 0.0
+    cosine = float(pull @ way) / float(np.linalg.norm(pull) * np.linalg.norm(way))
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def _moved(lines: Lines, measured: FloatArray) -> tuple[float, FloatArray]:
-    """Misfit after the one translation (2,) [m] that fits best, in the middle of both ends.
-
-    With a free end: at the start, which the line's first point is then taken for.
-    """
-    away = measured.mean(axis=1) - lines.declared.mean(axis=1)
-    shift = np.median(np.where(np.isfinite(away), away, (measured - lines.declared)[:, 0]), axis=0)
-    return overall(lines.misfit(measured - shift, lines.declared)), shift
-
-
-def _at(point: FloatArray, form: str = ".3f") -> str:
-    return f"({', '.join(format(value, form) for value in point)})"
+# Each takes a session and tells what it finds. Of alternatives the first that finds anything is the
+# only one. What a group finds certain is the last; poses that it doubts are left out of the next.
+Question = Callable[[Session], tuple[Suspicion, ...]]
+QUESTIONS: tuple[tuple[tuple[Question, ...], ...], ...] = (
+    ((wrong_units, counted_from_the_end, wrong_frame, out_of_step, single_poses),),
+    ((repeated,), (stretched,), (wrong_directions,)),
+    ((wrong_readings,), (ends_exchanged, hangs_elsewhere)),
+)

@@ -26,7 +26,6 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess, one_thread
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.findings import found_effects
 from dlo_casadi.session.fitting import (
     confirmed,
@@ -47,6 +46,7 @@ from dlo_casadi.session.outcome import (
     Repeatability,
     Stage,
 )
+from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.remarks import (
     branch_warnings,
     doubts_of,

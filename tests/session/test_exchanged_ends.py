@@ -8,9 +8,9 @@ import pytest
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
-from dlo_casadi.session.checks import find_suspicions
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import conditions, read_inputs
+from dlo_casadi.session.plausibility import find_suspicions
 
 LENGTH, NOISE = 0.8, 3e-4  # m
 SHOWN = np.array([0.3, 0.5, 0.7]) * LENGTH  # m, far from both clamps

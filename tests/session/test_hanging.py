@@ -9,9 +9,9 @@ import pytest
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
-from dlo_casadi.session import checks, coarse
+from dlo_casadi.session import plausibility
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.hanging import load_over_stiffness, shown_pull
+from dlo_casadi.session.hypotheses import Session, load_over_stiffness, shown_pull
 from dlo_casadi.session.measure import conditions, read_inputs
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -67,15 +67,15 @@ def test_a_curved_cable_between_ball_joints_is_no_mistake(curved, monkeypatch):
     """Its moments seem to show another load, which they are far from; nothing needs a fit."""
     load = load_over_stiffness([(item.points, item.s) for item in curved[1]])
     assert load[2] > 0.5 * np.linalg.norm(load), "upwards: rest curvature is taken for weight"
-    assert shown_pull(*curved)[2] < 0
-    monkeypatch.setattr(coarse, "fit_model", None)
-    assert checks.find_suspicions(*curved) == ()
+    assert shown_pull(Session(*curved))[2] < 0
+    monkeypatch.setattr(plausibility, "fit_model", None)
+    assert plausibility.find_suspicions(*curved) == ()
 
 
 @pytest.mark.parametrize(("gravity", "count"), [((0.0, 0.0, 9.81), 2), ((0.0, -9.81, 0.0), 4)])
 def test_gravity_along_another_axis_is_named_of_few_poses(curved, gravity, count):
     config, inputs = curved
-    (found,) = checks.find_suspicions(under(config, gravity), inputs[:count])
+    (found,) = plausibility.find_suspicions(under(config, gravity), inputs[:count])
     declared = "(0, 0, 9.81)" if gravity[2] else "(0, -9.81, 0)"
     assert f"does not hang along gravity {declared} m/s^2" in found.message
     assert "m with gravity (0, 0, -9.81) m/s^2" in found.message
@@ -83,8 +83,8 @@ def test_gravity_along_another_axis_is_named_of_few_poses(curved, gravity, count
 
 def test_what_is_seen_at_a_glance_refuses_nothing_that_a_fit_explains(curved, monkeypatch):
     """Were the pull that lines show upwards, the fit under the declared gravity would tell."""
-    monkeypatch.setattr("dlo_casadi.session.hanging.shown_pull", lambda *_: np.array([0, 0, 1.0]))
-    assert checks.find_suspicions(*curved) == ()
+    monkeypatch.setattr(plausibility, "shown_pull", lambda _: np.array([0, 0, 1.0]))
+    assert plausibility.find_suspicions(*curved) == ()
 
 
 def test_a_strap_or_a_stiff_cable_is_doubted_but_not_refused():
@@ -97,13 +97,13 @@ def test_a_strap_or_a_stiff_cable_is_doubted_but_not_refused():
             self.residual_rms = rms
 
     found = [
-        coarse.Comparison("", Left(own), Left(other), 1.0)
+        plausibility.Comparison("", Left(own), Left(other), 1.0)
         for own, other in ((0.008, 0.001), (0.02, 0.001), (0.02, 0.015), (0.0015, 0.0003))
     ]
     assert [item.better for item in found] == [True, True, False, False]
     assert [item.certain for item in found] == [False, True, False, False]
     assert found[0].told.startswith("the lines are 0.008 m RMS from the shapes of any stiffness")
-    assert coarse.Comparison("y down", None, Left(0.001), 1.0).told == (
+    assert plausibility.Comparison("y down", None, Left(0.001), 1.0).told == (
         "no stiffness gives equilibria near the lines, but they are within 0.001 m with y down"
     )
 
@@ -128,14 +128,14 @@ def test_a_loop_of_which_only_the_ends_were_measured_is_no_mistake(tmp_path):
     }
     (tmp_path / "loop.yaml").write_text(dump_yaml(data))
     config = load_config(tmp_path / "loop.yaml")
-    assert checks.find_suspicions(config, read_inputs(config, lambda *_: None)) == ()
+    assert plausibility.find_suspicions(config, read_inputs(config, lambda *_: None)) == ()
 
 
 def test_gravity_upwards_is_named_of_a_wire_that_does_not_repeat():
     """Its trials differ by a hundredth of its length, whichever way gravity points."""
     config = load_config(CONFIGS / "black_wire.yaml")
     inputs = read_inputs(config, lambda *_: None)
-    assert checks.find_suspicions(config, inputs) == ()
-    (found,) = checks.find_suspicions(under(config, (0.0, 9.81)), inputs)
+    assert plausibility.find_suspicions(config, inputs) == ()
+    (found,) = plausibility.find_suspicions(under(config, (0.0, 9.81)), inputs)
     assert "the lines show no weight" in found.message
     assert not found.certain

@@ -8,10 +8,11 @@ import pytest
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import write_points
-from dlo_casadi.session.checks import lines_of, without_implausible
-from dlo_casadi.session.directions import wrong_directions
+from dlo_casadi.session.clamps import wrong_directions
+from dlo_casadi.session.ends import single_poses
+from dlo_casadi.session.hypotheses import Session
 from dlo_casadi.session.measure import read_inputs
-from dlo_casadi.session.plausibility import suspicions
+from dlo_casadi.session.plausibility import without_implausible
 
 LENGTH = 0.8  # m
 BEGINS = (-1.1, -0.6, 0.2)  # rad, where the arcs begin
@@ -58,7 +59,7 @@ def test_a_clamp_that_is_a_little_askew_is_no_mistake(turn, askew, tmp_path):
         pose["start_heading"] += askew
         pose["end_heading"] -= askew
 
-    assert wrong_directions(*session(tmp_path, change, turn)) == ()
+    assert wrong_directions(Session(*session(tmp_path, change, turn))) == ()
 
 
 @pytest.mark.parametrize(
@@ -86,10 +87,10 @@ def test_the_heading_of_a_pinned_side_is_not_used(tmp_path):
         pose["start_heading"] += 2.0
 
     config, inputs = session(tmp_path, change)
-    assert wrong_directions(config, inputs)
+    assert wrong_directions(Session(config, inputs))
     boundary = config.experiment.boundary.model_copy(update={"start": "pinned"})
     experiment = config.experiment.model_copy(update={"boundary": boundary})
-    assert wrong_directions(replace(config, experiment=experiment), inputs) == ()
+    assert wrong_directions(Session(replace(config, experiment=experiment), inputs)) == ()
 
 
 def test_one_wrong_heading_leaves_its_pose_out(tmp_path):
@@ -113,19 +114,18 @@ def test_a_full_turn_more_than_the_line_has_is_a_mistake(tmp_path):
 @pytest.mark.parametrize("apart", [50, 133, 399])
 def test_points_far_apart_do_not_show_the_direction_of_a_clamp(apart, tmp_path):
     """A third of the cable on, arcs have turned by radians."""
-    assert wrong_directions(*session(tmp_path, turn=13.0, apart=apart)) == ()
-    assert wrong_directions(*session(tmp_path, turn=-6.0, apart=apart)) == ()
+    assert wrong_directions(Session(*session(tmp_path, turn=13.0, apart=apart))) == ()
+    assert wrong_directions(Session(*session(tmp_path, turn=-6.0, apart=apart))) == ()
 
 
 @pytest.mark.parametrize("apart", [5, 100, 133])
 def test_lines_of_few_points_may_end_before_their_fixtures(apart, tmp_path):
     """But no farther than what they leave of the cable."""
-    config, inputs = session(tmp_path, apart=apart)
-    assert suspicions(lines_of(config, inputs)) == ()
+    assert single_poses(Session(*session(tmp_path, apart=apart))) == ()
 
     def elsewhere(pose, k):
         if k == 1:
             pose["end"] = [0.0, 0.9 * LENGTH]
 
-    (found,) = suspicions(lines_of(*session(tmp_path, elsewhere, apart=apart)))
+    (found,) = single_poses(Session(*session(tmp_path, elsewhere, apart=apart)))
     assert found.pose == "arc_1"

@@ -13,8 +13,8 @@ from dlo_casadi.io.points import read_points, write_points
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.session import run_session
-from dlo_casadi.session.checks import without_implausible
 from dlo_casadi.session.measure import read_inputs
+from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.remarks import reading_warnings
 
 SOURCE = Path(__file__).parents[1] / "data/bench/short_clean/session.yaml"

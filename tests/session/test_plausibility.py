@@ -2,28 +2,37 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
-from dlo_casadi.session.checks import find_suspicions
-from dlo_casadi.session.frames import FRAMES
+from dlo_casadi.session.ends import out_of_step, repeated, single_poses, wrong_frame, wrong_units
+from dlo_casadi.session.hypotheses import Lines, exchanges, named
 from dlo_casadi.session.measure import read_inputs
-from dlo_casadi.session.plausibility import (
-    Lines,
-    exchanged,
-    far_ends,
-    out_of_step,
-    repeated,
-    suspicions,
-    wrong_frame,
-    wrong_units,
-)
+from dlo_casadi.session.plausibility import QUESTIONS, find_suspicions
 
 ROOT = Path(__file__).parents[2]
 SESSIONS = [*ROOT.glob("tests/data/bench/*/session.yaml"), *ROOT.glob("configs/*.yaml")]
 LENGTH = 0.8  # m
+FRAMES = exchanges(2)[1:]
+
+
+def asked(question, lines):
+    """What a question to the ends of lines finds."""
+    return question(SimpleNamespace(lines=lines))
+
+
+def suspicions(lines):
+    """What all questions to the ends find: the first that finds anything is the only one."""
+    (alternatives,) = QUESTIONS[0]
+    return next(filter(None, (asked(question, lines) for question in alternatives)), ())
+
+
+def ordered(count):
+    """That nobody knows where a line begins."""
+    return np.zeros(count, dtype=bool)
 
 
 def session(count=9, seed=0):
@@ -36,7 +45,7 @@ def session(count=9, seed=0):
     measured[::2] = measured[::2, ::-1]
     lengths = LENGTH * (1 + 0.01 * rng.standard_normal(count))
     names = tuple(f"pose_{k}" for k in range(count))
-    return Lines(names, declared, measured, lengths, LENGTH, np.zeros((count, 2)))
+    return Lines(names, declared, measured, lengths, LENGTH, np.zeros((count, 2)), ordered(count))
 
 
 def markers(count=9):
@@ -48,14 +57,16 @@ def markers(count=9):
     declared[:, 0] = 0.0
     names = tuple(f"pose_{k}" for k in range(count))
     gaps = np.tile([0.3 * LENGTH, 0.0], (count, 1))
-    return Lines(names, declared, measured, np.full(count, LENGTH * 0.66 / 0.7), LENGTH, gaps)
+    return Lines(
+        names, declared, measured, np.full(count, LENGTH * 0.66 / 0.7), LENGTH, gaps, ordered(count)
+    )
 
 
 def test_markers_need_not_be_where_the_cable_ends():
     lines = markers()
     assert suspicions(lines) == ()
     scaled = replace(lines, measured=1e3 * lines.measured, lengths=1e3 * lines.lengths)
-    assert "the points look like millimetres" in wrong_units(scaled).message
+    assert "the points look like millimetres" in asked(wrong_units, scaled)[0].message
     # No cable reaches farther than it is long.
     moved = lines.measured.copy()
     moved[4] += [0.0, -0.5 * LENGTH]
@@ -74,36 +85,50 @@ def test_a_sound_session_raises_no_suspicion(seed):
 def test_units_are_told_from_the_ratio_of_lengths(factor, unit):
     lines = session()
     points = replace(lines, measured=factor * lines.measured, lengths=factor * lines.lengths)
-    assert f"the points look like {unit}" in wrong_units(points).message
+    assert f"the points look like {unit}" in asked(wrong_units, points)[0].message
     declared = replace(lines, length=factor * LENGTH)
-    assert f"it looks like {unit}. Try: cable.length: 0.8," in wrong_units(declared).message
+    assert (
+        f"it looks like {unit}. Try: cable.length: 0.8," in asked(wrong_units, declared)[0].message
+    )
     ends = replace(lines, declared=lines.declared / factor)
-    assert f"the factor of {unit}" in wrong_units(ends).message
+    assert f"the factor of {unit}" in asked(wrong_units, ends)[0].message
 
 
 def test_a_length_that_is_a_little_off_is_no_unit():
     lines = session()
     for factor in (0.5, 0.9, 1.1, 2.0, 10.0):
-        assert wrong_units(replace(lines, lengths=factor * lines.lengths)) is None
+        assert asked(wrong_units, replace(lines, lengths=factor * lines.lengths)) == ()
 
 
-@pytest.mark.parametrize("what", FRAMES)
+@pytest.mark.parametrize("axes", FRAMES, ids=named)
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (1.3, 0.7)])
-def test_every_frame_is_recognised(what, shift):
+def test_every_frame_is_recognised(axes, shift):
     lines = session()
-    turned = replace(lines, measured=lines.measured @ FRAMES[what] + shift)
+    turned = replace(lines, measured=lines.measured @ axes + shift)
     (found,) = suspicions(turned)
     assert found.certain
-    assert f"with {what}" in found.message
+    assert f"with {named(axes)}" in found.message
     assert ("moved by (" in found.message) == any(shift)
 
 
 def test_a_frame_a_little_off_is_a_doubt():
     lines = session()
     c, s = np.cos(0.15), np.sin(0.15)
-    found = wrong_frame(replace(lines, measured=lines.measured @ [[c, s], [-s, c]]))
+    (found,) = asked(wrong_frame, replace(lines, measured=lines.measured @ [[c, s], [-s, c]]))
     assert not found.certain
     assert "with the points turned by 8." in found.message
+
+
+def test_a_mirrored_frame_that_is_turned_is_told_by_its_angle():
+    """Of a picture with y downwards, taken askew."""
+    lines = session()
+    c, s = np.cos(0.6), np.sin(0.6)
+    measured = lines.measured @ np.array([[c, s], [-s, c]]) * [1, -1]
+    (found,) = suspicions(replace(lines, measured=measured))
+    assert found.certain
+    assert "with the points mirrored, turned by 3" in found.message
+    angle = float(found.message.split("turned by ")[1].split(" degrees")[0])
+    assert angle == pytest.approx(np.degrees(0.6), abs=1.0)  # ends are 5 mm off
 
 
 def test_another_origin_is_recognised():
@@ -117,13 +142,14 @@ def test_two_wrong_poses_do_not_hide_a_wrong_frame():
     lines = session(12)
     measured = lines.measured * [1, -1]
     measured[:2] += 0.4
-    assert "y pointing down" in wrong_frame(replace(lines, measured=measured)).message
+    (found,) = asked(wrong_frame, replace(lines, measured=measured))
+    assert "y pointing down" in found.message
 
 
 @pytest.mark.parametrize("order", [np.roll(np.arange(9), -1), [1, 0, *range(2, 9)]])
 def test_files_of_other_poses_are_named(order):
     lines = session()
-    found = out_of_step(replace(lines, measured=lines.measured[order]))
+    (found,) = asked(out_of_step, replace(lines, measured=lines.measured[order]))
     assert found.certain
     assert "pose_0 shows the ends of pose_1" in found.message
 
@@ -135,14 +161,13 @@ def test_one_wrong_end_is_odd_but_not_certain():
     (found,) = suspicions(replace(lines, declared=declared))
     assert not found.certain
     assert found.message.startswith("pose_3: its line runs from")
-    assert found in far_ends(replace(lines, declared=declared))
 
 
 def test_start_and_end_exchanged_in_one_pose():
     lines = session()
     declared = lines.declared.copy()
     declared[5] = declared[5, ::-1]
-    (found,) = exchanged(replace(lines, declared=declared))
+    (found,) = asked(single_poses, replace(lines, declared=declared))
     assert found.message.startswith("pose_5: its end (0, 0) m is where the other poses")
 
 
@@ -158,8 +183,14 @@ def test_free_ends_are_judged_by_their_start():
 
 def test_the_same_points_twice():
     points = np.random.default_rng(0).standard_normal((3, 5, 2))
-    assert repeated("abc", points) == ()
-    (found,) = repeated("abc", [points[0], points[1], points[0]])
+
+    def found_in(*points):
+        named = zip("abc", points, strict=True)
+        read = [SimpleNamespace(name=name, points=own) for name, own in named]
+        return repeated(SimpleNamespace(read=read))
+
+    assert found_in(*points) == ()
+    (found,) = found_in(points[0], points[1], points[0])
     assert found.message.startswith("c holds exactly the points of a")
 
 

@@ -9,9 +9,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.config import load_config
-from dlo_casadi.session.checks import find_suspicions
-from dlo_casadi.session.hanging import load_over_stiffness
+from dlo_casadi.session.hypotheses import load_over_stiffness
 from dlo_casadi.session.measure import read_inputs
+from dlo_casadi.session.plausibility import find_suspicions
 
 ROOT = Path(__file__).parents[2]
 TIP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # z up -> y up
@@ -146,7 +146,15 @@ def test_files_out_of_step(session):
     assert "10 of 10 files belong to other entries" in found.message
 
 
-@pytest.mark.parametrize("gravity", [(0.0, 0.0, 9.81), (0.0, -9.81, 0.0), (9.81, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("session", "gravity"),
+    [
+        ("markers", (0.0, 0.0, 9.81)),
+        ("lines", (0.0, -9.81, 0.0)),
+        ("markers", (9.81, 0.0, 0.0)),
+    ],
+    indirect=["session"],
+)
 def test_gravity_is_held_against_the_load_that_the_shapes_show(session, gravity):
     config, inputs = session[0], session[1][::3]
     experiment = config.experiment.model_copy(update={"gravity": gravity})

@@ -13,10 +13,10 @@ from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.session.checks import find_suspicions
+from dlo_casadi.session.clamps import Compared, misread
 from dlo_casadi.session.fitting import declared_model, straight
 from dlo_casadi.session.measure import conditions, read_inputs
-from dlo_casadi.session.plausibility_of_readings import Compared, misread
+from dlo_casadi.session.plausibility import find_suspicions
 
 ROOT = Path(__file__).parents[2]
 CABLE = Cable(0.8, 0.2, 0.012, 0.04)

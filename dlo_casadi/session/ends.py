@@ -1,0 +1,330 @@
+"""Mistakes that points and their ends give away: units, frames, files out of step.
+
+A wrong unit shows as a factor of a thousand, an axis that points the other way as ends that fit
+once they are mirrored, a list out of step as ends that fit another pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.errors import counted
+from dlo_casadi.session.hypotheses import (
+    Hypothesis,
+    Lines,
+    Session,
+    Suspicion,
+    T,
+    exchanges,
+    likeliest,
+    named,
+    overall,
+)
+from dlo_casadi.thresholds import (
+    CONTRADICTS,
+    FITS,
+    MUCH_BETTER,
+    NEAR_UNIT,
+    NEARLY_ALL,
+    OUT_OF_STEP,
+    STRETCHED,
+    TOO_LONG,
+)
+
+FloatArray = NDArray[np.floating]
+
+UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
+# A rotation so near to exchanged axes is told by their names [rad].
+_NAMED = 0.3
+# Fits of a frame, each followed by a new choice of which end of a line is which.
+_FITS_OF_FRAME = 4
+
+
+def wrong_units(session: Session) -> tuple[Suspicion, ...]:
+    """Lengths, or distances of the ends, that are off by the factor of a unit."""
+    lines, meant = session.lines, []
+    ratio, typical = lines.lengths / lines.length, float(np.median(lines.lengths))
+    for unit, size in UNITS.items():
+        points = (
+            f"the measured lines are {typical:.4g} m long (median), the cable {lines.length:.4g} "
+            f"m: the points look like {unit}. Try: write them in metres, as the header x_m,y_m "
+            "says."
+        )
+        length = (
+            f"the measured lines are {typical:.4g} m long (median), cable.length is "
+            f"{lines.length:.4g} m: it looks like {unit}. Try: cable.length: "
+            f"{lines.length * size:.6g}, and all lengths in metres."
+        )
+        meant += [Hypothesis(points, ratio * size), Hypothesis(length, ratio / size)]
+    declared, measured = (
+        np.linalg.norm(np.diff(ends, axis=1)[:, 0], axis=1)
+        for ends in (lines.declared, lines.measured)
+    )
+    apart = np.isfinite(declared) & (np.maximum(declared, measured) > CONTRADICTS * lines.length)
+    whole = np.mean(lines.gaps.max(axis=1) < FITS * lines.length) >= NEARLY_ALL
+    if apart.sum() > 1 and whole:
+        spans = declared[apart] / np.maximum(measured[apart], 1e-12)
+        for (unit, size), sign in product(UNITS.items(), (-1, 1)):
+            ends = (
+                f"the ends of the lines are {np.median(measured[apart]):.4g} m apart (median), "
+                f"start and end of their poses {np.median(declared[apart]):.4g} m: the factor of "
+                f"{unit}. Try: start and end of all poses in metres."
+            )
+            meant.append(Hypothesis(ends, spans * size**sign))
+
+    def far_from_one(ratio: FloatArray) -> float:
+        """Share of ratios that are not one, up to a quarter."""
+        return float(1.0 - ((ratio > 1 / NEAR_UNIT) & (ratio < NEAR_UNIT)).mean())
+
+    found = likeliest(meant, far_from_one, 1 - NEARLY_ALL + 1e-9)
+    return () if found is None else (Suspicion(found[0].said, True),)
+
+
+def counted_from_the_end(session: Session) -> tuple[Suspicion, ...]:
+    """Markers that fit their fixtures once they are counted from the other end."""
+    lines = session.lines
+    if not lines.known.any():
+        return ()
+    own = overall(lines.misfit(lines.measured, lines.declared)[lines.known])
+    turned = replace(lines, measured=lines.measured[:, ::-1], gaps=lines.gaps[:, ::-1])
+    said = (
+        "the markers are {own:.3g} m RMS from the declared start and end, but {left:.3g} m once "
+        "they are counted from the other end. Try: s_m from the start; or are start and end of "
+        "the poses exchanged?"
+    )
+    return _by_ends(
+        lines,
+        own,
+        [Hypothesis(said, turned)],
+        lambda one: overall(one.misfit(one.measured, one.declared)[one.known]),
+    )
+
+
+def _by_ends(
+    lines: Lines,
+    own: float,
+    hypotheses: Iterable[Hypothesis[T]],
+    misfit: Callable[[T], float],
+    near: float = np.inf,
+    certain: bool = True,
+) -> tuple[Suspicion, ...]:
+    """What explains ends that are `own` lengths of the cable off their fixtures."""
+    if own < FITS:
+        return ()
+    found = likeliest(hypotheses, misfit, min(FITS, MUCH_BETTER * own), near)
+    if found is None:
+        return ()
+    said = found[0].said.format(own=own * lines.length, left=found[1] * lines.length)
+    return (Suspicion(said, certain),)
+
+
+def wrong_frame(session: Session) -> tuple[Suspicion, ...]:
+    """Ends that fit all fixtures once the points are moved, turned or mirrored as a whole."""
+    lines = session.lines
+    own = lines.overall(lines.measured)
+    several = len(lines.names) > 2  # to the ends of fewer, some turn and some origin fit
+    if own > CONTRADICTS and (
+        found := _by_ends(lines, own, _exchanged_axes(lines, several), lines.overall)
+    ):
+        return found
+    if not (several and np.all(np.isfinite(lines.declared))):
+        return ()
+    fitted = (_fitted(lines, axes) for axes in exchanges(lines.declared.shape[2]))
+    return _by_ends(lines, own, fitted, lines.overall, near=1.0, certain=own > CONTRADICTS)
+
+
+def _exchanged_axes(lines: Lines, several: bool) -> Iterator[Hypothesis[FloatArray]]:
+    """Ends of points from another origin, with other axes, and both."""
+    shift = _shift(lines, lines.measured)
+    yield Hypothesis(
+        f"all lines lie {_at(shift, '.4g')} m away from their start and end. Try: measure "
+        "fixtures and lines from the same origin; subtract this from the points, or add it to "
+        "start and end.",
+        lines.measured - shift,
+    )
+    for moved, axes in product((False, True)[: 1 + several], exchanges(len(shift))[1:]):
+        turned, what = lines.measured @ axes.T, named(axes)
+        if moved:
+            shift = _shift(lines, turned)
+            turned, what = turned - shift, f"{what} and moved by {_at(-shift, '.4g')} m"
+        yield _in_frame(what, turned)
+
+
+def _in_frame(what: str, measured: FloatArray) -> Hypothesis[FloatArray]:
+    said = (
+        "the lines do not end at start and end of their poses ({own:.3g} m RMS), but do "
+        f"({{left:.3g}} m) with {what}. Try: points, start, end, orientations and gravity in one "
+        "frame, right-handed, in a plane x to the right and y up; in pictures rows count "
+        "downwards; a camera's points by its calibration."
+    )
+    return Hypothesis(said, measured)
+
+
+def _shift(lines: Lines, measured: FloatArray) -> FloatArray:
+    """The one translation (d,) [m] that fits best, in the middle of both ends.
+
+    With a free end: at the start, which the line's first point is then taken for.
+    """
+    away = measured.mean(axis=1) - lines.declared.mean(axis=1)
+    away = np.where(np.isfinite(away), away, (measured - lines.declared)[:, 0])
+    return np.asarray(np.median(away, axis=0))
+
+
+def _fitted(lines: Lines, turn: FloatArray) -> Hypothesis[FloatArray]:
+    """Ends in the frame that fits best, from a first rotation (d, d).
+
+    Declared = rotation measured + translation, least squares (Kabsch 1976), of the handedness of
+    the first one; the middle of both ends needs no order of a line.
+    """
+    d, hand = len(turn), np.sign(np.linalg.det(turn))
+    shift = np.median(lines.declared.mean(axis=1) - lines.measured.mean(axis=1) @ turn.T, axis=0)
+    for _ in range(_FITS_OF_FRAME):
+        moved = lines.measured @ turn.T + shift
+        given, other = (
+            np.linalg.norm(ends - lines.declared, axis=(1, 2)) for ends in (moved, moved[:, ::-1])
+        )
+        swapped = ~lines.known & (other < given)
+        source = np.where(swapped[:, None, None], lines.measured[:, ::-1], lines.measured)
+        source, goal = source.reshape(-1, d), lines.declared.reshape(-1, d)
+        centres = source.mean(axis=0), goal.mean(axis=0)
+        u, _, v = np.linalg.svd((goal - centres[1]).T @ (source - centres[0]))
+        turn = u @ np.diag([*np.ones(d - 1), hand * np.sign(np.linalg.det(u @ v))]) @ v
+        shift = centres[1] - turn @ centres[0]
+    return _in_frame(_told(turn, shift), lines.measured @ turn.T + shift)
+
+
+def _told(turn: FloatArray, shift: FloatArray) -> str:
+    """A frame in words: exchanged axes by their names, else how far it is turned and moved."""
+    d, moved = len(turn), f"moved by {_at(shift, '.3g')} m"
+    near = min(exchanges(d), key=lambda axes: float(np.linalg.norm(turn - axes)))
+    if np.linalg.norm(turn - near) < _NAMED * np.sqrt(2) and not np.allclose(near, np.eye(d)):
+        return f"{named(near)} and {moved}"
+    hand = np.sign(np.linalg.det(turn))
+    # What is mirrored before it is turned: y in a plane, all axes in space.
+    mirror, whole = np.array([hand**d, hand, hand][:d]), np.eye(3)
+    whole[:d, :d] = turn * mirror
+    vector = Rotation.from_matrix(whole).as_rotvec()
+    angle = float(np.linalg.norm(vector))
+    return (
+        f"the points {'mirrored, ' if hand < 0 else ''}turned by {np.degrees(angle):.3g} degrees "
+        f"about {_at(vector / max(angle, 1e-12), '.2g')} and {moved}"
+    )
+
+
+def out_of_step(session: Session) -> tuple[Suspicion, ...]:
+    """Ends that fit the fixtures of other poses: files and end positions in different orders."""
+    lines = session.lines
+    misfit = lines.misfit(lines.measured[:, None], lines.declared[None, :])
+    own, order = np.diag(misfit), np.arange(len(misfit))
+    _, best = linear_sum_assignment(misfit**2)
+    other = misfit[order, best]
+    wrong = (own > OUT_OF_STEP) & (other < np.minimum(FITS, MUCH_BETTER * own))
+    if wrong.sum() < 2:
+        return ()
+    pairs = [
+        f"{lines.names[i]} shows the ends of {lines.names[best[i]]}" for i in np.flatnonzero(wrong)
+    ]
+    more = f", and {len(pairs) - 4} more" if len(pairs) > 4 else ""
+    step = set((best - order)[wrong].tolist())
+    shift = f" (all of them {abs(step.pop())} further in the list)" if len(step) == 1 else ""
+    text = (
+        f"{len(pairs)} of {len(own)} files belong to other entries of the list of poses{shift}: "
+        f"{'; '.join(pairs[:4])}{more}. Try: put file names and end positions in step."
+    )
+    return (Suspicion(text, True),)
+
+
+def single_poses(session: Session) -> tuple[Suspicion, ...]:
+    """Poses that are wrong by themselves; of each the first reason.
+
+    Points that run to and fro in their order; an end where all others have their start, as if both
+    were exchanged; a line that ends far from the fixtures.
+    """
+    lines = session.lines
+    ends, own = lines.declared, lines.misfit(lines.measured, lines.declared)
+    near = np.linalg.norm(ends - np.median(ends[:, 0], axis=0), axis=2) < FITS * lines.length
+    turned = ~near[:, 0] & near[:, 1]
+    if len(ends) < 4 or near[:, 0].sum() < 3 * turned.sum():
+        turned = np.zeros(len(ends), dtype=bool)
+    reasons: list[tuple[NDArray[np.bool_], Callable[[int], str]]] = [
+        (
+            lines.lengths > TOO_LONG * lines.length,
+            lambda i: (
+                f"from point to point its line is {lines.lengths[i]:.4g} m long, the cable "
+                f"{lines.length:.4g} m. Try: are its points in order along the cable?"
+            ),
+        ),
+        (
+            turned,
+            lambda i: (
+                f"its end {_at(ends[i, 1], 'g')} m is where the other poses have their start. "
+                "Try: are start and end exchanged?"
+            ),
+        ),
+        (
+            own > CONTRADICTS,
+            lambda i: (
+                f"its line runs from {_at(lines.measured[i, 0])} to {_at(lines.measured[i, 1])} "
+                f"m, {own[i] * lines.length:.3g} m RMS away from the declared ends. Try: start "
+                "and end of this pose, and whether it is the right file."
+            ),
+        ),
+    ]
+    said: dict[str, Suspicion] = {}
+    for wrong, text in reasons:
+        for i in np.flatnonzero(wrong).tolist():
+            name = lines.names[i]
+            said.setdefault(name, Suspicion.of_pose(name, text(i)))
+    return tuple(said.values())
+
+
+# ---- what the points show -----------------------------------------------------------------------
+
+
+def repeated(session: Session) -> tuple[Suspicion, ...]:
+    """Poses with exactly the same points: one file under two names."""
+    seen: dict[bytes, str] = {}
+    found = []
+    for item in session.read:
+        first = seen.setdefault(np.ascontiguousarray(item.points, float).tobytes(), item.name)
+        if first != item.name:
+            text = (
+                f"{item.name} holds exactly the points of {first}, and no two measurements agree "
+                "to the last digit. Try: is one file there twice, under two names?"
+            )
+            found.append(Suspicion(text, False, item.name))
+    return tuple(found)
+
+
+def stretched(session: Session) -> tuple[Suspicion, ...]:
+    """Markers farther apart than the cable between them."""
+    texts, marked = {}, 0
+    for item in session.read:
+        if item.s is None:
+            continue
+        marked += 1
+        chords, along = np.linalg.norm(np.diff(item.points, axis=0), axis=1), np.diff(item.s)
+        k = int((chords - along).argmax()) if len(along) else 0
+        if len(along) and chords[k] - along[k] > STRETCHED * session.config.cable.length:
+            texts[item.name] = (
+                f"its markers at s_m {item.s[k]:g} and {item.s[k + 1]:g} are {chords[k]:.4g} m "
+                f"apart, the cable between them is {along[k]:.4g} m long"
+            )
+    advice = ". Try: s_m in metres along the cable, each beside its own point."
+    if texts and 2 * len(texts) > marked:
+        name = next(iter(texts))
+        told = f"{len(texts)} of {counted(marked, 'pose')}"
+        said = f"s_m contradicts the points of {told}. {name}: "
+        return (Suspicion(said + texts[name] + advice, True),)
+    return tuple(Suspicion.of_pose(name, text + advice) for name, text in texts.items())
+
+
+def _at(point: FloatArray, form: str = ".3f") -> str:
+    return f"({', '.join(format(value, form) for value in point)})"
