@@ -41,7 +41,7 @@ from dlo_casadi.effects import EFFECTS
 from dlo_casadi.equilibrium.equilibrium import tipping
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.spread import modes_in
-from dlo_casadi.estimation.mesh import SEARCH_MESH
+from dlo_casadi.estimation.fit import SEARCH_MESH
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.io.files import write_file

@@ -39,7 +39,7 @@ from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.mesh import fine_enough
+from dlo_casadi.estimation.fit import fine_enough
 from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.io.files import write_file
 from dlo_casadi.report.canvas import BLUE, GREY, VERMILLION, save_figure, styled

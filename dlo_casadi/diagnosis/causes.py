@@ -18,7 +18,7 @@ from dlo_casadi.diagnosis.pull import Pull
 from dlo_casadi.diagnosis.screening import Screened
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.result import Fit
 
 FloatArray = NDArray[np.floating]
@@ -38,7 +38,7 @@ def start_from(pull: Pull, candidate: Candidate) -> dict[str, float]:
     params = {name: linear[k] for k, name in enumerate(names)} | {"position": ca.SX(pull.position)}
     force = effect.force(place, ca.SX(ca.DM(model.gravity)), params)
     slopes = ca.Function("slopes", [place], [ca.jacobian(force, linear)])
-    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    seen = fit.problem.observed(fit.point)
     places = [seen[j].curve.at(np.array([pull.position]))[0] for j in fit.problem.used]
     arms = np.concatenate([np.array(slopes(at)) for at in places])
     found = np.linalg.lstsq(arms, pull.force_per_pose.ravel(), rcond=None)[0]
@@ -59,14 +59,7 @@ def refit_from(base: Fit, pull: Pull, screened: Screened) -> Confirmed | None:
     for name, value in start_from(pull, screened.candidate).items():
         values[model.names.index(name)] = value
     try:
-        fit = fit_model(
-            model,
-            base.problem.history,
-            base.problem.tolerances,
-            values=values,
-            start=pull.fit,
-            max_iterations=MOST_STEPS,
-        )
+        fit = refit(pull.fit, model, values=values, steps=MOST_STEPS)
     except EstimationError:
         return None
     return Confirmed.of(screened, base, fit)

@@ -14,7 +14,7 @@ from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import Start, fit_from_data, origins_of, start_from_data
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.runtime.parallel import map_in_order
 
@@ -118,14 +118,7 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
             scanned = name not in screened.candidate.screened
             values[i] = value if scanned else values[i] + share * (value - values[i])
         try:
-            fit = fit_model(
-                model,
-                base.problem.history,
-                base.problem.tolerances,
-                values=values,
-                start=base,
-                max_iterations=MOST_STEPS,
-            )
+            fit = refit(base, model, values=values, steps=MOST_STEPS)
         except EstimationError:
             continue
         same = best is not None and abs(fit.point.objective - best.point.objective) < ONE_PLACE

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtr
 
 from dlo_casadi.equilibrium.curve import Observed
-from dlo_casadi.estimation.gauss_newton import NO_INFORMATION
+from dlo_casadi.estimation.problem import NO_INFORMATION
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.runtime.executors import InProcess
@@ -123,14 +123,11 @@ def cross_validate(
     problem, lin = fit.problem, fit.linearization
     thetas, covariances = [], []
     total = fit.normal
-    for k, (block, cross, slope) in enumerate(_inner(fit)):
+    for k, (block, cross, slope) in enumerate(total.inner):
         a, e = lin.by_theta[k], lin.residuals[k]
-        h_j = a.T @ a
-        g_j = a.T @ e
-        if len(block):
-            solved = np.linalg.solve(block, np.column_stack([cross, slope]))
-            h_j = h_j - cross.T @ solved[:, :-1]
-            g_j = g_j - cross.T @ solved[:, -1]
+        solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+        h_j = a.T @ a - cross.T @ solved[:, :-1]
+        g_j = a.T @ e - cross.T @ solved[:, -1]
         theta, covariance = _without(fit, total.hessian - h_j, total.gradient - g_j)
         thetas.append(theta)
         covariances.append(covariance)
@@ -155,15 +152,6 @@ def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> Cross
     points = np.concatenate([fold[0] for fold in known]) if known else np.zeros(1)
     rmse = float(np.sqrt((points**2).mean()))
     return CrossValidation(squares, np.array([float(len(fold)) for fold in both]), complete, rmse)
-
-
-def _inner(fit: Fit) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Deviation blocks of each fitted pose; empty ones where there is none."""
-    if fit.normal.inner:
-        return fit.normal.inner
-    size = fit.problem.unknowns.size
-    empty = (np.zeros((0, 0)), np.zeros((0, size)), np.zeros(0))
-    return [empty] * len(fit.problem.used)
 
 
 def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -15,20 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.estimation.fit import (
-    ROUGHNESS_START,
-    SEARCH_STD,
-    STEPS_OF_A_RIVAL,
-)
-from dlo_casadi.estimation.gauss_newton import BatchProblem
+from dlo_casadi.estimation.descent import descend, with_border_of
+from dlo_casadi.estimation.fit import SEARCH_STD, STEPS_OF_A_RIVAL
+from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import Guess, all_at_once, equilibria_near, measured_shapes
+from dlo_casadi.estimation.start import Guess, all_at_once, measured_shapes
 from dlo_casadi.estimation.starting_points import FIRST_LOOK, MORE
-from dlo_casadi.estimation.transfer import with_border_of
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
-from dlo_casadi.model.rest_curvature import RestScatter
 
 FloatArray = NDArray[np.floating]
 
@@ -47,7 +42,7 @@ STEPS = (FIRST_LOOK, 4, 8)
 class Start:
     """Where a fit of a model begins: a problem, and nodes and parameters that are near balance."""
 
-    problem: BatchProblem
+    problem: Problem
     guess: Guess
 
 
@@ -108,15 +103,15 @@ def start_from_data(
     scans: tuple[dict[str, float], ...] = ({},)
     if candidate is not None:
         scans, linear = candidate.scans, candidate.add_linear_to(base.model)
-    first = _First(base, model if linear == model else linear, origins)
+    weights = None if smaller is None else smaller[1].problem.weights
+    first = _First(base, linear, origins, weights)
     looks: list[tuple[Guess, dict[str, float]]] = []
     if candidate is not None and smaller is not None:
         looks = [(guess, scans[0]) for guess in first.beyond(candidate, *smaller)]
     looks = looks or first.looks(scans[:: -(-len(scans) // PLACES_TRIED)])
     problem, best = first.problem, None
     if linear != model:
-        problem = _searched_problem(base, model)
-        problem.share_weights(first.problem)
+        problem = replace(_searched_problem(base, model), weights=problem.weights)
     for look, scan in sorted(looks, key=lambda look: look[0].objective)[:FOLLOWED]:
         guess: Guess | None = look
         if candidate is not None and linear != model:
@@ -132,8 +127,15 @@ def start_from_data(
 class _First:
     """First looks at a model, in parameters in which what it has more is linear."""
 
-    def __init__(self, base: Fit, model: CableModel, origins: Sequence[Origin]) -> None:
-        self.problem, self.model = _searched_problem(base, model), model
+    def __init__(
+        self,
+        base: Fit,
+        model: CableModel,
+        origins: Sequence[Origin],
+        weights: tuple[FloatArray, ...] | None,
+    ) -> None:
+        self.problem = replace(_searched_problem(base, model), weights=weights)
+        self.model = model
         self.begun: list[tuple[FloatArray, Shapes, list[FloatArray]]] = []
         for origin in origins:
             p = base.values_in(model)
@@ -149,6 +151,10 @@ class _First:
                     self.problem, origin.values.get(END_ROLL, 0.0)
                 )
             self.begun.append((p, shapes, projections))
+        if weights is None:
+            p, shapes, projections = self.begun[0]
+            theta = self.problem.unknowns.pack(p, np.zeros(model.n_coefficients))
+            self.problem = self.problem.weighed(Values(theta, shapes, projections))
         priors = base.model.priors
         released = {name for name in priors if name not in model.priors}
         self.kept = set(base.model.names) - released - {END_ROLL}
@@ -178,8 +184,6 @@ class _First:
         for name, value in scan.items():
             p[self.model.names.index(name)] = value
         theta = self.problem.unknowns.pack(p, np.zeros(self.model.n_coefficients))
-        if not self.problem.has_weights:
-            self.problem.refresh(theta, shapes, projections)
         held = np.array([name in self.kept or name in scan for name in self.problem.unknowns.names])
         return all_at_once(self.problem, Guess(theta, shapes, projections), held, STEPS[0])
 
@@ -194,12 +198,11 @@ class _First:
         p = np.array([values[name] for name in self.model.names])
         shapes = with_border_of(start.guess.shapes, other.model, self.model)
         begun = Guess(self.problem.unknowns.pack(p, rest), shapes, start.guess.projections)
-        self.problem.share_weights(start.problem)
         held = np.array([name in self.kept for name in self.problem.unknowns.names])
         guess = all_at_once(self.problem, begun, held, STEPS[0])
         return [] if guess is None else [guess]
 
-    def continued(self, guess: Guess, problem: BatchProblem, candidate: Candidate) -> Guess:
+    def continued(self, guess: Guess, problem: Problem, candidate: Candidate) -> Guess:
         """A guess in the candidate's own parameters."""
         names, found = problem.unknowns.model.names, self.problem.unknowns.p(guess.theta)
         values = dict(zip(self.model.names, map(float, found), strict=True))
@@ -211,16 +214,12 @@ class _First:
         return replace(guess, theta=theta)
 
 
-def _searched_problem(base: Fit, model: CableModel) -> BatchProblem:
+def _searched_problem(base: Fit, model: CableModel) -> Problem:
     """A model's batch problem as a search weighs it."""
     known, problem = base.noise.before or base.noise, base.problem
     noise = known.doubted(SEARCH_STD * model.cable.length)
-    scatter = problem.tolerances.deviation(model.node)
     unknowns = Unknowns(model, base.free_in(model), base.values_in(model))
-    rest = RestScatter()
-    return BatchProblem(
-        unknowns, problem.history, noise, problem.tolerances, ROUGHNESS_START, scatter, rest
-    )
+    return Problem(unknowns, problem.history, noise, Priors.of(problem.priors.tolerances, model))
 
 
 def fit_from_data(base: Fit, start: Start) -> Fit | None:
@@ -229,12 +228,10 @@ def fit_from_data(base: Fit, start: Start) -> Fit | None:
     none = np.zeros(problem.unknowns.size, dtype=bool)
     guess = all_at_once(problem, start.guess, none, MORE)
     for one in (guess, start.guess):
-        point = None if one is None else equilibria_near(problem, one)
+        point = None if one is None else problem.balanced(one, max_iterations=40)
         if point is not None:
             break
     else:
         return None
-    point, _ = problem.descend(point, STEPS_OF_A_RIVAL, tolerance=1e-2)
-    alike = base.problem.of(problem.unknowns)
-    point = alike.taken_over(point)
-    return Fit(alike, *alike.descend(point))
+    near = descend(Fit(problem, point), STEPS_OF_A_RIVAL, tolerance=1e-2)
+    return descend(near.reweighed(base.noise, base.problem.priors))

@@ -17,7 +17,7 @@ from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.effects import Load
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.profile import student_95
 from dlo_casadi.estimation.result import Fit
@@ -112,14 +112,7 @@ def _with_weights(fit: Fit, weight: Candidate, place: float) -> Iterator[Fit]:
         values = start.values_in(model)
         values[own] = share * model.cable.mass, place
         try:
-            start = fit_model(
-                model,
-                fit.problem.history,
-                fit.problem.tolerances,
-                free=free,
-                values=values,
-                start=start,
-            )
+            start = refit(start, model, free=free, values=values)
         except EstimationError:
             return
         best = min(best, start.point.objective)

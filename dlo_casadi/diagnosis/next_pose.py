@@ -114,7 +114,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
 
 def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
     """Which reading tells two predictions of a pose apart best."""
-    tolerances, noise = fit.problem.tolerances, fit.noise.readings
+    tolerances, noise = fit.problem.priors.tolerances, fit.noise.readings
     found = []
     for name, at in reaction_rows(fit.model.node).items():
         moment = name.endswith("moment")

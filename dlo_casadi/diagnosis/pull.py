@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.linearization import Point
+from dlo_casadi.estimation.descent import descend, refit
+from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.starting_points import DECADES, starting_points
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -87,13 +86,7 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
     best: Fit | None = None
     for fit in search.run(executor or InProcess()):
         try:
-            best = fit_model(
-                model,
-                base.problem.history,
-                base.problem.tolerances,
-                start=fit,
-                max_iterations=MOST_STEPS,
-            )
+            best = refit(fit, model, steps=MOST_STEPS)
             break
         except EstimationError:
             continue
@@ -140,25 +133,20 @@ class _Search:
         decades = DECADES if first is None else self.decades_about(first)
         asked = [(share, decades) for share in PULL_PLACES if share != middle]
         starts = [first, *map_in_order(executor, self.start, asked)]
-        places = [middle, *(share for share, _ in asked)]
-        ways = [
-            (share, point) for share, point in zip(places, starts, strict=True) if point is not None
-        ]
-        likely = sorted(ways, key=lambda way: way[1].objective)
+        likely = sorted((x for x in starts if x), key=lambda start: start.point.objective)
         fits = map_in_order(executor, self.fit_from, likely[:TRIED])
         return sorted(fits, key=lambda fit: fit.point.objective)
 
-    def decades_about(self, point: Point) -> tuple[float, ...]:
+    def decades_about(self, start: Fit) -> tuple[float, ...]:
         """Stiffnesses to start from at other places: at all, what was left had one valley.
 
         Of a simulated cable with a tether, over nine places; the valley moved by a decade at most.
         """
-        p = self.held_at(PULL_PLACES[0]).unknowns.p(point.theta)
         own = self.model.names.index(BENDING_STIFFNESS)
-        best = round(float(np.log10(p[own] / self.model.nominal[own])))
+        best = round(float(np.log10(start.p[own] / self.model.nominal[own])))
         return (best, best - 1, best + 1)
 
-    def start(self, way: tuple[float, Sequence[float]]) -> Point | None:
+    def start(self, way: tuple[float, Sequence[float]]) -> Fit | None:
         """Equilibria near the measured shapes for a load at a share of the length.
 
         `way` is the share, and in a plane the decades about the prior stiffness to start from.
@@ -174,32 +162,25 @@ class _Search:
         points = starting_points(problem, theta, decades)
         return points[0] if points else None
 
-    def fit_from(self, way: tuple[float, Point]) -> Fit:
-        """Fit with the load held at the share of the length, then with its place free."""
-        share, point = way
-        problem = self.held_at(share)
-        held = Fit(problem, *problem.descend(point))
-        found = self.base.problem.unknowns
-        moving = self._problem(Unknowns(self.model, self.free, held.p, found.rest_free))
+    def fit_from(self, start: Fit) -> Fit:
+        """Fit with the load held where it is, then with its place free."""
+        held = descend(start)
+        moving = self._problem(Unknowns(self.model, self.free, held.p))
         theta = moving.unknowns.pack(held.p, held.coefficients)
-        start = replace(held.point, theta=theta)
-        return Fit(moving, *moving.descend(start, MOST_STEPS))
+        return descend(Fit(moving, replace(held.point, theta=theta)), MOST_STEPS)
 
-    def held_at(self, share: float) -> BatchProblem:
+    def held_at(self, share: float) -> Problem:
         """Problem with the load at a share of the length, all else nominal or kept fixed."""
         free = self.free
         values = np.where(free, self.model.nominal, self.base.values_in(self.model))
         place = self.model.names.index(self.position)
         values[place] = share * self.model.cable.length
         free[place] = False
-        return self._problem(
-            Unknowns(self.model, free, values, self.base.problem.unknowns.rest_free)
-        )
+        return self._problem(Unknowns(self.model, free, values))
 
-    def _problem(self, unknowns: Unknowns) -> BatchProblem:
-        problem = self.base.problem.of(unknowns, scatter=pull_scatter(self.base))
-        problem.share_weights(self.base.problem)
-        return problem
+    def _problem(self, unknowns: Unknowns) -> Problem:
+        priors = replace(self.base.problem.priors, scatter=pull_scatter(self.base))
+        return replace(self.base.problem, unknowns=unknowns, priors=priors)
 
 
 def pull_scatter(base: Fit) -> FloatArray:
@@ -211,7 +192,7 @@ def pull_scatter(base: Fit) -> FloatArray:
     """
     cable = base.model.cable
     weight = cable.mass * float(np.linalg.norm(base.model.gravity))
-    scatter = base.problem.scatter.copy()
+    scatter = base.problem.priors.scatter.copy()
     scatter[-base.model.node.dimension :] = PULL_WEIGHTS * max(
         weight, cable.bending_stiffness / cable.length**2
     )

@@ -28,10 +28,9 @@ from scipy.special import chdtrc, fdtrc
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import StateEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
-from dlo_casadi.estimation.linearization import Linearization, Point
+from dlo_casadi.estimation.descent import carried_shapes
+from dlo_casadi.estimation.problem import NO_INFORMATION, Linearization, Point, Problem, Values
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.transfer import carried_shapes
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
@@ -80,7 +79,7 @@ class _Moving:
     derivatives by its own parameters have to be taken again, without the other candidates.
     """
 
-    problem: BatchProblem
+    problem: Problem
     shapes: Shapes
     names: tuple[str, ...]
 
@@ -88,9 +87,8 @@ class _Moving:
     def of(cls, fit: Fit, candidates: Sequence[Candidate]) -> _Moving:
         """Candidates beside a fit."""
         model = extended(fit, candidates)
-        values, rest_free = fit.values_in(model), fit.problem.unknowns.rest_free
-        problem = fit.problem.of(Unknowns(model, fit.free_in(model), values, rest_free))
-        problem.share_weights(fit.problem)
+        unknowns = Unknowns(model, fit.free_in(model), fit.values_in(model))
+        problem = replace(fit.problem, unknowns=unknowns)
         names = tuple(name for candidate in candidates for name in candidate.screened)
         return cls(problem, carried_shapes(problem, fit), names)
 
@@ -105,13 +103,11 @@ class _Moving:
         still = np.zeros((len(rest), len(columns)))
         shapes = with_springs(problem.equilibria, self.shapes, p, rest)
         along = problem.equilibria.directions(shapes, p, rest, slopes, still)
-        seen = problem.equilibria.observe(shapes, p, rest, along)
-        out: list[FloatArray] = []
-        for j, s in zip(problem.used, fit.point.projections, strict=True):
-            now, change = seen.pose(j, unknowns.model.cable.length)
-            _, moved = problem.measured[j].linearized(now, s, change)
-            out.append(problem.whitening(j) @ moved[:, : len(columns)])
-        return out
+        moved = problem.residuals(Values(theta, shapes, fit.point.projections), along)
+        return [
+            white @ change[:, : len(columns)]
+            for white, (_, change) in zip(problem.whitening, moved, strict=True)
+        ]
 
 
 def with_springs(
@@ -202,15 +198,14 @@ class Screen:
             active = [c for c in self.listed if k < len(c.scans)]
             yield AtScan(active, k, normal.hessian, normal.gradient, names)
 
-    def _linearized(self) -> tuple[BatchProblem, Point, Linearization]:
+    def _linearized(self) -> tuple[Problem, Point, Linearization]:
         """The fit's model with candidates at their nominal values, linearised at the fit."""
         problem = self.fit.problem
         p = _at(_scan(self.listed, 0), self.model, self.fit)
         # Nuisances that are candidates enter twice: with their prior, and free.
         free = self.fit.free_in(self.model)
-        unknowns = Unknowns(self.model, free, p, problem.unknowns.rest_free)
-        larger = problem.of(unknowns)
-        larger.share_weights(problem)
+        unknowns = Unknowns(self.model, free, p)
+        larger = replace(problem, unknowns=unknowns)
         theta = unknowns.pack(p, self.fit.coefficients)
         shapes = carried_shapes(larger, self.fit)
         shapes = with_springs(larger.equilibria, shapes, p, unknowns.rest(theta))

@@ -37,11 +37,11 @@ from dlo_casadi.diagnosis.structure import (
 )
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.hyperparameters import SETTLED_MODES, settle
-from dlo_casadi.estimation.mesh import fine_enough
+from dlo_casadi.estimation.descent import refit
+from dlo_casadi.estimation.fit import fine_enough
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.variances import SETTLED_MODES, settle
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import (
     BIC_APART,
@@ -335,6 +335,6 @@ def _drop(fit: Fit, candidate: Candidate) -> Fit | None:
         return None
     model = fit.model.without_effect(candidate.effect.label)
     try:
-        return fit_model(model, fit.problem.history, fit.problem.tolerances, start=fit)
+        return refit(fit, model)
     except EstimationError:
         return None

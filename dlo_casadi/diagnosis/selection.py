@@ -12,10 +12,11 @@ from dlo_casadi.diagnosis.confirm import Confirmed
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fitted_closely
-from dlo_casadi.estimation.hyperparameters import errors_of, settle
 from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.variances import errors_of, settle
 from dlo_casadi.thresholds import LEAST_NOISE_DEGREES, MISLEADING
 
 
@@ -106,25 +107,18 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
     """
     try:
         noise, rest_scatter = errors_of(
-            closed.problem,
-            closed.point,
-            closed.linearization,
+            closed,
             modes=0,
             estimated=not closed.noise.known,
-            repeats=closed.problem.rest_scatter.std == 0,
+            repeats=closed.problem.priors.rest_scatter.std == 0,
         )
     except EstimationError:  # with the effect hardly a point is left over: nothing is shown
         return 1.0
-    rough, scatter = open_.problem.roughness_std, open_.problem.scatter
-    larger = closed.problem.changed(noise, rough, scatter, rest_scatter)
-    larger.refresh(closed.point.theta, closed.point.shapes, closed.point.projections)
-    problem = open_.problem.changed(noise, rough, scatter, rest_scatter)
-    problem.share_weights(larger)
-    point = problem.evaluate(open_.point.theta, open_.point.shapes, open_.point.projections)
-    point, _ = problem.descend(point)
-    other = larger.evaluate(closed.point.theta, closed.point.shapes, closed.point.projections)
-    other, _ = larger.descend(other)
-    gain = max(2 * (point.objective - other.objective), 0.0)
+    priors = replace(open_.problem.priors, rest_scatter=rest_scatter)
+    larger = closed.reweighed(noise, priors)
+    smaller = replace(larger.problem, unknowns=open_.problem.unknowns)
+    without = descend(Fit(smaller, smaller.evaluate(open_.point)))
+    gain = max(2 * (without.point.objective - descend(larger).point.objective), 0.0)
     dof = len(winner.candidate.frees)
     return sidak(survival(gain, dof, max(LEAST_NOISE_DEGREES, noise.slow_dof)), tried)
 
@@ -229,7 +223,7 @@ def misleads(fit: Fit, before: Fit, validation: CrossValidation) -> bool:
 
 def _told(fit: Fit) -> float:
     """Cross-validated error [m] of poses of which nothing but the ends is known."""
-    shapes = predicted_shapes(fit.problem, fit.point.shapes, fit.p, fit.rest)
+    shapes = predicted_shapes(fit.problem, fit.point)
     return cross_validate(fit, shapes=shapes).rmse
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from dlo_casadi.diagnosis.screening import survival
-from dlo_casadi.estimation.hyperparameters import rest_scatter_of
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.variances import rest_scatter_of
 from dlo_casadi.sensing.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.thresholds import KEPT_INFORMATION, KEPT_VARIANCE, LEAST_NOISE_DEGREES
 
@@ -20,8 +20,6 @@ FloatArray = NDArray[np.floating]
 # Largest normal score of a test: tails beyond a probability of 1e-12 tell no more.
 _TAIL = 1e-12
 LARGEST_SCORE = -float(ndtri(_TAIL))
-
-NO_DEVIATION = (np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Structure:
 
 def noise_degrees(fit: Fit) -> float:
     """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
-    return max(LEAST_NOISE_DEGREES, min(fit.noise.slow_dof, fit.problem.rest_scatter.dof))
+    return max(LEAST_NOISE_DEGREES, min(fit.noise.slow_dof, fit.problem.priors.rest_scatter.dof))
 
 
 def screening_degrees(fit: Fit) -> float:
@@ -85,7 +83,7 @@ def screening_degrees(fit: Fit) -> float:
     of cable told it, which is too much: what is found so has to pass a second test, under the
     noise that is left once it is in the model.
     """
-    rest_dof = fit.problem.rest_scatter.dof
+    rest_dof = fit.problem.priors.rest_scatter.dof
     if fit.noise.known:
         return noise_degrees(fit)
     if fit.noise.share == 0:
@@ -99,18 +97,15 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     problem, lin, normal = fit.problem, fit.linearization, fit.normal
     model = fit.model
     coefficients, own, arms = [], [], []
-    inner = normal.inner or [NO_DEVIATION] * len(problem.used)
     for k, (j, s) in enumerate(zip(problem.used, fit.point.projections, strict=True)):
         modes = smooth_modes(s, model.cable.length, SLOW_MODES, model.end == "free")
         seen = problem.measured[j].slow_rows(modes)
-        basis, _ = np.linalg.qr(problem.whitening(j) @ seen)
+        basis, _ = np.linalg.qr(problem.whitening[k] @ seen)
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
-        covariance = np.eye(basis.shape[1])
-        block = inner[k]
-        if block is not NO_DEVIATION:
-            solved = np.linalg.solve(block[0], np.column_stack([b.T, block[1]]))
-            covariance -= b @ solved[:, : len(b)]
-            a = a - b @ solved[:, len(b) :]
+        block, cross, _ = normal.inner[k]
+        solved = np.linalg.solve(block, np.column_stack([b.T, cross]))
+        covariance = np.eye(basis.shape[1]) - b @ solved[:, : len(b)]
+        a = a - b @ solved[:, len(b) :]
         coefficients.append(basis.T @ lin.residuals[k])
         own.append(covariance)
         arms.append(a)
@@ -155,16 +150,15 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
 
 def _systematic(fit: Fit) -> float | None:
     """Probability of what poses that are alike have in common; None where the cable repeats."""
-    if fit.problem.rest_scatter.std == 0:
+    if fit.problem.priors.rest_scatter.std == 0:
         return None
-    found = rest_scatter_of(fit.problem, fit.point, fit.linearization, fit.noise)
-    return found.p_systematic
+    return rest_scatter_of(fit, fit.noise).p_systematic
 
 
 def _position_score(fit: Fit, noise_dof: float) -> float:
     """Score test of a displacement field's terms of first and second degree, in the plane ten."""
     problem, lin, inner = fit.problem, fit.linearization, fit.normal.inner
-    observed = problem.observed(fit.point.theta, fit.point.shapes)
+    observed = problem.observed(fit.point)
     d = observed[0].curve.d
     pairs = list(combinations_with_replacement(range(d), 2))
     size = d * (d + len(pairs))
@@ -176,17 +170,16 @@ def _position_score(fit: Fit, noise_dof: float) -> float:
         x = item.points / fit.model.cable.length
         terms = np.column_stack([x, *(x[:, a] * x[:, b] for a, b in pairs)])
         moved = np.einsum("dc,kt->kdct", np.eye(d), terms).reshape((len(x), d, size))
-        seen = problem.whitening(j) @ item.components(observed[j].curve, s, moved)
+        seen = problem.whitening[k] @ item.components(observed[j].curve, s, moved)
         information += seen.T @ seen
         cross += seen.T @ lin.by_theta[k]
         slope += seen.T @ lin.residuals[k]
-        if inner:
-            block, by_theta, gradient = inner[k]
-            along = lin.by_deviation[k].T @ seen
-            taken = np.linalg.solve(block, along)
-            information -= along.T @ taken
-            cross -= taken.T @ by_theta
-            slope -= taken.T @ gradient
+        block, by_theta, gradient = inner[k]
+        along = lin.by_deviation[k].T @ seen
+        taken = np.linalg.solve(block, along)
+        information -= along.T @ taken
+        cross -= taken.T @ by_theta
+        slope -= taken.T @ gradient
     information -= cross @ fit.covariance @ cross.T
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))

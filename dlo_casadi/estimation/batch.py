@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.curve import ObservedChange
 from dlo_casadi.equilibrium.ipopt import run_ipopt
 from dlo_casadi.errors import EstimationError, counted
-from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.linearization import Point
+from dlo_casadi.estimation.problem import Point, Problem, Values
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after
@@ -60,12 +59,12 @@ class BatchSolution:
     residual: float
 
 
-def solve_batch(problem: BatchProblem, start: Point, max_solves: int = 4) -> BatchSolution:
+def solve_batch(problem: Problem, start: Point, max_solves: int = 4) -> BatchSolution:
     """Solve the batch NLP by IPOPT from a point near its minimum.
 
     Parameters
     ----------
-    problem : BatchProblem
+    problem : Problem
     start : Point
         For example of `fit_model`.
 
@@ -89,7 +88,7 @@ def solve_batch(problem: BatchProblem, start: Point, max_solves: int = 4) -> Bat
                 "  Try: more poses, or estimation.robust: true if some points are far off."
             )
         theta, shapes = nlp.unpack(vector, point.shapes)
-        moved = problem.evaluate(theta, shapes, point.projections)
+        moved = problem.evaluate(Values(theta, shapes, point.projections))
         shift = max(
             float(np.abs(new - old).max())
             for new, old in zip(moved.projections, point.projections, strict=True)
@@ -99,17 +98,16 @@ def solve_batch(problem: BatchProblem, start: Point, max_solves: int = 4) -> Bat
             return BatchSolution(point, solves, iterations, residual)
 
 
-def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, FloatArray]]:
+def _compressed(problem: Problem, point: Point) -> list[tuple[FloatArray, FloatArray]]:
     """Triangular factor (n_rows, n_z) and target (n_rows,) of each fitted pose's residuals."""
-    seen = problem.observed(point.theta, point.shapes)
+    seen = problem.observed(point)
     count, size = _n_rows(problem), problem.observed_size
     unit = np.eye(size)
     out: list[tuple[FloatArray, FloatArray]] = []
-    for j, s in zip(problem.used, point.projections, strict=True):
+    for j, s, white in zip(problem.used, point.projections, problem.whitening, strict=True):
         curve, readings = seen[j].curve.numbers, seen[j].readings
         each = ObservedChange(unit[: curve.size].reshape((*curve.shape, size)), unit[curve.size :])
-        item, white = problem.measured[j], problem.whitening(j)
-        residual, change = item.linearized(seen[j], s, each)
+        residual, change = problem.measured[j].linearized(seen[j], s, each)
         rows = -white @ change
         here = np.concatenate([curve.ravel(), readings])
         target = white @ residual + rows @ here
@@ -121,7 +119,7 @@ def _compressed(problem: BatchProblem, point: Point) -> list[tuple[FloatArray, F
     return out
 
 
-def _n_rows(problem: BatchProblem) -> int:
+def _n_rows(problem: Problem) -> int:
     """Rows of a pose's compressed residuals: no more than what they depend on, or residuals."""
     most = max(problem.measured[j].n_residuals for j in problem.used)
     return min(most, problem.observed_size)
@@ -135,7 +133,7 @@ class _BatchNlp:
     differentiating the assembled NLP would cost as many sweeps as a pose has unknowns.
     """
 
-    def __init__(self, problem: BatchProblem, p: FloatArray) -> None:
+    def __init__(self, problem: Problem, p: FloatArray) -> None:
         self.problem = problem
         unknowns, model = problem.unknowns, problem.unknowns.model
         self.poses = list(range(problem.equilibria.m)) if model.has_state else list(problem.used)
@@ -164,7 +162,7 @@ class _BatchNlp:
         for k, column in enumerate(self.columns):
             deviation[column] = dev[k] * problem.deviation_std[k]
         if not model.has_state:
-            rest = unknowns.symbolic_rest(theta)
+            rest = ca.DM(unknowns.rest_slopes) @ theta
         p = unknowns.symbolic_p(theta)
         symbols = PoseSymbols(x, lam * self.force, p, rest, pose, deviation)
         scale = np.concatenate(
@@ -322,9 +320,7 @@ class _BatchNlp:
     ) -> tuple[FloatArray, dict[str, Any], float]:
         """One IPOPT run with frozen projections."""
         problem = self.problem
-        rests = problem.equilibria.rests(
-            point.shapes, problem.unknowns.p(point.theta), problem.unknowns.rest(point.theta)
-        )
+        rests = problem.equilibria.rests(*problem.state(point))
         own = []
         for j in self.poses:
             scaled = point.shapes.deviation[j, self.columns] / problem.deviation_std

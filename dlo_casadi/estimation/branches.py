@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.hyperparameters import SETTLED_MODES, refine
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.variances import SETTLED_MODES, refine
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.thresholds import BIC_APART
@@ -147,14 +147,10 @@ def _refitted(fit: Fit, gaps: Sequence[EnergyGap]) -> Fit:
         row = gap.slope / (KEPT * gap.std)
         aim = -BELOW * gap.std - gap.value
         told.append((row, float(row @ fit.point.theta) + aim / (KEPT * gap.std)))
-    unknowns = replace(problem.unknowns, told=tuple(told))
-    knowing = problem.of(unknowns, equilibria=problem.equilibria)
-    found, point, _ = refine(
-        knowing,
-        knowing.taken_over(fit.point),
-        estimate=not fit.noise.known,
+    knowing = refine(
+        fit.reweighed(priors=replace(problem.priors, told=tuple(told))),
         rounds=2,
         modes=SETTLED_MODES,
     )
-    plain = found.of(problem.unknowns, equilibria=problem.equilibria)
-    return Fit(plain, plain.taken_over(point), converged=True)
+    plain = knowing.reweighed(priors=replace(knowing.problem.priors, told=()))
+    return replace(plain, converged=True)

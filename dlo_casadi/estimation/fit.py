@@ -1,4 +1,4 @@
-"""Fit of a model to all measured poses: the best of some starts, or from a similar fit."""
+"""Fit of a model to all measured poses: the best of some starts, on a mesh that is fine enough."""
 
 from __future__ import annotations
 
@@ -9,26 +9,27 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.hyperparameters import (
+from dlo_casadi.estimation.descent import descend, on_other_mesh, refit
+from dlo_casadi.estimation.problem import Priors, Problem
+from dlo_casadi.estimation.repeats import different_poses, with_repeats
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.starting_points import DECADES, ROLLS, starting_points
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.variances import (
     SCATTER_FLOOR,
     SMOOTH_MODES,
     errors_of,
     first_reading_noise,
     refine,
 )
-from dlo_casadi.estimation.linearization import Point
-from dlo_casadi.estimation.repeats import different_poses, with_repeats
-from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.starting_points import DECADES, ROLLS, starting_points
-from dlo_casadi.estimation.transfer import carried_projections, carried_shapes
-from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
 from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
-from dlo_casadi.thresholds import DIFFERENT
+from dlo_casadi.thresholds import DIFFERENT, LACKING_SHARE, MESH_SHARE
 
 FloatArray = NDArray[np.floating]
 
@@ -58,12 +59,14 @@ MISFIT, MISFIT_STD = 0.002, 0.01
 ASTRAY = 0.001
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
-ROUGHNESS_START = 0.3
 # Rise of the objective from a mesh to the next finer one by which a fit has got stuck: of two poses
 # in space 20 elements left 280 and 40 left 6327, while two meshes of a fit differ by a few percent.
 STUCK = 2.0
 # Turns per length, several times what heavy cables were measured to have, 0.1 to 0.3 1/m.
 FIRST_REST_TURNS = 0.05
+FINEST_MESH = 160
+# The search for missing effects, a hundred refits, runs on at most so many elements.
+SEARCH_MESH = 80
 
 
 def fit_model(
@@ -74,9 +77,7 @@ def fit_model(
     *,
     free: Sequence[str] | None = None,
     values: FloatArray | None = None,
-    start: Fit | None = None,
     decades: Sequence[float] = DECADES,
-    max_iterations: int = 40,
     readings: ReadingNoise | None = None,
 ) -> Fit:
     """Fit a model to all readable fit poses.
@@ -90,17 +91,11 @@ def fit_model(
     std : float, optional [m]
         Declared noise of one coordinate; estimated, with its correlation, when absent.
     free : sequence of str, optional
-        Names of the parameters to estimate; by default all but those that `start` keeps fixed.
+        Names of the parameters to estimate; all by default.
     values : (n_parameters,), optional
-        Where the parameters start, or stay if they are not estimated; by default where `start`
-        has them, nominal where it does not know them.
-    start : Fit, optional
-        A fit of a similar model on the same mesh to start from; its noise is kept, and what it
-        has found of the parameters that are estimated.
+        Where the parameters start, or stay if they are not estimated; nominal by default.
     decades : sequence of float
         Stiffnesses to start from, powers of ten about the prior.
-    max_iterations : int
-        Of a fit that continues from `start`.
     readings : ReadingNoise, optional
         Noise of forces and moments on the fixtures; estimated by default.
 
@@ -109,59 +104,50 @@ def fit_model(
     EstimationError
         If there is no fit pose, or no start leads to an equilibrium near the measured shapes.
     """
-    if not any(item.readable and not item.held_out for item in measured):
+    count = sum(item.readable and not item.held_out for item in measured)
+    if not count:
         raise EstimationError(
             "no pose to fit: every pose is held out or could not be read.\n"
             "  Try: role: fit for at least one pose."
         )
-    if free is not None:
-        chosen = np.array([name in free for name in model.names])
-    else:
-        chosen = np.ones(len(model.names), dtype=bool) if start is None else start.free_in(model)
-    if values is not None:
-        begin = values
-    else:
-        begin = model.nominal if start is None else start.values_in(model)
+    begin = model.nominal if values is None else values
+    chosen = np.isin(model.names, model.names if free is None else free)
     unknowns = Unknowns(model, chosen, begin)
-    if start is not None:
-        return _continue(unknowns, measured, start, max_iterations)
     noise = NoiseModel(FIRST_STD)
     if std is not None:
         declared = NoiseModel(std, source="declared")
         noise = with_repeats(declared, measured, model.cable.length)
     noise = replace(noise, readings=readings or first_reading_noise(model))
-    scatter = tolerances.deviation(model.node)
-    count = sum(item.readable and not item.held_out for item in measured)
+    priors = Priors.of(tolerances, model)
     if count == 1:
         # One pose does not deviate from others: what is wrong with it is wrong with the session.
-        scatter = SCATTER_FLOOR * scatter
-    problem = BatchProblem(unknowns, measured, noise, tolerances, ROUGHNESS_START, scatter)
+        priors = replace(priors, scatter=SCATTER_FLOOR * priors.scatter)
+    problem = Problem(unknowns, tuple(measured), noise, priors)
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta, decades)
     different = different_poses(measured, model.cable.length)
     astray = fit.beyond_noise and fit.residual_rms > ASTRAY * model.cable.length
     if not model.in_space and different >= DIFFERENT and astray:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
-        # left: search once more as if every hanging had a rest curvature of its own.
+        # left: search once more as if every repeat had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
         noise = fit.noise if std is not None and fit.noise.source == "estimated" else noise
-        loose = problem.changed(noise, ROUGHNESS_START, scatter, first)
+        loose = replace(problem, noise=noise, priors=replace(priors, rest_scatter=first))
         near = _found(loose, theta, decades)
         try:
-            others = [_refined(loose, near)] if near and _scatters(loose, near) else []
+            others = [refine(near, first=True)] if near and _scatters(near) else []
         except EstimationError:
             return fit
         return max([fit, *others], key=lambda found: found.log_evidence)
     return fit
 
 
-def _scatters(problem: BatchProblem, point: Point) -> bool:
-    """Whether what a point leaves differs from hanging to hanging, and not as their shapes do."""
-    lin, estimated = problem.linearize(point), not problem.noise.known
-    return errors_of(problem, point, lin, estimated=estimated, repeats=False)[1].std > 0
+def _scatters(fit: Fit) -> bool:
+    """Whether what a point leaves differs from repeat to repeat, and not as their shapes do."""
+    return errors_of(fit, estimated=not fit.noise.known, repeats=False)[1].std > 0
 
 
-def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Fit:
+def _searched(problem: Problem, theta: FloatArray, decades: Sequence[float]) -> Fit:
     """The best minimum from starts over decades of stiffness, noise and scatters estimated."""
     model = problem.unknowns.model
     best = _found(problem, theta, decades)
@@ -172,71 +158,86 @@ def _searched(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )
-    if model.in_space and _misfits(problem, best):
+    if model.in_space and _misfits(best):
         if END_ROLL in problem.unknowns.names:
             other = _search(problem, theta, decades, FAR_ROLLS, either_way=True)
-            best = other if other is not None and other.objective < best.objective else best
-        if _misfits(problem, best):
-            return _fit_to_misfit(problem, best)
-    return _refined(problem, best)
+            lower = other is not None and other.point.objective < best.point.objective
+            best = other if other is not None and lower else best
+        if _misfits(best):
+            return _fit_to_misfit(best)
+    return refine(best, first=True)
 
 
-def _found(problem: BatchProblem, theta: FloatArray, decades: Sequence[float]) -> Point | None:
+def _found(problem: Problem, theta: FloatArray, decades: Sequence[float]) -> Fit | None:
     """The best minimum from starts over decades of stiffness; of many poses, of a part first."""
     best = None
     if len(problem.used) > POSES_OF_A_SEARCH and not problem.unknowns.model.has_state:
-        rough = _search(problem.thinned(POSES_OF_A_SEARCH), theta, decades)
-        best = rough and _search(problem, rough.theta, (0,))
+        kept = problem.fitted[:: -(-len(problem.fitted) // POSES_OF_A_SEARCH)]
+        thinned = replace(problem, history=tuple(problem.history[k] for k in kept))
+        rough = _search(thinned, theta, decades)
+        best = rough and _search(problem, rough.point.theta, (0,))
     return best or _search(problem, theta, decades)
 
 
-def _refined(problem: BatchProblem, near: Point) -> Fit:
-    """A minimum with noise, roughness and scatters estimated."""
-    return Fit(*refine(problem, near, estimate=not problem.noise.known, first=True))
-
-
-def _misfits(problem: BatchProblem, point: Point) -> bool:
-    """Whether a point leaves more than MISFIT."""
-    rms = Fit(problem, point, converged=False).residual_rms
-    return rms > MISFIT * problem.unknowns.model.cable.length
+def _misfits(fit: Fit) -> bool:
+    """Whether a fit leaves more than MISFIT."""
+    return fit.residual_rms > MISFIT * fit.model.cable.length
 
 
 def _search(
-    problem: BatchProblem,
+    problem: Problem,
     theta: FloatArray,
     decades: Sequence[float],
     rolls: Sequence[float] = ROLLS,
     *,
     either_way: bool = False,
-) -> Point | None:
+) -> Fit | None:
     """The best of the minima that the starts over decades of stiffness lead to.
 
     In space the search takes the points for less sure than they are: where an effect is missing,
     shapes that are held to a fraction of a millimetre allow no way to the minimum.
     """
-    loosely = problem.noise.doubted(SEARCH_STD * problem.unknowns.model.cable.length)
-    if not problem.unknowns.model.in_space or loosely is problem.noise:
-        return _best(problem, theta, decades, rolls, either_way=either_way)
-    rest = problem.rest_scatter
-    loose = problem.changed(loosely, problem.roughness_std, problem.scatter, rest)
-    found = _best(loose, theta, decades, rolls, either_way=either_way)
-    if found is None:
-        return None
-    return problem.taken_over(found)
+    model, noise = problem.unknowns.model, problem.noise
+    loosely = noise.doubted(SEARCH_STD * model.cable.length) if model.in_space else noise
+    begun = replace(problem, noise=loosely)
+    starts: list[Fit] = []
+    for tried in (decades, BETWEEN_DECADES):
+        starts = starts or starting_points(begun, theta, tried, rolls, either_way=either_way)
+    found = fit_from(starts)
+    return found if found is None or loosely is noise else found.reweighed(noise)
 
 
-def _fit_to_misfit(problem: BatchProblem, near: Point) -> Fit:
+def fit_from(starts: Sequence[Fit]) -> Fit | None:
+    """The best minimum that some starts lead to, the most promising first."""
+    best: Fit | None = None
+    for start in starts:
+        found = descend(start, STEPS_OF_A_RIVAL if best else 40, tolerance=1e-2)
+        if best is None or _better(found, best):
+            best = found
+        elif abs(found.point.objective - best.point.objective) < 1.0:
+            break
+    return best
+
+
+def _better(fit: Fit, other: Fit) -> bool:
+    """Whether a minimum is clearly lower than another, or only the other's GJ over EI is odd."""
+    odd, others = (one.problem.unknowns.odd_ratio(one.point.theta) for one in (fit, other))
+    return others if odd != others else fit.point.objective < other.point.objective - 0.5
+
+
+def _fit_to_misfit(near: Fit) -> Fit:
     """Fit a model that lacks something, its points taken for no surer than it can meet them.
 
     Where an effect is missing, a fit to a fraction of a millimetre bends all that it may bend and
     ends in folds of single poses.
     """
-    model, known = problem.unknowns.model, problem.noise
-    noise = replace(known.doubted(MISFIT_STD * model.cable.length), source="misfit", before=known)
-    scatter = problem.tolerances.deviation(model.node)
-    loose = problem.changed(noise, ROUGHNESS_START, scatter, RestScatter())
-    point = loose.taken_over(near)
-    return Fit(loose, *loose.descend(point))
+    doubted = near.noise.doubted(MISFIT_STD * near.model.cable.length)
+    noise = replace(doubted, source="misfit", before=near.noise)
+    return descend(near.reweighed(noise, _first_priors(near)))
+
+
+def _first_priors(fit: Fit) -> Priors:
+    return Priors.of(fit.problem.priors.tolerances, fit.model)
 
 
 def fitted_closely(fit: Fit) -> Fit:
@@ -247,73 +248,18 @@ def fitted_closely(fit: Fit) -> Fit:
     EstimationError
         If the points are hardly more than the unknowns that they determine.
     """
-    problem, known = fit.problem, fit.noise.before
+    known = fit.noise.before
     assert known is not None
-    length = fit.model.cable.length
     # Through the scale of the search: at the noise a first step would bend all that is left.
-    loosely = known.doubted(SEARCH_STD * length)
-    loose = problem.changed(loosely, problem.roughness_std, problem.scatter, problem.rest_scatter)
-    near, _ = loose.descend(loose.taken_over(fit.point), STEPS_OF_A_RIVAL, tolerance=1e-2)
-    if _misfits(loose, near):
+    loosely = known.doubted(SEARCH_STD * fit.model.cable.length)
+    near = descend(fit.reweighed(loosely), STEPS_OF_A_RIVAL, tolerance=1e-2)
+    if _misfits(near):
         return fit
-    scatter = problem.tolerances.deviation(fit.model.node)
-    tight = problem.changed(known, ROUGHNESS_START, scatter, RestScatter())
-    closely = _refined(tight, tight.taken_over(near))
-    return fit if _misfits(closely.problem, closely.point) else closely
+    closely = refine(near.reweighed(known, _first_priors(near)), first=True)
+    return fit if _misfits(closely) else closely
 
 
-def _best(
-    problem: BatchProblem,
-    theta: FloatArray,
-    decades: Sequence[float],
-    rolls: Sequence[float] = ROLLS,
-    *,
-    either_way: bool = False,
-) -> Point | None:
-    """Descend from the most promising starts."""
-    points: list[Point] = []
-    for tried in (decades, BETWEEN_DECADES):
-        points = points or starting_points(problem, theta, tried, rolls, either_way=either_way)
-    best: Point | None = None
-    for point in points:
-        steps = STEPS_OF_A_RIVAL if best else 40
-        candidate, _ = problem.descend(point, steps, tolerance=1e-2)
-        if best is None or _better(problem, candidate, best):
-            best = candidate
-        elif abs(candidate.objective - best.objective) < 1.0:
-            break
-    return best
-
-
-def _better(problem: BatchProblem, point: Point, other: Point) -> bool:
-    """Whether a minimum is clearly lower than another, or only the other's GJ over EI is odd."""
-    odd, others = (problem.unknowns.odd_ratio(one.theta) for one in (point, other))
-    return others if odd != others else point.objective < other.objective - 0.5
-
-
-def _continue(
-    unknowns: Unknowns,
-    measured: Sequence[MeasuredPose],
-    start: Fit,
-    max_iterations: int = 40,
-) -> Fit:
-    """Fit a similar model from the minimum of another one, with the noise found there."""
-    model = unknowns.model
-    known = np.array([name in start.model.names for name in model.names])
-    p = np.where(known & unknowns.free, start.values_in(model), unknowns.fixed)
-    unknowns = replace(unknowns, fixed=p)
-    theta = unknowns.pack(p, start.coefficients)
-    problem = start.problem.of(unknowns, measured)
-    shapes, solved = problem.equilibria.solve(
-        carried_shapes(problem, start), p, unknowns.rest(theta)
-    )
-    if not solved.all():
-        raise EstimationError("the shapes of the first fit are no equilibria of the second model")
-    projections = carried_projections(problem, start)
-    problem.share_weights(start.problem)
-    point = problem.evaluate(theta, shapes, projections)
-    point, converged = problem.descend(point, max_iterations)
-    return Fit(problem, point, converged)
+# ---- meshes ------------------------------------------------------------------------------------
 
 
 def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
@@ -324,28 +270,73 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     modes : int
         Slow displacements kept out of the noise estimate, if the noise is estimated.
     """
-    problem = fit.problem
-    model = fit.model.with_mesh(n)
-    unknowns = replace(problem.unknowns, model=model)
-    moved = None
+    model, moved = fit.model.with_mesh(n), None
     with suppress(EstimationError):
-        moved = _continue(unknowns, problem.history, fit)
+        moved = refit(fit, model)
     if moved is None or moved.point.objective > STUCK * fit.point.objective:
         # The coarse mesh was too far off, or a pose loses its stability on the way to this one, so
         # that no step leads on: start again from the measured shapes.
-        names = [name for name, free in zip(model.names, unknowns.free, strict=True) if free]
-        known = fit.noise.before or fit.noise
-        std = known.std if known.source == "declared" else None
+        problem, known = fit.problem, fit.noise.before or fit.noise
         return fit_model(
             model,
             problem.history,
-            problem.tolerances,
-            std,
-            free=names,
+            problem.priors.tolerances,
+            known.std if known.source == "declared" else None,
+            free=problem.unknowns.names,
             values=fit.p,
             readings=known.readings,
         )
-    problem, point, converged = refine(
-        moved.problem, moved.point, estimate=not fit.noise.known, rounds=2, modes=modes
-    )
-    return Fit(problem, point, converged)
+    return refine(moved, rounds=2, modes=modes)
+
+
+def mesh_error(fit: Fit) -> float:
+    """Largest RMS distance [m] between a pose on this mesh and on an infinitely fine one.
+
+    The difference to the mesh of half the element size, times 4/3: the error falls at least with
+    the square of the element size (Richardson). Infinite if the fitted parameters have no
+    equilibria nearby on the finer mesh.
+    """
+    model = fit.model.with_mesh(2 * fit.model.n)
+    equilibria = BatchEquilibrium(model, [item.pose for item in fit.problem.measured])
+    state = fit.p, model.rest_basis @ fit.coefficients
+    start = on_other_mesh(fit.point.shapes, fit.model, model)
+    shapes, converged = equilibria.solve(start, *state)
+    if not converged.all():
+        return float("inf")
+    fine = equilibria.seen(shapes, *state)
+    places = np.linspace(0.0, fit.model.cable.length, 101)
+    worst = 0.0
+    for true, seen in zip(fine, fit.problem.observed(fit.point), strict=True):
+        gap = true.curve.at(places) - seen.curve.at(places)
+        worst = max(worst, float(np.sqrt((gap**2).sum(axis=1).mean())))
+    return 4 / 3 * worst
+
+
+def fine_enough(
+    fit: Fit, n: int, modes: int = SMOOTH_MODES, finest: int = FINEST_MESH
+) -> tuple[Fit, float]:
+    """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
+
+    Where an effect is missing, the mesh need not be much finer than what is missing.
+    """
+    while True:
+        if fit.noise.source == "misfit":
+            return fit, mesh_error(fit)
+        if n != fit.model.n:
+            fit = refine_mesh(fit, n, modes)
+        error = mesh_error(fit)
+        largest = finest if np.isfinite(error) else SEARCH_MESH
+        allowed = allowed_mesh_error(fit)
+        if error <= allowed or n >= largest:
+            return fit, error
+        # Even; carefully: as if half of what lies above the second order were lost on a coarse
+        # mesh.
+        order = 1 + ELEMENTS[fit.model.element].order / 2
+        finer = n * np.clip((error / allowed) ** (1 / order), 1.2, 2.0)
+        n = min(2 * int(np.ceil(finer / 2)), largest)
+
+
+def allowed_mesh_error(fit: Fit) -> float:
+    """Error of the mesh [m] that is far below the noise, or below what else is left."""
+    left = LACKING_SHARE if fit.beyond_noise else MESH_SHARE
+    return max(MESH_SHARE * fit.compared_std, left * fit.residual_rms)

@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.guesses import line_nodes
 from dlo_casadi.equilibrium.pose import Pose, PoseBranch
 from dlo_casadi.equilibrium.solve import continued, solve_equilibria, ways_of
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.estimation.gauss_newton import BatchProblem
+from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -155,14 +155,13 @@ def _seen(
     ]
 
 
-def predicted_shapes(
-    problem: BatchProblem, shapes: Shapes, p: FloatArray, rest: FloatArray
-) -> Shapes:
+def predicted_shapes(problem: Problem, values: Values) -> Shapes:
     """Shapes of a problem's poses as a user is told them, who knows their ends alone.
 
     Where there is no prediction, or one on the other side (see `CableModel.tipped_by`), they are
-    those of `shapes`. A prediction takes 3 ms in the plane.
+    those of `values`. A prediction takes 3 ms in the plane.
     """
+    shapes, p, rest = problem.state(values)
     model, history = problem.unknowns.model, [item.pose for item in problem.history]
     predictions = predict_poses(model, p, rest, history)
     poses = [history[index] for index in problem.indices]

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
-from dlo_casadi.estimation.linearization import Point
+from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES
@@ -54,14 +55,14 @@ def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
     noise, is the length in its weights of a systematic error of SYSTEMATIC_SHARE in all points.
     """
     square = 0.0
-    for j in fit.problem.used:
+    for j, white in zip(fit.problem.used, fit.problem.whitening, strict=True):
         if fit.noise.source != "declared":
             break
         item = fit.problem.measured[j]
         constant = np.zeros(item.n_residuals)
         constant[item.on_points] = item.relative_std[item.point_of]
         constant *= SYSTEMATIC_SHARE * fit.noise.std
-        square += float(((fit.problem.whitening(j) @ constant) ** 2).sum())
+        square += float(((white @ constant) ** 2).sum())
     return (student_95(fit, name) + np.sqrt(square)) ** 2 * fit.inflation**2
 
 
@@ -182,23 +183,18 @@ class _Profile:
         others = np.array([other != self.name for other in model.names]) & found.free
         p = self.fit.p.copy()
         p[model.names.index(self.name)] *= np.exp(place)
-        return Unknowns(model, others, p, found.rest_free)
+        return Unknowns(model, others, p)
 
     def refitted(self, place: float, near: _Refit) -> _Refit | None:
         """Hold the parameter at a place, from a neighbour; None without equilibria there."""
         fit, k = self.fit, self._k
         base = 2 * fit.point.objective - fit.problem.unknowns.own_prior(fit.point.theta, k)
-        unknowns = self._held(place)
-        problem = fit.problem.of(unknowns, equilibria=fit.problem.equilibria)
-        problem.share_weights(fit.problem)
+        problem = replace(fit.problem, unknowns=self._held(place))
         for theta in (self._along(place, near), near.point.theta):
-            shapes, converged = problem.equilibria.solve(
-                near.point.shapes, unknowns.p(theta), unknowns.rest(theta)
-            )
-            if converged.all():
-                start = problem.evaluate(theta, shapes, near.point.projections)
-                point, _ = problem.descend(start, tolerance=1e-2)
-                return _Refit(place, point, 2 * point.objective - base)
+            point = problem.balanced(replace(near.point, theta=theta))
+            if point is not None:
+                found = descend(Fit(problem, point), tolerance=1e-2)
+                return _Refit(place, found.point, 2 * found.point.objective - base)
         return None
 
     def _along(self, place: float, near: _Refit) -> FloatArray:

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
-from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
-from dlo_casadi.estimation.linearization import Linearization, Normal, Point
+from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.estimation.problem import (
+    NO_INFORMATION,
+    Linearization,
+    Normal,
+    Point,
+    Priors,
+    Problem,
+)
+from dlo_casadi.estimation.repeats import different_poses, hanging_std
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import LEAST_NOISE_DEGREES
+from dlo_casadi.thresholds import DIFFERENT, LEAST_NOISE_DEGREES
 
 FloatArray = NDArray[np.floating]
 
@@ -25,16 +34,26 @@ class Fit:
 
     Parameters
     ----------
-    problem : BatchProblem
+    problem : Problem
         With the noise and the roughness found.
     point : Point
-        Unknowns, shapes and objective at the minimum.
+        Unknowns, shapes and objective at the minimum, or on the way there.
     converged : bool
     """
 
-    problem: BatchProblem
+    problem: Problem
     point: Point
-    converged: bool
+    converged: bool = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is cached: another process computes it again, with the same rounding."""
+        return {"problem": self.problem, "point": self.point, "converged": self.converged}
+
+    def reweighed(self, noise: NoiseModel | None = None, priors: Priors | None = None) -> Fit:
+        """The same point under another noise or other priors, with the weights there."""
+        noise, priors = noise or self.noise, priors or self.problem.priors
+        problem = replace(self.problem, noise=noise, priors=priors).weighed(self.point)
+        return Fit(problem, problem.evaluate(self.point))
 
     @property
     def model(self) -> CableModel:
@@ -56,12 +75,12 @@ class Fit:
     def beyond_noise(self) -> bool:
         """Whether more is left than noise: chi-square by two standard deviations, or a scatter."""
         excess = 2 * np.sqrt(2 / self.degrees_of_freedom)
-        return self.problem.rest_scatter.std > 0 or self.chi2_per_dof > 1 + excess
+        return self.problem.priors.rest_scatter.std > 0 or self.chi2_per_dof > 1 + excess
 
     @property
     def errors_known(self) -> bool:
         """Whether nothing of what the residuals are held against was estimated from them."""
-        return self.noise.known and self.problem.rest_scatter.std == 0
+        return self.noise.known and self.problem.priors.rest_scatter.std == 0
 
     @property
     def p(self) -> FloatArray:
@@ -143,23 +162,20 @@ class Fit:
         for k, (taken, b) in enumerate(
             zip(self._taken, self.linearization.by_deviation, strict=True)
         ):
-            own = ((taken @ self.covariance) * taken).sum(axis=1)
-            if b.shape[1]:
-                block = self.normal.inner[k][0]
-                own += (b * np.linalg.solve(block, b.T).T).sum(axis=1)
-            out.append(own)
+            own = (b * np.linalg.solve(self.normal.inner[k][0], b.T).T).sum(axis=1)
+            out.append(((taken @ self.covariance) * taken).sum(axis=1) + own)
         return out
 
     @property
     def _taken(self) -> list[FloatArray]:
         """Whitened residuals (R_j, size) by theta, each pose's own deviations following."""
-        lin, out = self.linearization, []
-        for k, (a, b) in enumerate(zip(lin.by_theta, lin.by_deviation, strict=True)):
-            if b.shape[1]:
-                block, cross, _ = self.normal.inner[k]
-                a = a - b @ np.linalg.solve(block, cross)
-            out.append(a)
-        return out
+        lin = self.linearization
+        return [
+            a - b @ np.linalg.solve(block, cross)
+            for a, b, (block, cross, _) in zip(
+                lin.by_theta, lin.by_deviation, self.normal.inner, strict=True
+            )
+        ]
 
     def variance_degrees(self, name: str) -> float:
         """Degrees of freedom with which the variance of a parameter's estimate is known.
@@ -174,7 +190,7 @@ class Fit:
         ----------
         Satterthwaite, Biometrics Bulletin 2 (1946).
         """
-        problem, rest = self.problem, self.problem.rest_scatter
+        problem, rest = self.problem, self.problem.priors.rest_scatter
         index = problem.unknowns.names.index(name)
         column = self.covariance[index]
         errors, hangings = 0.0, 0.0
@@ -182,7 +198,7 @@ class Fit:
             by_errors = taken @ column
             errors += float(by_errors @ by_errors)
             if rest.std > 0:
-                way = problem.whitening(problem.used[k]) @ self._moved_by_rest[k]
+                way = problem.whitening[k] @ self._moved_by_rest[k]
                 sizes = np.tile(rest.sizes, way.shape[1] // len(rest.sizes))
                 hangings += float(((by_errors @ way * sizes) ** 2).sum())
         parts = ((errors - hangings) ** 2 / self.noise.slow_dof + hangings**2 / rest.dof) / column[
@@ -248,9 +264,9 @@ class Fit:
     def _by_rest(self) -> list[FloatArray]:
         """Variance (R_j,) of each residual by the rest curvature of each hanging's own."""
         problem = self.problem
-        if problem.rest_scatter.std == 0:
+        if problem.priors.rest_scatter.std == 0:
             return [np.zeros(len(raw)) for raw in self.linearization.raw]
-        sizes = problem.rest_scatter.sizes
+        sizes = problem.priors.rest_scatter.sizes
         return [
             ((way * np.tile(sizes, way.shape[1] // len(sizes))) ** 2).sum(axis=1)
             for way in self._moved_by_rest
@@ -258,8 +274,7 @@ class Fit:
 
     @cached_property
     def _moved_by_rest(self) -> list[FloatArray]:
-        point = self.point
-        return self.problem.moved_by_rest(point.theta, point.shapes, point.projections)
+        return self.problem.moved_by_rest(self.point)
 
     @property
     def _on_points(self) -> list[NDArray[np.bool_]]:
@@ -324,9 +339,7 @@ class Fit:
         if name not in unknowns.names:
             return 0.0
         k = unknowns.names.index(name)
-        slope = unknowns.scales[k]
-        if name in self.model.names:
-            slope = unknowns.slopes(self.point.theta)[self.model.names.index(name), k]
+        slope = unknowns.derivatives(self.point.theta)[k]
         return float(abs(slope) * np.sqrt(self.inflated_covariance[k, k]))
 
     @property
@@ -336,10 +349,7 @@ class Fit:
         The unknowns are scaled or logarithmic: C = D C_theta D with D = dp/dtheta.
         """
         unknowns = self.problem.unknowns
-        slopes = unknowns.scales.copy()
-        by_theta = unknowns.slopes(self.point.theta)
-        for k, name in enumerate(unknowns.names[: unknowns.n_parameters]):
-            slopes[k] = by_theta[self.model.names.index(name), k]
+        slopes = unknowns.derivatives(self.point.theta)
         scaled = self.inflated_covariance * np.outer(slopes, slopes)
         return unknowns.names, np.asarray((scaled + scaled.T) / 2)
 
@@ -360,7 +370,7 @@ class Fit:
     @cached_property
     def stable(self) -> NDArray[np.bool_]:
         """Whether each pose is a stable equilibrium at the fitted parameters."""
-        return self.problem.equilibria.stable(self.point.shapes, self.p, self.rest)
+        return self.problem.equilibria.stable(*self.problem.state(self.point))
 
     @cached_property
     def log_evidence(self) -> float:
@@ -375,9 +385,25 @@ class Fit:
         prior = float(np.log(eigen[eigen > 1e-12]).sum())
         values = np.linalg.eigvalsh(self.normal.hessian)
         hessian = float(np.log(np.maximum(values, 1.0)).sum())
-        white = sum(float(np.linalg.slogdet(problem.whitening(j))[1]) for j in problem.used)
+        white = sum(float(np.linalg.slogdet(weight)[1]) for weight in problem.whitening)
         inner = sum(
             float(np.linalg.slogdet(block)[1]) + 2 * float(np.log(problem.deviation_std).sum())
             for block, _, _ in self.normal.inner
         )
         return -self.point.objective + (prior - hessian - inner) / 2 + white
+
+
+def uncertainty_of(fit: Fit) -> Uncertainty:
+    """What makes predictions from a fit uncertain.
+
+    How far repeats of a pose differ beyond the noise of their points holds fixtures that hold them
+    differently, too. Where many poses differ, the rest curvature of each repeat's own tells it.
+    """
+    names, covariance = fit.named_covariance
+    used = [fit.model.deviation_names[k] for k in fit.problem.equilibria.used_deviations]
+    scatter = dict(zip(used, map(float, fit.problem.deviation_std), strict=True))
+    history, length = fit.problem.history, fit.model.cable.length
+    apart = 0.0
+    if different_poses(history, length) < DIFFERENT:
+        apart = hanging_std(history, length, fit.noise.of_points.beside_hangings)
+    return Uncertainty(names, covariance, scatter, fit.problem.priors.rest_scatter, apart)

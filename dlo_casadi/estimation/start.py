@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
 from dlo_casadi.equilibrium.guesses import first_nodes, line_nodes
-from dlo_casadi.estimation.gauss_newton import NO_INFORMATION, BatchProblem
-from dlo_casadi.estimation.linearization import Point, Values
+from dlo_casadi.estimation.problem import NO_INFORMATION, Problem, Values
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import Vector
@@ -35,7 +34,7 @@ RISE, PART = 1.5, 0.3
 
 
 def measured_shapes(
-    problem: BatchProblem, roll: float = 0.0, turns: FloatArray | None = None
+    problem: Problem, roll: float = 0.0, turns: FloatArray | None = None
 ) -> tuple[Shapes, list[FloatArray]]:
     """Shapes of all poses: along the measured line where there is one, guessed elsewhere.
 
@@ -85,7 +84,7 @@ def measured_shapes(
 
 
 def turned_either_way(
-    problem: BatchProblem, guess: Guess, held: NDArray[np.bool_], roll: float
+    problem: Problem, guess: Guess, held: NDArray[np.bool_], roll: float
 ) -> Guess:
     """A guess whose poses are twisted the other way round where that fits better.
 
@@ -120,7 +119,7 @@ def turned_either_way(
 
 
 def _kinematics(
-    problem: BatchProblem, equilibria: BatchEquilibrium, x: FloatArray, roll: float
+    problem: Problem, equilibria: BatchEquilibrium, x: FloatArray, roll: float
 ) -> tuple[Shapes, list[FloatArray], list[float]]:
     """Shapes from nodes x on, arc lengths of the points, and what is left of each (used,) [m^2]."""
     model, used = problem.unknowns.model, problem.used
@@ -238,7 +237,7 @@ class _Step:
 
 
 def all_at_once(
-    problem: BatchProblem, guess: Guess, held: NDArray[np.bool_], iterations: int
+    problem: Problem, guess: Guess, held: NDArray[np.bool_], iterations: int
 ) -> Guess | None:
     """Gauss-Newton on shapes, multipliers and unknowns together, from inconsistent values.
 
@@ -273,7 +272,7 @@ def all_at_once(
     return None if last is None else last[0]
 
 
-def _moved(problem: BatchProblem, guess: Guess, step: _Step, share: float) -> Guess:
+def _moved(problem: Problem, guess: Guess, step: _Step, share: float) -> Guess:
     """A share of a step; multipliers, unknown at first, take the whole of theirs."""
     deviation = guess.shapes.deviation + share * step.deviation
     change = Vector(share * step.shapes.x, step.shapes.y)
@@ -281,21 +280,21 @@ def _moved(problem: BatchProblem, guess: Guess, step: _Step, share: float) -> Gu
     return Guess(guess.theta + share * step.theta, shapes, guess.projections)
 
 
-def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step | None:
+def _step(problem: Problem, guess: Guess, held: NDArray[np.bool_]) -> _Step | None:
     """Where the linearised balance and residuals lead; None where matrices are singular."""
     unknowns, equilibria = problem.unknowns, problem.equilibria
     theta, shapes = guess.theta, guess.shapes
     columns, moving = equilibria.used_deviations, ~held
     own = np.diag(1 / problem.deviation_std**2 + 1e-12)
-    p, rest = unknowns.p(theta), unknowns.rest(theta)
+    state = problem.state(guess)
     try:
-        along = equilibria.directions(shapes, p, rest, unknowns.slopes(theta), unknowns.rest_slopes)
-        force = equilibria.imbalance(shapes, p, rest)
+        along = equilibria.directions(*state, unknowns.slopes(theta), unknowns.rest_slopes)
+        force = equilibria.imbalance(*state)
         assert along.tangent is not None
         correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
     except np.linalg.LinAlgError:
         return None
-    projections = problem.located(problem.observed(theta, shapes), guess.projections)
+    projections = problem.located(guess, problem.observed(guess))
     ahead = problem.linearize_along(replace(guess, projections=projections), along, correction)
     gap = theta - problem.mean
     hessian, gradient = problem.precision.copy(), problem.precision @ gap
@@ -328,13 +327,3 @@ def _step(problem: BatchProblem, guess: Guess, held: NDArray[np.bool_]) -> _Step
     if not (0 <= objective < np.inf and np.all(np.isfinite(change.x))):
         return None
     return _Step(objective, step, change, deviation, projections)
-
-
-def equilibria_near(problem: BatchProblem, guess: Guess) -> Point | None:
-    """Equilibria of all poses near a guess; None if some pose has none there."""
-    p, rest = problem.unknowns.p(guess.theta), problem.unknowns.rest(guess.theta)
-    shapes, converged = problem.equilibria.settled(guess.shapes, p, rest, max_iterations=40)
-    if not converged.all():
-        return None
-    point = problem.evaluate(guess.theta, shapes, guess.projections)
-    return point if np.isfinite(point.objective) else None

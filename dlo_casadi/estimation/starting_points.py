@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.linearization import Point
+from dlo_casadi.estimation.problem import Point, Problem, Values
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import (
     Guess,
     all_at_once,
-    equilibria_near,
     measured_shapes,
     turned_either_way,
 )
@@ -34,36 +33,41 @@ DESCENTS, ALIKE = 3, 1e-2
 
 
 def starting_points(
-    problem: BatchProblem,
+    problem: Problem,
     theta: FloatArray,
     decades: Sequence[float] = DECADES,
     rolls: Sequence[float] = ROLLS,
     *,
     either_way: bool = False,
-) -> list[Point]:
+) -> list[Fit]:
     """Equilibria near the measured shapes for stiffnesses over decades, best first.
+
+    Where the problem has no weights yet, they are taken at the first shapes.
 
     Starts take a few iterations, then the most promising take more, until as many as are
     descended from have led to equilibria. Where none has, no decade is left out. `either_way`: see
     `turned_either_way`.
     """
     for whole in (False, True):
-        guesses = _guesses(problem, theta, decades, rolls, either_way=either_way, whole=whole)
+        problem, guesses = _guesses(
+            problem, theta, decades, rolls, either_way=either_way, whole=whole
+        )
         found = _equilibria(problem, guesses)
         if found:
             break
-    return sorted(found, key=lambda point: point.objective)
+    ranked = sorted(found, key=lambda point: point.objective)
+    return [Fit(problem, point) for point in ranked]
 
 
 def _guesses(
-    problem: BatchProblem,
+    problem: Problem,
     theta: FloatArray,
     decades: Sequence[float],
     rolls: Sequence[float],
     *,
     either_way: bool,
     whole: bool,
-) -> list[Guess]:
+) -> tuple[Problem, list[Guess]]:
     """Starts after a few iterations, each roll's over decades of stiffness; see `_outwards`."""
     names = problem.unknowns.names
     rolls = rolls if END_ROLL in names else (0.0,)
@@ -71,8 +75,8 @@ def _guesses(
     guesses: list[Guess] = []
     for roll in rolls:
         shapes, projections = measured_shapes(problem, roll)
-        if not problem.has_weights:
-            problem.refresh(theta, shapes, projections)
+        if problem.weights is None:
+            problem = problem.weighed(Values(theta, shapes, projections))
         rolled = theta.copy()
         if roll:
             own = names.index(END_ROLL)
@@ -83,11 +87,11 @@ def _guesses(
             shapes, projections = turned.shapes, turned.projections
         near = Guess(rolled, shapes, projections)
         guesses += _outwards(problem, near, held, decades, whole=whole)
-    return guesses
+    return problem, guesses
 
 
 def _outwards(
-    problem: BatchProblem,
+    problem: Problem,
     near: Guess,
     held: NDArray[np.bool_],
     decades: Sequence[float],
@@ -117,7 +121,7 @@ def _outwards(
     return list(found.values())
 
 
-def _held(problem: BatchProblem) -> NDArray[np.bool_]:
+def _held(problem: Problem) -> NDArray[np.bool_]:
     """Entries of theta that starts leave where they are: all but the rest shape.
 
     And the roll of a cable in its end clamp, which is as unknown.
@@ -127,7 +131,7 @@ def _held(problem: BatchProblem) -> NDArray[np.bool_]:
     return held & np.array([name != END_ROLL for name in names])
 
 
-def _equilibria(problem: BatchProblem, guesses: Sequence[Guess]) -> list[Point]:
+def _equilibria(problem: Problem, guesses: Sequence[Guess]) -> list[Point]:
     """Equilibria that the most promising guesses lead to."""
     held, found = _held(problem), list[Point]()
     for guess in _promising(guesses):
@@ -135,7 +139,7 @@ def _equilibria(problem: BatchProblem, guesses: Sequence[Guess]) -> list[Point]:
             break
         more = all_at_once(problem, guess, held, MORE) if problem.unknowns.model.in_space else None
         for one in (more, guess):
-            point = None if one is None else equilibria_near(problem, one)
+            point = None if one is None else problem.balanced(one, max_iterations=40)
             if point is not None:
                 found.append(point)
                 break

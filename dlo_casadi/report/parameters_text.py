@@ -15,8 +15,7 @@ from dlo_casadi.config import Config, dump_yaml
 from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.errors import DloError
-from dlo_casadi.estimation.band import uncertainty_of
-from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.io.parameters import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.report.json_report import finite

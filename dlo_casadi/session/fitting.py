@@ -15,14 +15,13 @@ from dlo_casadi.diagnosis.candidates import setup_of
 from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError, EstimationError
 from dlo_casadi.estimation.batch import solve_batch
-from dlo_casadi.estimation.fit import fit_model, refine_mesh
-from dlo_casadi.estimation.gauss_newton import CONVERGED
-from dlo_casadi.estimation.hyperparameters import first_reading_noise, refine
-from dlo_casadi.estimation.linearization import Point
-from dlo_casadi.estimation.mesh import fine_enough, mesh_error
+from dlo_casadi.estimation.descent import CONVERGED, descend, least_decrease
+from dlo_casadi.estimation.fit import fine_enough, fit_model, mesh_error, refine_mesh
 from dlo_casadi.estimation.prediction import predicted_shapes
+from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
+from dlo_casadi.estimation.variances import first_reading_noise, refine
 from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
 from dlo_casadi.paper.algorithm1 import Algorithm1Result, applies, run_algorithm1
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -237,7 +236,7 @@ def confirmed(fit: Fit, found: Minimum) -> Fit:
         return fit
     if point is None:
         return replace(fit, converged=False)
-    if point.objective < own - fit.problem.least_decrease(fit.point):
+    if point.objective < own - least_decrease(fit.problem, fit.point):
         return Fit(fit.problem, point, converged=True)
     same = point.objective <= own + SAME_MINIMUM * abs(own)
     return replace(fit, converged=True) if same and not fit.converged else fit
@@ -360,20 +359,13 @@ def _from_simpler(fit: Fit, stiffness: float, better: bool) -> Fit:
     values = model.nominal.copy()
     values[model.stiffness_indices] *= stiffness / values[0]
     theta = problem.unknowns.pack(values, np.zeros(model.n_coefficients))
-    p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
-    shapes, known = problem.equilibria.settled(fit.point.shapes, p, rest)
-    if not known.all() and better:
-        predicted = predicted_shapes(problem, fit.point.shapes, p, rest)
-        shapes, known = problem.equilibria.settled(predicted, p, rest)
-    if not known.all():
+    start = replace(fit.point, theta=theta)
+    point = problem.balanced(start)
+    if point is None and better:
+        point = problem.balanced(replace(start, shapes=predicted_shapes(problem, start)))
+    if point is None or (not better and point.objective >= fit.point.objective):
         return fit
-    point = problem.evaluate(theta, shapes, fit.point.projections)
-    if not better and point.objective >= fit.point.objective:
+    found = descend(Fit(problem, point))
+    if found.point.objective > fit.point.objective - CONVERGED:
         return fit
-    point, converged = problem.descend(point)
-    if point.objective > fit.point.objective - CONVERGED:
-        return fit
-    if fit.noise.source == "misfit":
-        return Fit(problem, point, converged)
-    problem, point, converged = refine(problem, point, estimate=not fit.noise.known)
-    return Fit(problem, point, converged)
+    return found if fit.noise.source == "misfit" else refine(found)

@@ -276,7 +276,7 @@ class Repeatability:
     @classmethod
     def of(cls, fit: Fit) -> Self:
         """What a fit has found."""
-        rest = fit.problem.rest_scatter.std
+        rest = fit.problem.priors.rest_scatter.std
         if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
             return cls(rest, float(np.sqrt(2) * fit.hanging_error), "poses")
         spread = repeatability(fit.problem.history, fit.model.cable.length)

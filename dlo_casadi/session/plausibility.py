@@ -264,7 +264,7 @@ def wrong_readings(session: Session) -> tuple[Suspicion, ...]:
     fit = coarse_fit(replace(session, read=tuple(shown))) if shown else None
     if fit is None:
         return ()
-    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    seen = fit.problem.observed(fit.point)
     rows = reaction_rows(fit.model.node)
     compared = []
     for name, at in rows.items():

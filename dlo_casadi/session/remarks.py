@@ -12,7 +12,7 @@ from dlo_casadi.diagnosis.hidden_weight import HiddenWeight
 from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
 from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.errors import counted
-from dlo_casadi.estimation.mesh import allowed_mesh_error
+from dlo_casadi.estimation.fit import allowed_mesh_error
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
@@ -272,7 +272,7 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
             f"the model misses the points by {1e3 * fit.residual_rms:.2g} mm RMS, far more than "
             f"their noise: the fit weighs them as if that were {1e3 * fit.noise.std:.2g} mm"
         )
-    rest = fit.problem.rest_scatter
+    rest = fit.problem.priors.rest_scatter
     if rest.std > 0:
         lines.append(
             "the cable does not come back to the same shape: two hangings of a pose differ by "
@@ -325,7 +325,7 @@ def _beside(fit: Fit, floor: float) -> str:
 
 def _scatter(fit: Fit) -> str:
     """How far the poses' fixtures are from their declared places, one standard deviation."""
-    scatter = dict(zip(fit.model.deviation_names, fit.problem.scatter, strict=True))
+    scatter = dict(zip(fit.model.deviation_names, fit.problem.priors.scatter, strict=True))
     # All components of a position, or of a turn, share one scatter.
     place, turn = fit.model.node.axes[0], fit.model.node.turns[0]
     parts = {

@@ -13,7 +13,6 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
 from dlo_casadi.equilibrium.tipping import sides_of, tipping_of
-from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.branches import EnergyGap
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
@@ -24,7 +23,7 @@ from dlo_casadi.estimation.prediction import (
     rms_distance,
 )
 from dlo_casadi.estimation.profile import Interval
-from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.paper.algorithm1 import Algorithm1Result

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from dlo_casadi import CableModel, DloError
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.hyperparameters import settle
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.report.canvas import BLACK, BLUE
@@ -87,7 +87,7 @@ def draw(rng: np.random.Generator) -> Truth:
             p[k] += q.prior_std * rng.standard_normal()
     roughness = float(np.exp(rng.uniform(*np.log(ROUGHNESSES))))
     rest_only = Unknowns(model, np.zeros(len(p), dtype=bool), p)
-    factor = np.linalg.cholesky(rest_only.prior_precision(roughness))
+    factor = np.linalg.cholesky(rest_only.prior(roughness)[1])
     scaled = np.linalg.solve(factor.T, rng.standard_normal(len(factor)))
     deviation = np.zeros((len(published.poses()), len(deviation_names(Heading))))
     deviation[:, :2] = TOLERANCES.end * rng.standard_normal((len(deviation), 2))
@@ -135,14 +135,15 @@ def bound(fit: Fit, truth: Truth) -> tuple[float, FloatArray]:
     The inverse of the information of the data plus that of the prior (van Trees).
     """
     unknowns = fit.problem.unknowns
-    problem = BatchProblem(unknowns, fit.problem.history, truth.noise, TOLERANCES, truth.roughness)
+    priors = replace(Priors.of(TOLERANCES, fit.model), roughness_std=truth.roughness)
+    problem = Problem(unknowns, fit.problem.history, truth.noise, priors)
     theta = unknowns.pack(truth.p, truth.coefficients)
     start = Shapes(fit.point.shapes.x, fit.point.shapes.lam, truth.deviation)
     shapes, converged = problem.equilibria.solve(start, truth.p, unknowns.rest(theta))
     if not converged.all():
         raise DloError("the true parameters have no equilibria near the fitted ones")
-    problem.refresh(theta, shapes, fit.point.projections)
-    point = problem.evaluate(theta, shapes, fit.point.projections)
+    point = Values(theta, shapes, fit.point.projections)
+    problem = problem.weighed(point)
     hessian = problem.normal_equations(point, problem.linearize(point)).hessian
     covariance = np.linalg.inv(hessian)
     tail = slice(unknowns.n_parameters, unknowns.size)

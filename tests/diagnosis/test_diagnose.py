@@ -18,6 +18,7 @@ from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
 from dlo_casadi.effects import EFFECTS, BendingSoftening, LumpedMass
 from dlo_casadi.estimation.batch import solve_batch
+from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -104,7 +105,7 @@ def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
     values = larger.nominal.copy()
     for key, value in effect.items():
         values[larger.names.index(f"point_force.{key}")] = value
-    fit = fit_model(larger, measured, declared.tolerances, values=values, start=start)
+    fit = refit(start, larger, values=values)
     assert equivalents(fit, force, tried=()) == (untried,)
     assert equivalents(fit, force, tried=(untried,)) == ()
 
@@ -133,7 +134,7 @@ def test_the_score_predicts_the_gain_of_a_refit(session):
     listed = candidates(fit.model, setup_of(fit.model, n_poses=len(measured)))
     screened = {item.candidate.name: item for item in Screen(fit, listed).run(np.inf)}
     item = screened["gravity_tilt"]
-    larger = fit_model(item.candidate.add_to(fit.model), measured, declared.tolerances, start=fit)
+    larger = refit(fit, item.candidate.add_to(fit.model))
     gain = 2 * (fit.point.objective - larger.point.objective)
     # The session's misfit is large even for 50 mm of noise: curvature of the model, 15 %.
     assert gain == pytest.approx(item.score, rel=0.15)
@@ -156,13 +157,12 @@ def test_leaving_a_pose_out_in_one_step_is_close_to_fitting_again(session):
     assert quick.squares[0] / quick.counts[0] == pytest.approx(exact, rel=0.1)
 
 
-def test_the_place_of_a_mass_of_zero_stops_nothing(session, fit):
+def test_the_place_of_a_mass_of_zero_stops_nothing(fit):
     """It has no information at all: predictions are those without the mass."""
-    declared, measured = session
     model = fit.model.with_effect(LumpedMass())
     values = np.array([*fit.p, 0.0, 0.1])
     held = [*fit.model.names, "lumped_mass.position"]  # the mass stays at zero
-    same = fit_model(model, measured, declared.tolerances, start=fit, values=values, free=held)
+    same = refit(fit, model, values=values, free=held)
     here, there = cross_validate(fit), cross_validate(same)
     assert here.squares == pytest.approx(there.squares, rel=1e-3)  # two stops of the same descent
     assert Screen(same, candidates(model, setup_of(model, n_poses=6))).run(screening_degrees(same))

@@ -108,7 +108,7 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     """Forces k (a - r_j) at the places r_j of the poses' own shapes, by least squares."""
     fit = session("tether", *TETHER)
     stiffness, position, *anchor = TETHER
-    seen = fit.problem.observed(fit.point.theta, fit.point.shapes)
+    seen = fit.problem.observed(fit.point)
     places = [seen[j].curve.at(np.array([position]))[0] for j in fit.problem.used]
     pull = Pull(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), 0.0, fit)
     listed = {c.name: c for c in candidates(fit.model, setup_of(fit.model, n_poses=len(ENDS)))}

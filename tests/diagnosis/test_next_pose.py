@@ -45,7 +45,7 @@ def test_noise_that_is_one_for_the_whole_line_does_not_average():
 def test_a_reading_is_repeated_until_noise_and_bias_hide_no_difference(gap, times):
     """Noise of 0.15 N averages, a bias of 0.1 N does not: 3 sqrt(0.15^2 / n + 0.1^2) <= gap."""
     fit = SimpleNamespace(
-        problem=SimpleNamespace(tolerances=Tolerances(force_bias=0.1)),
+        problem=SimpleNamespace(priors=SimpleNamespace(tolerances=Tolerances(force_bias=0.1))),
         noise=NoiseModel(STD, readings=ReadingNoise(0.15, 0.1)),
         model=SimpleNamespace(node=Heading, names=()),
     )

@@ -13,7 +13,6 @@ from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.profile import threshold
-from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.rest_curvature import RestScatter
 from dlo_casadi.session.fitting import nuisances
@@ -73,13 +72,11 @@ def test_a_declared_noise_that_the_points_contradict(points, source):
 def test_how_well_the_variance_of_a_parameter_is_known():
     """Satterthwaite: shares are the slopes of the log of the variance, by differences."""
     fit = fitted(9)
-    problem = fit.problem
 
     def like(noise=1.0, rest=1.0, rest_dof=7.0):
         errors = replace(fit.noise, std=np.sqrt(noise) * fit.noise.std, slow_dof=30.0)
         scatter = RestScatter(np.sqrt(rest) * 0.2, 0.25, rest_dof)
-        other = problem.changed(errors, problem.roughness_std, problem.scatter, scatter)
-        return Fit(other, other.taken_over(fit.point), converged=True)
+        return fit.reweighed(errors, replace(fit.problem.priors, rest_scatter=scatter))
 
     def slope(name):
         more, less = (like(**{name: factor}).covariance[0, 0] for factor in (1.01, 0.99))
@@ -114,7 +111,8 @@ def test_fewer_points_than_unknowns():
 
 def test_an_effect_that_leaves_no_point_over_is_not_significant():
     fit = fitted(1, poses=4, std=STD)
-    fit.problem.noise = replace(fit.noise, source="estimated")
+    noise = replace(fit.noise, source="estimated")
+    fit = replace(fit, problem=replace(fit.problem, noise=noise))
     assert p_with_closed_noise(fit, fit, winner=None, tried=1) == 1.0
 
 

@@ -24,10 +24,11 @@ from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
+from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.linearization import Point
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.problem import Point, Priors, Problem, Values
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -84,7 +85,7 @@ def all_free(model: CableModel) -> Unknowns:
     return Unknowns(model, np.ones(len(model.names), dtype=bool), model.nominal.copy())
 
 
-def solved(problem: BatchProblem, theta: np.ndarray, deviation: np.ndarray | None = None) -> Shapes:
+def solved(problem: Problem, theta: np.ndarray, deviation: np.ndarray | None = None) -> Shapes:
     """Equilibria of all poses, each from its own IPOPT solve, a drift carried along."""
     unknowns, model = problem.unknowns, problem.unknowns.model
     p, rest = unknowns.p(theta), unknowns.rest(theta)
@@ -184,7 +185,7 @@ EFFECTS_AND_VALUES = {
 
 
 @cache
-def rich(element: str, markers: bool = False) -> tuple[BatchProblem, Point]:
+def rich(element: str, markers: bool = False) -> tuple[Problem, Point]:
     """Many effects at once, three poses, at a point that is not the minimum."""
     effects = tuple(kind() for kind in EFFECTS_AND_VALUES)
     model = CableModel(CABLE, 8, element, effects=effects, n_rest=5)
@@ -192,29 +193,30 @@ def rich(element: str, markers: bool = False) -> tuple[BatchProblem, Point]:
     coefficients = np.array([0.5, 1.0, 1.5, 0.8, 0.4])
     measured = measured_from(model, p, coefficients, 3, 2e-3, points=25, markers=markers)
     noise = NoiseModel(STD, share=0.5, length=0.05, kernel="matern")
-    problem = BatchProblem(all_free(model), measured, noise, Tolerances(), 0.5)
+    priors = replace(Priors.of(Tolerances(), model), roughness_std=0.5)
+    problem = Problem(all_free(model), measured, noise, priors)
     theta = problem.unknowns.pack(p, coefficients)
     theta = theta + np.random.default_rng(1).normal(scale=0.02, size=len(theta))
-    shapes = solved(problem, theta)
-    seen = problem.observed(theta, shapes)
-    projections = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
-    problem.refresh(theta, shapes, projections)
-    return problem, problem.evaluate(theta, shapes, projections)
+    values = projected(problem, theta, solved(problem, theta))
+    problem = problem.weighed(values)
+    return problem, problem.evaluate(values)
 
 
-def residuals(problem: BatchProblem, point: Point, theta, deviation=None) -> list[np.ndarray]:
+def projected(problem: Problem, theta: np.ndarray, shapes: Shapes) -> Values:
+    """Values at which each point is compared with the nearest place of its pose's curve."""
+    seen = problem.observed(Values(theta, shapes, []))
+    pairs = zip(seen, problem.measured, strict=True)
+    return Values(theta, shapes, [item.nearest(one.curve) for one, item in pairs])
+
+
+def residuals(problem: Problem, point: Point, theta, deviation=None) -> list[np.ndarray]:
     """Whitened normal distances at other unknowns: equilibria solved again, projections moved."""
     start = point.shapes if deviation is None else replace(point.shapes, deviation=deviation)
     shapes, converged = problem.equilibria.solve(
         start, problem.unknowns.p(theta), problem.unknowns.rest(theta), tolerance=1e-12
     )
     assert converged.all()
-    seen, out = problem.observed(theta, shapes), []
-    for j, guess in zip(problem.used, point.projections, strict=True):
-        item = problem.measured[j]
-        s = item.located(seen[j], guess)
-        out.append(problem.whitening(j) @ item.residual(seen[j], s))
-    return out
+    return problem.evaluate(Values(theta, shapes, point.projections)).residuals
 
 
 @pytest.mark.parametrize(
@@ -339,18 +341,17 @@ def test_noise_free_round_trip_is_exact():
     model = CableModel(CABLE, 10, effects=(LumpedMass(),), n_rest=5)
     p, coefficients = np.array([0.06, 0.04, 0.3]), np.array([0.5, 1.0, 1.5, 0.8, 0.4])
     measured = measured_from(model, p, coefficients, 5, 0.0)
-    problem = BatchProblem(all_free(model), measured, NoiseModel(1e-7), Tolerances(), 100.0)
+    priors = replace(Priors.of(Tolerances(), model), roughness_std=100.0)
+    problem = Problem(all_free(model), measured, NoiseModel(1e-7), priors)
     exact = problem.unknowns.pack(p, coefficients)
     theta = exact + 0.03 * np.array([1, -1, 0.5, 1, -1, 1, -1, 1])
-    shapes = solved(problem, theta)
-    seen = problem.observed(theta, shapes)
-    projections = [item.nearest(one.curve) for one, item in zip(seen, measured, strict=True)]
-    problem.refresh(theta, shapes, projections)
-    found, converged = problem.descend(problem.evaluate(theta, shapes, projections))
-    assert converged
+    values = projected(problem, theta, solved(problem, theta))
+    problem = problem.weighed(values)
+    found = descend(Fit(problem, problem.evaluate(values)))
+    assert found.converged
     # A standard deviation of 1e-7 m against positions of 1 m: relative 1e-6 or better, and the
     # ends may deviate by a share (1e-7 / 2e-4)^2 of what the points ask for.
-    np.testing.assert_allclose(found.theta, exact, atol=1e-4)
+    np.testing.assert_allclose(found.point.theta, exact, atol=1e-4)
 
 
 def test_a_drift_comes_back():
@@ -363,7 +364,7 @@ def test_a_drift_comes_back():
         assert abs(fit.value(name) - exact) < 3 * fit.std(name), name
     assert fit.std("rest_curvature_drift.rate") < 0.02
     shuffled = fit_model(model, [measured[k] for k in (3, 0, 7, 5, 1, 6, 2, 4)], Tolerances(), STD)
-    assert shuffled.problem.rest_scatter.std > 0 == fit.problem.rest_scatter.std
+    assert shuffled.problem.priors.rest_scatter.std > 0 == fit.problem.priors.rest_scatter.std
 
 
 @pytest.mark.parametrize("markers", [False, True])
@@ -382,7 +383,7 @@ def test_predictions_of_a_fit_are_its_shapes():
     fit, *_ = round_trip("arc")
     poses = [item.pose for item in fit.problem.measured]
     predicted = predict_poses(fit.model, fit.p, fit.rest, poses)
-    curves = [one.curve for one in fit.problem.observed(fit.point.theta, fit.point.shapes)]
+    curves = [one.curve for one in fit.problem.observed(fit.point)]
     s = np.linspace(0.0, CABLE.length, 50)
     for one, other in zip(predicted, curves, strict=True):
         assert isinstance(other, NodeCurve)

@@ -9,7 +9,6 @@ import pytest
 from dlo_casadi.config import load_config
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.spread import displacements, spread_across
-from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
 from dlo_casadi.estimation.repeats import (
     different_poses,
@@ -17,6 +16,7 @@ from dlo_casadi.estimation.repeats import (
     repeatability,
     with_repeats,
 )
+from dlo_casadi.estimation.result import uncertainty_of
 from dlo_casadi.report.parameters_text import fit_dict
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel

@@ -1,12 +1,11 @@
 """From one mesh to the next: a fit that gets stuck on the finer one starts again."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation import fit as fitting
+from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -29,17 +28,12 @@ def test_a_fit_that_gets_stuck_on_a_finer_mesh_starts_again(monkeypatch):
     ]
     fit = fitting.fit_model(MODEL, measured, Tolerances(), NOISE)
 
-    def stuck(unknowns, history, start, _=0):
+    def stuck(start, model):
         p = start.p * np.where(np.array(start.model.names) == "bending_stiffness", 2.0, 1.0)
-        problem = start.problem.of(replace(unknowns, fixed=p), history)
-        problem.share_weights(start.problem)
-        rest = unknowns.model.rest_basis @ start.coefficients
-        moved, _ = problem.equilibria.solve(fitting.carried_shapes(problem, start), p, rest)
-        theta = unknowns.pack(p, start.coefficients)
-        return fitting.Fit(problem, problem.evaluate(theta, moved, start.point.projections), False)
+        return refit(start, model, free=[], values=p, steps=0)
 
-    monkeypatch.setattr(fitting, "_continue", stuck)
-    monkeypatch.setattr(fitting, "refine", lambda problem, near, **_: (problem, near, False))
+    monkeypatch.setattr(fitting, "refit", stuck)
+    monkeypatch.setattr(fitting, "refine", lambda near, **_: near)
     finer = fitting.refine_mesh(fit, 20)
 
     assert finer.model.n == 20

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation import starting_points
-from dlo_casadi.estimation.gauss_newton import BatchProblem
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel, Tolerances
@@ -45,15 +45,14 @@ def test_twists_are_turned_the_way_that_fits():
         points = shape.curve.at(s) + rng.normal(scale=5e-4, size=(len(s), 3))
         measured.append(MeasuredPose.of_points(pose, points))
     unknowns = Unknowns(model, np.ones(len(p), dtype=bool), model.nominal)
-    spread = Tolerances().deviation(model.node)
-    problem = BatchProblem(unknowns, measured, NoiseModel(3e-3), Tolerances(), 0.3, spread)
+    problem = Problem(unknowns, measured, NoiseModel(3e-3), Priors.of(Tolerances(), model))
 
     roll = ROLL + OFF
     theta = unknowns.pack(p, np.zeros(model.n_coefficients))
     theta[unknowns.names.index(END_ROLL)] = roll / 0.1
     held = np.isin(unknowns.names, (*STIFFNESSES, END_ROLL))
     shapes, projections = measured_shapes(problem, roll)
-    problem.refresh(theta, shapes, projections)
+    problem = problem.weighed(Guess(theta, shapes, projections))
     begun = turned_either_way(problem, Guess(theta, shapes, projections), held, roll)
 
     true = model.node.turning(measured_shapes(problem, ROLL)[0].x)

@@ -6,9 +6,9 @@ import pytest
 from dlo_casadi.effects import Cable, LumpedMass
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
-from dlo_casadi.estimation.band import uncertainty_of
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.result import uncertainty_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.report.json_report import finite
 from dlo_casadi.report.text_parameters import describe

@@ -9,7 +9,7 @@ from tiny_sessions import write_session
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import EFFECTS, RestCurvatureDrift
-from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.descent import refit
 from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.runtime.parallel import open_executor
 from dlo_casadi.session import run_session
@@ -60,7 +60,7 @@ def test_a_whole_session(tmp_path, name, tried, verdict):
 
 def test_folds_where_a_state_is_carried(fit, pool):
     model = fit.model.with_effect(RestCurvatureDrift())
-    drifting = fit_model(model, fit.problem.history, fit.problem.tolerances, start=fit)
+    drifting = refit(fit, model)
     here, there = cross_validate(drifting), cross_validate(drifting, pool)
     assert here.complete
     assert np.array_equal(here.squares, there.squares)

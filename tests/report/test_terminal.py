@@ -168,9 +168,7 @@ def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
     fit, problem = outcome.fit, outcome.fit.problem
     assert not replace(fit, converged=False).failed  # it is at its minimum
     off = fit.point.theta + 0.5 * np.eye(problem.unknowns.size)[0]  # ln EI
-    p, rest = problem.unknowns.p(off), problem.unknowns.rest(off)
-    shapes, _ = problem.equilibria.settled(fit.point.shapes, p, rest)
-    point = problem.evaluate(off, shapes, fit.point.projections)
+    point = problem.balanced(replace(fit.point, theta=off))
     stopped = replace(found, fit=replace(fit, point=point, converged=False))
     assert "Verdict: the fit has failed. Fit poses" in said(stopped)
     assert page_data(stopped)["verdict_word"] == "Fit failed"

@@ -119,7 +119,7 @@ def test_a_pose_predicted_on_another_equilibrium_is_in_doubt(held_out):
     assert "lowest equilibrium in 0 is another one than the measured one" in doubt
     assert "`branch: cw` in these poses chooses it" in doubt
     if not held_out:
-        told = predicted_shapes(fit.problem, fit.point.shapes, fit.p, fit.rest)
+        told = predicted_shapes(fit.problem, fit.point)
         assert cross_validate(fit).rmse < 2 * NOISE
         assert cross_validate(fit, shapes=told).rmse > 0.05
 
@@ -150,11 +150,8 @@ def test_a_fit_is_no_worse_than_the_stiffness_alone():
     assert worse_than_simpler(stages) == []
 
     problem, far = fit.problem, fit.point.theta - np.log(10) * np.eye(fit.problem.unknowns.size)[0]
-    rest = problem.unknowns.rest(far)
-    shapes, _ = problem.equilibria.settled(fit.point.shapes, problem.unknowns.p(far), rest)
-    stopped = replace(
-        fit, point=problem.evaluate(far, shapes, fit.point.projections), converged=False
-    )
+    point = problem.balanced(replace(fit.point, theta=far))
+    stopped = replace(fit, point=point, converged=False)
     stage, doubts = judged(poses, stopped)
     assert "has not converged" in doubts[0]
     (said,) = worse_than_simpler([stages[0], stage])

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import EstimationError, counted
-from dlo_casadi.estimation.gauss_newton import BatchProblem
-from dlo_casadi.estimation.linearization import Linearization, Point
+from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.rest_scatter import (
     MOST_POSES,
@@ -48,25 +47,10 @@ SCATTER_FLOOR = 0.05
 
 def settle(fit: Fit) -> Fit:
     """Estimate noise, roughness and scatter anew for a model that is taken as complete."""
-    problem, point, converged = refine(
-        fit.problem,
-        fit.point,
-        estimate=not fit.noise.known,
-        rounds=2,
-        modes=SETTLED_MODES,
-    )
-    return Fit(problem, point, converged)
+    return refine(fit, rounds=2, modes=SETTLED_MODES)
 
 
-def refine(
-    problem: BatchProblem,
-    point: Point,
-    *,
-    estimate: bool,
-    rounds: int = 3,
-    modes: int = SMOOTH_MODES,
-    first: bool = False,
-) -> tuple[BatchProblem, Point, bool]:
+def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool = False) -> Fit:
     """Alternate between the fit, the noise, the roughness of the rest curvature and the scatter.
 
     Roughness and scatter (how much the poses' ends differ from one another, within the
@@ -74,6 +58,8 @@ def refine(
 
     Parameters
     ----------
+    modes : int
+        Slow displacements kept out of the noise estimate, if the noise is estimated.
     first : bool
         Whether it is not known yet if the cable comes back to the same shape, and if the points
         scatter as their noise is declared: it is estimated where they scatter more.
@@ -82,63 +68,53 @@ def refine(
     ----------
     MacKay, Neural Computation 4 (1992).
     """
-    repeats = problem.rest_scatter.std == 0 and not first
-    rough = first and problem.unknowns.model.in_space
-    near, converged = problem.descend(point, tolerance=1e-2)
-    if converged or not rough:
-        point = near
+    repeats = fit.problem.priors.rest_scatter.std == 0 and not first
+    rough, estimated = first and fit.model.in_space, not fit.noise.known
+    near = descend(fit, tolerance=1e-2)
+    fit = near if near.converged or not rough else replace(fit, converged=False)
     for round_ in range(rounds):
-        lin = problem.linearize(point)
-        if first and round_ == 0 and problem.noise.source == "declared":
-            estimate = contradicted(problem, point, lin)
-        noise, rest = problem.noise, problem.rest_scatter
+        priors, noise = fit.problem.priors, fit.noise
+        if first and round_ == 0 and noise.source == "declared":
+            estimated = contradicted(fit)
+        rest = priors.rest_scatter
         if round_ < 2:
-            noise, rest = errors_of(problem, point, lin, modes, estimated=estimate, repeats=repeats)
-        roughness = roughness_of(problem, point, lin)
-        scatter = scatter_of(problem, point, lin)
+            noise, rest = errors_of(fit, modes, estimated=estimated, repeats=repeats)
+        roughness, scatter = roughness_of(fit), scatter_of(fit)
         ends = np.isfinite(scatter)
         moved = max(
-            abs(np.log(roughness / problem.roughness_std)),
-            float(np.abs(np.log(scatter[ends] / problem.scatter[ends])).max()),
+            abs(np.log(roughness / priors.roughness_std)),
+            float(np.abs(np.log(scatter[ends] / priors.scatter[ends])).max()),
         )
-        changed = abs(np.log(noise.std / problem.noise.std))
-        same = rest.std == problem.rest_scatter.std or abs(
-            rest.std - problem.rest_scatter.std
-        ) < 0.05 * max(rest.std, problem.rest_scatter.std)
-        problem = problem.changed(noise, roughness, scatter, rest)
-        point = problem.taken_over(point)
-        point, converged = problem.descend(point)
+        changed = abs(np.log(noise.std / fit.noise.std))
+        largest = max(rest.std, priors.rest_scatter.std)
+        same = abs(rest.std - priors.rest_scatter.std) <= 0.05 * largest
+        found = replace(priors, roughness_std=roughness, scatter=scatter, rest_scatter=rest)
+        fit = descend(fit.reweighed(noise, found))
         if moved < 0.1 and changed < 0.02 and same:
             break
-        if rough and not converged:
+        if rough and not fit.converged:
             # What is missing is no noise: to estimate that once more leads farther astray.
             break
-    return problem, point, converged
+    return fit
 
 
-def contradicted(problem: BatchProblem, point: Point, lin: Linearization) -> bool:
+def contradicted(fit: Fit) -> bool:
     """Whether the points scatter more than their declared noise lets expect.
 
     By the white part of what is left beside all that the shapes may do: what a model lacks is
     smooth along the cable.
     """
-    samples = _noise_samples(problem, point, lin, SMOOTH_MODES)
+    samples = _noise_samples(fit, SMOOTH_MODES)
     if not tell_of_noise(samples, SCATTERED_DEGREES):
         return False
-    found = estimate_noise(samples, problem.unknowns.model.cable.length)
-    return found.white > SCATTERED * problem.noise.std
+    found = estimate_noise(samples, fit.model.cable.length)
+    return found.white > SCATTERED * fit.noise.std
 
 
 def errors_of(
-    problem: BatchProblem,
-    point: Point,
-    lin: Linearization,
-    modes: int = SMOOTH_MODES,
-    *,
-    estimated: bool,
-    repeats: bool,
+    fit: Fit, modes: int = SMOOTH_MODES, *, estimated: bool, repeats: bool
 ) -> tuple[NoiseModel, RestScatter]:
-    """Noise of the points and rest curvature of each hanging's own, from the residuals.
+    """Noise of the points and rest curvature of each repeat's own, from the residuals.
 
     The noise is estimated with all that the shape may do projected out. Lines of few points
     leave nothing over then: fewer slow displacements are projected out of them, and at last the
@@ -157,20 +133,19 @@ def errors_of(
     EstimationError
         If the points are hardly more than the unknowns that they determine.
     """
-    noise, together = problem.noise, False
+    noise, together, length = fit.noise, False, fit.model.cable.length
     if estimated:
-        length = problem.unknowns.model.cable.length
         for count in range(modes, -1, -1):
-            samples = _noise_samples(problem, point, lin, count)
+            samples = _noise_samples(fit, count)
             if tell_of_noise(samples):
-                noise = with_repeats(estimate_noise(samples, length), problem.history, length)
+                noise = with_repeats(estimate_noise(samples, length), fit.problem.history, length)
                 break
         else:
-            noise, together = _white_noise(problem, point), True
-    noise = replace(noise, readings=reading_noise_of(problem, point, lin))
+            noise, together = _white_noise(fit), True
+    noise = replace(noise, readings=reading_noise_of(fit))
     if repeats:
         return noise, RestScatter()
-    found = rest_scatter_of(problem, point, lin, noise)
+    found = rest_scatter_of(fit, noise)
     return replace(noise, std=found.noise * noise.std) if together else noise, found.rest
 
 
@@ -192,7 +167,7 @@ def first_reading_noise(
     )
 
 
-def reading_noise_of(problem: BatchProblem, point: Point, lin: Linearization) -> ReadingNoise:
+def reading_noise_of(fit: Fit) -> ReadingNoise:
     """Noise of forces and of moments where it is not declared: one fixed-point update.
 
         std^2 = (sum of squares + guess^2) / (components - what of them the unknowns explain + 1)
@@ -203,12 +178,12 @@ def reading_noise_of(problem: BatchProblem, point: Point, lin: Linearization) ->
     ----------
     MacKay, Neural Computation 4 (1992).
     """
-    own, guess = problem.noise.readings, first_reading_noise(problem.unknowns.model)
-    kinds = np.concatenate([problem.measured[j].kinds for j in problem.used])
+    own, guess = fit.noise.readings, first_reading_noise(fit.model)
+    kinds = np.concatenate([fit.problem.measured[j].kinds for j in fit.problem.used])
     if (kinds == "point").all():
         return own
-    free = 1 - np.concatenate(Fit(problem, point, converged=True).leverages)
-    square = np.concatenate(lin.raw) ** 2
+    free = 1 - np.concatenate(fit.leverages)
+    square = np.concatenate(fit.linearization.raw) ** 2
 
     def std(kind: str, first: float) -> float:
         of = kinds == kind
@@ -219,14 +194,13 @@ def reading_noise_of(problem: BatchProblem, point: Point, lin: Linearization) ->
     return replace(own, force=force, moment=moment)
 
 
-def rest_scatter_of(
-    problem: BatchProblem, point: Point, lin: Linearization, noise: NoiseModel
-) -> ScatterEstimate:
-    """Rest curvature of each hanging's own; see `estimate_rest_scatter`."""
-    if different_poses(problem.history, problem.unknowns.model.cable.length) < DIFFERENT:
+def rest_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
+    """Rest curvature of each repeat's own; see `estimate_rest_scatter`."""
+    problem, point, lin = fit.problem, fit.point, fit.linearization
+    if different_poses(problem.history, fit.model.cable.length) < DIFFERENT:
         return ScatterEstimate(RestScatter(), 1.0, 1.0)
     size, std = problem.unknowns.size, problem.deviation_std
-    moved = problem.moved_by_rest(point.theta, point.shapes, point.projections)
+    moved = problem.moved_by_rest(point)
     kept = range(0, len(problem.used), -(-len(problem.used) // MOST_POSES))
     samples = []
     for k in kept:
@@ -235,7 +209,7 @@ def rest_scatter_of(
         samples.append(
             ScatterSample(white @ lin.raw[k], white @ moved[k], by[:, size:] * std, by[:, :size])
         )
-    seen = problem.observed(point.theta, point.shapes)
+    seen = problem.observed(point)
     shapes = np.array([seen[problem.used[k]].curve.nodes for k in kept])
     shapes = shapes - shapes[:, :1]
     gap = shapes[:, None] - shapes[None]
@@ -244,9 +218,9 @@ def rest_scatter_of(
     return estimate_rest_scatter(RestLikelihood(samples, distances), sparse=sparse)
 
 
-def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
+def _white_noise(fit: Fit) -> NoiseModel:
     """White noise of the size of the residuals over their degrees of freedom."""
-    fit = Fit(problem, point, converged=True)
+    problem = fit.problem
     items = [problem.measured[j] for j in problem.used]
     on_points = np.concatenate([item.on_points for item in items])
     free = 1 - np.concatenate(fit.leverages)
@@ -266,17 +240,15 @@ def _white_noise(problem: BatchProblem, point: Point) -> NoiseModel:
     return NoiseModel(float(np.sqrt((raw**2).sum() / spare)), slow_dof=spare)
 
 
-def _noise_samples(
-    problem: BatchProblem, point: Point, lin: Linearization, modes: int
-) -> list[NoiseSample]:
+def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     """Residuals of each pose beside the directions that its curve may take."""
-    model = problem.unknowns.model
+    problem, point, lin, model = fit.problem, fit.point, fit.linearization, fit.model
     length = model.cable.length
     size = problem.unknowns.size
     bases, left_over = [], []
     rest = None
-    if problem.rest_scatter.std > 0:
-        rest = problem.moved_by_rest(point.theta, point.shapes, point.projections)
+    if problem.priors.rest_scatter.std > 0:
+        rest = problem.moved_by_rest(point)
     kept = [problem.measured[j].on_points for j in problem.used]
     raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
     ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]
@@ -316,22 +288,21 @@ def _noise_samples(
     return samples
 
 
-def roughness_of(problem: BatchProblem, point: Point, lin: Linearization) -> float:
+def roughness_of(fit: Fit) -> float:
     """One fixed-point update of the roughness of the rest curvature."""
-    unknowns = problem.unknowns
+    unknowns, roughness_std = fit.problem.unknowns, fit.problem.priors.roughness_std
     if unknowns.n_rest < 3:
-        return problem.roughness_std
+        return roughness_std
     rest = slice(unknowns.n_parameters, unknowns.size)
     rough = unknowns.model.roughness
-    hessian = problem.normal_equations(point, lin).hessian
-    covariance = np.linalg.pinv(hessian, hermitian=True)[rest, rest]
-    prior = rough.T @ rough / problem.roughness_std**2
+    covariance = np.linalg.pinv(fit.normal.hessian, hermitian=True)[rest, rest]
+    prior = rough.T @ rough / roughness_std**2
     well_determined = len(rough) - float(np.trace(covariance @ prior))
-    energy = float(((rough @ point.theta[rest]) ** 2).sum())
+    energy = float(((rough @ fit.point.theta[rest]) ** 2).sum())
     return float(max(np.sqrt(energy / max(well_determined, 1e-2)), ROUGHNESS_FLOOR))
 
 
-def scatter_of(problem: BatchProblem, point: Point, lin: Linearization) -> FloatArray:
+def scatter_of(fit: Fit) -> FloatArray:
     """One fixed-point update of the scatter of ends and headings, never above the tolerance.
 
         std^2 = (sum of squares + u tolerance^2) / (determined + u),   u = 1 - determined / all
@@ -341,21 +312,21 @@ def scatter_of(problem: BatchProblem, point: Point, lin: Linearization) -> Float
     were intervals: of ten random cables in space five lay more than two standard deviations off,
     one 4.6; with the tolerance none of these and nine more, at most 1.85.
     """
+    problem, normal = fit.problem, fit.normal
     columns = problem.equilibria.used_deviations
     if not columns or len(problem.used) == 1:
-        return problem.scatter
-    normal = problem.normal_equations(point, lin)
+        return problem.priors.scatter
     covariance = np.linalg.pinv(normal.hessian, hermitian=True)
     variance = []
     for block, cross, _ in normal.inner:
         inverse = np.linalg.inv(block)
         arm = inverse @ cross
         variance.append(np.diag(inverse + arm @ covariance @ arm.T))
-    square = (point.shapes.deviation[np.ix_(problem.used, columns)] ** 2).sum(axis=0)
+    square = (fit.point.shapes.deviation[np.ix_(problem.used, columns)] ** 2).sum(axis=0)
     determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
-    scatter = problem.scatter.copy()
+    scatter = problem.priors.scatter.copy()
     node = problem.unknowns.model.node
-    limits = problem.tolerances.deviation(node)
+    limits = problem.priors.tolerances.deviation(node)
     # The coordinates of an end share one scatter, and so do the turns of both clamps.
     d, b = node.dimension, node.increment
     for group in (range(d), range(d, d + 2 * b)):

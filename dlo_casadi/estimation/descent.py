@@ -1,0 +1,248 @@
+"""Gauss-Newton for the batch problem: the Levenberg-Marquardt method with a watchdog."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
+from dlo_casadi.errors import EquilibriumError, EstimationError
+from dlo_casadi.estimation.problem import (
+    NO_INFORMATION,
+    Linearization,
+    Normal,
+    Point,
+    Problem,
+    Values,
+)
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import CableModel
+
+FloatArray = NDArray[np.floating]
+
+# Longest step of a node along its derivative [rad]; beyond it the linearisation is poor.
+LONGEST_MOVE = 1.5
+# A step that lowers the objective by less has converged: one standard deviation of one parameter is
+# a decrease of 1/2.
+CONVERGED = 1e-4
+# A descent has stalled where so many steps together gain no more than the last one may.
+STALLED = 4
+# Uphill steps allowed before backtracking; largest rise of the objective allowed.
+WATCHED, WORSE = 2, 3.0
+
+
+def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
+    """Levenberg-Marquardt from a problem's point, which is an equilibrium.
+
+    Parameters
+    ----------
+    fit : Fit
+        The problem, with its weights, and where to begin.
+    steps : int
+        Iterations at most.
+    tolerance : float
+        Decrease of the objective at which the fit has converged, see CONVERGED.
+
+    Returns
+    -------
+    Fit
+        The minimum and whether it converged: a descent that has stalled, or has run out of
+        iterations, has not.
+    """
+    problem, point = fit.problem, fit.point
+    damping, gains = 0.0, [np.inf] * STALLED
+    lin = fit.linearization
+    for _ in range(steps):
+        limit = point.objective + 1e-9 * abs(point.objective)
+        before, trial = damping, _ahead(problem, point, lin, damping, limit, WATCHED)
+        least = least_decrease(problem, point, tolerance)
+        if trial is None and _promised(problem.normal_equations(point, lin)) < least:
+            # What a pose's deviations do to the poses after it, through a state, is left out.
+            return Fit(problem, point, converged=True)
+        while trial is None:
+            damping = max(10 * damping, 1e-4)
+            if damping > 1e8:
+                return Fit(problem, point)
+            trial = _ahead(problem, point, lin, damping, limit, WATCHED)
+        gains = [*gains[1:], point.objective - trial.objective]
+        if damping == before:
+            damping = damping / 10 if damping > 1e-6 else 0.0
+        point = trial
+        least = least_decrease(problem, point, tolerance)
+        if gains[-1] < least and damping < 1e-2:
+            return Fit(problem, point, converged=True)
+        if sum(gains) < least:
+            return Fit(problem, point)
+        lin = problem.linearize(point)
+    return Fit(problem, point)
+
+
+def least_decrease(problem: Problem, point: Point, tolerance: float = CONVERGED) -> float:
+    """Decrease of the objective about a point that is worth a step.
+
+    Where the residual exceeds the noise, so does a standard deviation's decrease.
+    """
+    return tolerance * max(1.0, point.data / max(problem.n_residuals, 1))
+
+
+def _promised(normal: Normal) -> float:
+    """Decrease of the objective that an undamped step promises."""
+    matrix = normal.hessian + NO_INFORMATION * np.eye(len(normal.hessian))
+    shared = normal.gradient @ np.linalg.solve(matrix, normal.gradient)
+    own = sum(slope @ np.linalg.solve(block, slope) for block, _, slope in normal.inner)
+    return float(shared + own) / 2
+
+
+def _ahead(
+    problem: Problem, point: Point, lin: Linearization, damping: float, limit: float, more: int
+) -> Point | None:
+    """A point below a limit, in one step or with some more beyond one above it; else None.
+
+    The valley of stiffness against rest curvature, whose product is what shapes know, is
+    curved: a full step along it leads up its side, the next one back to its bottom.
+
+    References
+    ----------
+    The watchdog technique: Chamberlain et al., Math. Programming Study 16 (1982).
+    """
+    trial = _stepped(problem, point, lin, damping)
+    if trial is None or trial.objective <= limit:
+        return trial
+    if not more or trial.objective > WORSE * limit:
+        return None
+    return _ahead(problem, trial, problem.linearize(trial), damping, limit, more - 1)
+
+
+def _stepped(problem: Problem, point: Point, lin: Linearization, damping: float) -> Point | None:
+    """The point after a damped step within reach; None if some pose loses its equilibrium."""
+    normal, equilibria = problem.normal_equations(point, lin), problem.equilibria
+    lower, upper = problem.unknowns.reach(point.theta)
+    scale = np.maximum(np.diag(normal.hessian), 1e-12)
+    # A direction without any information (the place of a mass of zero) must not move.
+    matrix = normal.hessian + damping * np.diag(scale) + NO_INFORMATION * np.eye(len(scale))
+    step = -np.linalg.solve(matrix, normal.gradient)
+    new = point.theta + step
+    if np.any(new < lower) or np.any(new > upper):
+        step = _bounded_step(matrix, normal.gradient, lower - point.theta, upper - point.theta)
+    deviation = point.shapes.deviation.copy()
+    for j, (block, cross, slope) in zip(problem.used, normal.inner, strict=True):
+        own = np.linalg.solve(block, cross @ step + slope)
+        deviation[j, equilibria.used_deviations] -= own
+    change = problem.shape_step(lin.shapes, step, deviation - point.shapes.deviation)
+    if float(np.abs(change.x).max()) > LONGEST_MOVE:
+        return None
+    guess = replace(equilibria.moved(point.shapes, change), deviation=deviation)
+    return problem.balanced(Values(point.theta + step, guess, point.projections), reach=1.0)
+
+
+def _bounded_step(
+    matrix: FloatArray, gradient: FloatArray, lower: FloatArray, upper: FloatArray
+) -> FloatArray:
+    """Minimise the quadratic model within bounds."""
+    # The matrix, a Schur complement, is positive but for rounding.
+    values, vectors = np.linalg.eigh(matrix)
+    root = np.sqrt(np.maximum(values, NO_INFORMATION))
+    factor, target = root[:, None] * vectors.T, -(vectors.T @ gradient) / root
+    low, high = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
+    high = np.where(high - low < 1e-14, low + 1e-14, high)
+    return np.asarray(lsq_linear(factor, target, bounds=(low, high), method="bvls").x)
+
+
+# ---- from one fit to another model -------------------------------------------------------------
+
+
+def refit(
+    fit: Fit,
+    model: CableModel,
+    *,
+    free: Sequence[str] | None = None,
+    values: FloatArray | None = None,
+    steps: int = 40,
+) -> Fit:
+    """Fit a similar model, or the same on another mesh, from a fit's minimum and with its weights.
+
+    Parameters
+    ----------
+    free : sequence of str, optional
+        Names of the parameters to estimate; by default all but those that the fit keeps fixed.
+    values : (n_parameters,), optional
+        Where parameters that the fit does not have start, and where those stay that are not
+        estimated; by default as the fit has them, or nominal.
+    steps : int
+        Iterations at most.
+
+    Raises
+    ------
+    EstimationError
+        If the model has no equilibria near those of the fit.
+    """
+    chosen = fit.free_in(model) if free is None else np.isin(model.names, free)
+    known = np.isin(model.names, fit.model.names)
+    found = fit.values_in(model)
+    p = found if values is None else np.where(known & chosen, found, values)
+    problem = replace(fit.problem, unknowns=Unknowns(model, chosen, p))
+    theta = problem.unknowns.pack(p, fit.coefficients)
+    start = Values(theta, carried_shapes(problem, fit), fit.point.projections)
+    point = problem.balanced(start)
+    if point is None:
+        raise EstimationError("the shapes of the first fit are no equilibria of the second model")
+    return descend(Fit(problem, point), steps)
+
+
+def carried_shapes(problem: Problem, fit: Fit) -> Shapes:
+    """Shapes of a problem's poses from those of a fit, on the problem's mesh.
+
+    Poses that the fit did not need, because it carried no state, are predicted.
+
+    Raises
+    ------
+    EstimationError
+        If such a pose has no equilibrium.
+    """
+    known = {index: k for k, index in enumerate(fit.problem.indices)}
+    own = fit.point.shapes
+    rows = []
+    for index in problem.indices:
+        if index in known:
+            k = known[index]
+            rows.append((own.x[k], own.lam[k], own.deviation[k]))
+            continue
+        pose = problem.history[index].pose
+        try:
+            if pose.branch == "previous" and rows:
+                before = problem.history[index - 1].pose, rows[-1][0]
+                found = continued(fit.model, fit.p, fit.rest, pose, *before)
+            else:
+                found = solve_equilibrium(fit.model, fit.p, fit.rest, pose)
+        except EquilibriumError as error:
+            raise EstimationError(error.message) from error
+        rows.append((found.x, found.multipliers, np.zeros(len(fit.model.deviation_names))))
+    x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
+    model = problem.unknowns.model
+    shapes = with_border_of(Shapes(x, lam, deviation), fit.model, model)
+    return on_other_mesh(shapes, fit.model, model)
+
+
+def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
+    """Nodes interpolated from one model's mesh to another's."""
+    if model.chain == other.chain:
+        return shapes
+    coarse, fine = model.chain.places, other.chain.places
+    return replace(shapes, x=other.chain.kind.node.interpolated(fine, coarse, shapes.x))
+
+
+def with_border_of(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
+    """Multipliers in another model's order; what it has beside them begins at zero."""
+    if model.border_names == other.border_names:
+        return shapes
+    lam = np.zeros((len(shapes.lam), other.n_border))
+    for i, name in enumerate(other.border_names):
+        if name in model.border_names:
+            lam[:, i] = shapes.lam[:, model.border_names.index(name)]
+    return replace(shapes, lam=lam)

@@ -1,0 +1,385 @@
+"""The batch problem of one model, with the equilibria eliminated pose by pose.
+
+    min over theta, deviations of
+        1/2 sum_j |W_j e_j|^2 + 1/2 sum_j |deviation_j / std|^2
+        + 1/2 (theta - mean)^T P (theta - mean)
+    subject to every pose being an equilibrium
+
+with the residuals e_j of the pose's sensors, of a line N_j (x_j - r_j(s_j)). The projections s_j of
+its points move with the curve; there the normal distance does not change to first order with s, so
+that the Jacobian at fixed projections is the exact one. A Schur complement eliminates the
+deviations of a pose. A problem never changes: its weights W_j are taken at some values once
+(`Problem.weighed`), or handed over from another problem of the same poses with `replace`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.curve import Observed
+from dlo_casadi.equilibrium.spread import modes_in
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model.assembly import Shapes, Tangents
+from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.rest_curvature import MODES, RestScatter
+from dlo_casadi.rod.band import Vector
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
+
+FloatArray = NDArray[np.floating]
+
+# Precision in scaled units below which a direction counts as undetermined.
+NO_INFORMATION = 1e-6
+# Roughness of the rest curvature until it has been estimated.
+FIRST_ROUGHNESS = 0.3
+NO_REST_SCATTER = RestScatter()
+
+
+@dataclass(frozen=True)
+class Values:
+    """Unknowns and shapes, in equilibrium or not.
+
+    Parameters
+    ----------
+    theta : (size,)
+    shapes : Shapes
+    projections : list of (K_j,) [m]
+        Arc lengths at which the fitted poses' points are compared.
+    """
+
+    theta: FloatArray
+    shapes: Shapes
+    projections: list[FloatArray]
+
+
+@dataclass(frozen=True)
+class Point(Values):
+    """Everything at one value of the unknowns.
+
+    Parameters
+    ----------
+    objective : float
+        Half the sum of squares, priors included.
+    data : float
+        Sum of squares of the whitened residuals alone.
+    residuals : list of (R_j,)
+        These, whitened, of the fitted poses.
+    """
+
+    objective: float
+    data: float
+    residuals: list[FloatArray]
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Residuals and Jacobians of the data at a point.
+
+    Parameters
+    ----------
+    residuals : list of (R_j,)
+        Whitened residuals of the sensors, measured minus model.
+    by_theta : list of (R_j, size)
+        Derivative of the residuals.
+    by_deviation : list of (R_j, n_deviations)
+    raw : list of (R_j,)
+        Residuals, not whitened.
+    raw_directions : list of (R_j, size + n_deviations)
+        Their derivatives, not whitened.
+    shapes : Tangents
+        Derivatives of the equilibria, by the unknowns and by each pose's deviations.
+    """
+
+    residuals: list[FloatArray]
+    by_theta: list[FloatArray]
+    by_deviation: list[FloatArray]
+    raw: list[FloatArray]
+    raw_directions: list[FloatArray]
+    shapes: Tangents
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations with the deviations eliminated: hessian @ step = -gradient.
+
+    `inner`: of each fitted pose the block of its own deviations, their derivative by theta and
+    their gradient; of no size where a model has no deviations.
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    inner: list[tuple[FloatArray, FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """What is known beside the measurements, and how far poses differ from one another.
+
+    Parameters
+    ----------
+    tolerances : Tolerances
+    scatter : (n_deviations,)
+        Standard deviations of a pose's own deviations.
+    roughness_std : float
+        Prior of the rest curvature, see `Unknowns.prior`.
+    rest_scatter : RestScatter
+        Rest curvature of each repeat's own. None by default: cables come back to the same shape,
+        unless the data tell otherwise.
+    told : tuple of (row (size,), value)
+        What else is known of theta: row @ theta is `value`, with a standard deviation of one.
+    """
+
+    tolerances: Tolerances
+    scatter: FloatArray
+    roughness_std: float = FIRST_ROUGHNESS
+    rest_scatter: RestScatter = NO_REST_SCATTER
+    told: tuple[tuple[FloatArray, float], ...] = ()
+
+    @classmethod
+    def of(cls, tolerances: Tolerances, model: CableModel) -> Priors:
+        """Priors of a model's poses that differ as much as the tolerances allow."""
+        return cls(tolerances, tolerances.deviation(model.node))
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The batch problem of one model, its priors and measurements; it does not change.
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+    history : sequence of MeasuredPose
+        All poses in order; those held out or unreadable are among the problem's own poses,
+        `measured`, only if the model carries a state. The poses that are fitted are
+        `history[k] for k in fitted`, the same as `measured[j] for j in used`.
+    noise : NoiseModel
+    priors : Priors
+    weights : tuple of (R_j, R_j), optional
+        Whitening matrices W_j of the fitted poses, see `weighed`. Objectives of problems compare
+        only if they have the same ones.
+    """
+
+    unknowns: Unknowns
+    history: Sequence[MeasuredPose]
+    noise: NoiseModel
+    priors: Priors
+    weights: tuple[FloatArray, ...] | None = None
+
+    @cached_property
+    def fitted(self) -> list[int]:
+        """Places in the history of the poses that are fitted."""
+        return [k for k, x in enumerate(self.history) if x.readable and not x.held_out]
+
+    @property
+    def indices(self) -> list[int]:
+        """Places in the history of the problem's own poses.
+
+        Those that are not fitted matter only where they leave something behind in the cable.
+        """
+        coupled = self.unknowns.model.has_state
+        return list(range(len(self.history))) if coupled else self.fitted
+
+    @cached_property
+    def used(self) -> list[int]:
+        """Places among the problem's own poses of those that are fitted."""
+        coupled = self.unknowns.model.has_state
+        return self.fitted if coupled else list(range(len(self.fitted)))
+
+    @cached_property
+    def measured(self) -> tuple[MeasuredPose, ...]:
+        """The problem's own poses."""
+        return tuple(self.history[k] for k in self.indices)
+
+    @cached_property
+    def equilibria(self) -> BatchEquilibrium:
+        """The model over the problem's own poses."""
+        return BatchEquilibrium(self.unknowns.model, [item.pose for item in self.measured])
+
+    @cached_property
+    def _prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and precision of the prior of theta, with what else is told of it."""
+        mean, precision = self.unknowns.prior(self.priors.roughness_std)
+        told = self.priors.told
+        if told:
+            rows = np.array([row for row, _ in told])
+            precision = precision + rows.T @ rows
+            pulled = sum((row * (value - row @ mean) for row, value in told), np.zeros_like(mean))
+            mean = mean + np.linalg.pinv(precision, hermitian=True) @ pulled
+        return mean, precision
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean (size,) of the prior of theta."""
+        return self._prior[0]
+
+    @property
+    def precision(self) -> FloatArray:
+        """Precision matrix (size, size) of the prior of theta."""
+        return self._prior[1]
+
+    @property
+    def deviation_std(self) -> FloatArray:
+        """Standard deviations of the deviations that the model has."""
+        return self.priors.scatter[self.equilibria.used_deviations]
+
+    @property
+    def n_residuals(self) -> int:
+        """Number of residuals of the fitted poses.
+
+        In the plane one of a point, two of a marker; one of each component of a reading.
+        """
+        return sum(self.measured[j].n_residuals for j in self.used)
+
+    @property
+    def observed_size(self) -> int:
+        """Numbers that residuals depend on: those of a measured curve, and of readings."""
+        model = self.unknowns.model
+        curve = (model.chain.n + 1) * int(functions_of(model).station.size1_out(0))
+        return curve + int(functions_of(model).readings.size1_out(0))
+
+    # ---- weights -----------------------------------------------------------------------------
+
+    @property
+    def whitening(self) -> tuple[FloatArray, ...]:
+        """The weights, which have to be known."""
+        assert self.weights is not None, "Problem.weighed has not been called"
+        return self.weights
+
+    def weighed(self, values: Values) -> Problem:
+        """Return the problem with the weights of the residuals at these values.
+
+        The covariance of pose j is that of its noise plus E_j E_j^T, where E_j is what a standard
+        deviation of each mode of its own rest curvature does to the residuals.
+        """
+        weights = [
+            self.measured[j].whitening(self.noise, s)
+            for j, s in zip(self.used, values.projections, strict=True)
+        ]
+        rest = self.priors.rest_scatter
+        for k, way in enumerate(self.moved_by_rest(values) if rest.std > 0 else ()):
+            seen = weights[k] @ (way * np.tile(rest.sizes, way.shape[1] // MODES))
+            factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
+            weights[k] = solve_triangular(factor, weights[k], lower=True)
+        return replace(self, weights=tuple(weights))
+
+    def moved_by_rest(self, values: Values) -> list[FloatArray]:
+        """Change (R_j, axes MODES) of the fitted residuals by rest curvatures of the poses' own."""
+        along = self.equilibria.by_rest(*self.state(values), modes_in(self.unknowns.model))
+        return [change for _, change in self.residuals(values, along)]
+
+    # ---- evaluation --------------------------------------------------------------------------
+
+    def state(self, values: Values) -> tuple[Shapes, FloatArray, FloatArray]:
+        """Shapes, parameters and rest curvature before the first pose, for `equilibria`."""
+        return values.shapes, self.unknowns.p(values.theta), self.unknowns.rest(values.theta)
+
+    def observed(self, values: Values) -> list[Observed]:
+        """All poses as the sensors see them."""
+        return self.equilibria.seen(*self.state(values))
+
+    def located(self, values: Values, seen: list[Observed]) -> list[FloatArray]:
+        """Arc lengths (K_j,) [m] at which the fitted poses' points are compared, near those given.
+
+        `seen` are all poses.
+        """
+        places = zip(self.used, values.projections, strict=True)
+        return [self.measured[j].located(seen[j], guess) for j, guess in places]
+
+    def residuals(self, values: Values, along: Tangents) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Residuals (R_j,) of each fitted pose, not whitened, and derivatives along directions."""
+        seen = self.equilibria.observe(*self.state(values), along)
+        length = self.unknowns.model.cable.length
+        for j, s in zip(self.used, values.projections, strict=True):
+            now, change = seen.pose(j, length)
+            yield self.measured[j].linearized(now, s, change)
+
+    def evaluate(self, values: Values) -> Point:
+        """Objective at given unknowns and equilibria."""
+        theta, shapes, seen = values.theta, values.shapes, self.observed(values)
+        moved = self.located(values, seen)
+        residuals: list[FloatArray] = [
+            white @ self.measured[j].residual(seen[j], s)
+            for white, j, s in zip(self.whitening, self.used, moved, strict=True)
+        ]
+        data = float(sum(white @ white for white in residuals))
+        gap = theta - self.mean
+        used = shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
+        prior = float(gap @ self.precision @ gap + ((used / self.deviation_std) ** 2).sum())
+        return Point(theta, shapes, moved, (data + prior) / 2, data, residuals)
+
+    def balanced(self, values: Values, **options: Any) -> Point | None:
+        """The objective at equilibria of all poses near some values; None if a pose has none there.
+
+        `options`: of `BatchEquilibrium.settled`.
+        """
+        shapes, converged = self.equilibria.settled(*self.state(values), **options)
+        if not converged.all():
+            return None
+        point = self.evaluate(Values(values.theta, shapes, values.projections))
+        return point if np.isfinite(point.objective) else None
+
+    # ---- derivatives -------------------------------------------------------------------------
+
+    def linearize(self, point: Values) -> Linearization:
+        """Whitened residuals and their exact first derivatives."""
+        slopes = self.unknowns.slopes(point.theta), self.unknowns.rest_slopes
+        return self.linearize_along(point, self.equilibria.directions(*self.state(point), *slopes))
+
+    def linearize_along(
+        self, point: Values, along: Tangents, correction: Vector | None = None
+    ) -> Linearization:
+        """Residuals and derivatives for given derivatives of the shapes and parameters.
+
+        Parameters
+        ----------
+        correction : Vector, optional
+            How the shapes are about to move, one column; the residuals are those afterwards, to
+            first order.
+        """
+        ways = along if correction is None else along.and_step(correction)
+        out, size = Linearization([], [], [], [], [], along), self.unknowns.size
+        for white, (d, directions) in zip(self.whitening, self.residuals(point, ways), strict=True):
+            if correction is not None:
+                d, directions = d + directions[:, -1], directions[:, :-1]
+            whitened = white @ directions
+            out.residuals.append(white @ d)
+            out.by_theta.append(whitened[:, :size])
+            out.by_deviation.append(whitened[:, size:])
+            out.raw.append(d)
+            out.raw_directions.append(directions)
+        return out
+
+    def normal_equations(self, point: Values, lin: Linearization) -> Normal:
+        """Gauss-Newton normal equations of theta, deviations eliminated."""
+        hessian = self.precision.copy()
+        gradient = self.precision @ (point.theta - self.mean)
+        inner: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        precision = np.diag(1 / self.deviation_std**2)
+        columns = self.equilibria.used_deviations
+        rows = zip(self.used, lin.residuals, lin.by_theta, lin.by_deviation, strict=True)
+        for j, e, a, b in rows:
+            hessian += a.T @ a
+            gradient += a.T @ e
+            block = b.T @ b + precision
+            cross = b.T @ a
+            slope = b.T @ e + precision @ point.shapes.deviation[j, columns]
+            solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+            hessian -= cross.T @ solved[:, :-1]
+            gradient -= cross.T @ solved[:, -1]
+            inner.append((block, cross, slope))
+        return Normal(hessian, gradient, inner)
+
+    def shape_step(self, along: Tangents, step: FloatArray, deviation: FloatArray) -> Vector:
+        """How the shapes move with a step of theta and of the deviations, one column."""
+        own = deviation[:, self.equilibria.used_deviations]
+        both = np.concatenate([np.broadcast_to(step, (len(own), len(step))), own], axis=1)
+        return Vector(along.x @ both[:, None, :, None], along.lam @ both[:, :, None])
