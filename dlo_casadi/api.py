@@ -26,14 +26,8 @@ from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.equilibrium.pose import Branch, Pose
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.io.parameters import load_parameters
-from dlo_casadi.report.drawing import prediction_figure
-from dlo_casadi.report.notebook import (
-    outcome_figure,
-    outcome_html,
-    outcome_text,
-    shape_html,
-    shape_text,
-)
+from dlo_casadi.report.figures_poses import outcome_figure, prediction_figure
+from dlo_casadi.report.notebook import outcome_html, outcome_text, shape_html, shape_text
 from dlo_casadi.report.parameters_text import parameters_of
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
@@ -47,15 +41,15 @@ class PredictedShape(CableShape):
 
     def plot(self) -> Figure:
         """The shape with the forces of the cable on its fixtures."""
-        return prediction_figure(self.as_dict())
+        return prediction_figure(self)
 
     def __str__(self) -> str:
-        return shape_text(self.as_dict())
+        return shape_text(self)
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return shape_html(self.as_dict())
+        return shape_html(self)
 
 
 class Result(Outcome):

@@ -14,7 +14,8 @@ from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
-from dlo_casadi.report.check_table import advice_lines, check_dict, check_table
+from dlo_casadi.report.json_report import check_dict
+from dlo_casadi.report.terminal import check_table
 from dlo_casadi.session.measure import calibrated, draw_steps, read_inputs
 from dlo_casadi.session.plausibility import find_suspicions
 from dlo_casadi.vision import encoded
@@ -59,8 +60,9 @@ def main(argv: Sequence[str]) -> int:
         return OK if result["ok"] else BAD_INPUT
     page = console(quiet=chosen.quiet)
     page.print(check_table(config, result["poses"]))
-    for line in advice_lines(result["poses"]):
-        page.print(line, soft_wrap=True, markup=False)
+    for row in result["poses"]:
+        for advice in row["advice"]:
+            page.print(f"{row['name']}: {advice}", soft_wrap=True, markup=False)
     for warning in result["warnings"]:
         page.print(f"[bold yellow]warning:[/] {escape(warning)}", soft_wrap=True)
     for path in sorted({path.parent for path in pictures}):

@@ -13,7 +13,7 @@ from dlo_casadi.cli.guard import OK
 from dlo_casadi.cli.options import add_parameters, command, console, parsed, print_json
 from dlo_casadi.errors import DloError
 from dlo_casadi.report.canvas import save_figure
-from dlo_casadi.report.drawing import prediction_figure
+from dlo_casadi.report.figures_poses import prediction_figure
 from dlo_casadi.report.terminal import prediction_table
 
 DRAWN = (".png", ".pdf", ".svg", ".jpg")
@@ -75,12 +75,12 @@ def main(argv: Sequence[str]) -> int:
         branch=chosen.branch,
     )
     if figure is not None:
-        save_figure(figure, prediction_figure(shape.as_dict()))
+        save_figure(figure, prediction_figure(shape))
     if chosen.json:
         print_json(shape.as_dict())
         return OK
     page = console(quiet=chosen.quiet)
-    page.print(prediction_table(shape.as_dict(), _notes(shape)))
+    page.print(prediction_table(shape, _notes(shape)))
     if figure is not None:
         page.print(f"Figure: {figure}", soft_wrap=True)
     return OK

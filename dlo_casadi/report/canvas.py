@@ -6,34 +6,52 @@ import io
 import re
 import textwrap
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib as mpl
-import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from dlo_casadi.io.files import write_file
-from dlo_casadi.session.outcome import Outcome, Stage, StageName
+from dlo_casadi.report.scene import Mark, Room, Scene, seen
+from dlo_casadi.session.outcome import Outcome
 
 # Colours that the colour-blind can tell apart, each at least 4.5 to 1 against white.
 BLACK, GREY = "#1F2933", "#6B7280"
 ORANGE, BLUE, GREEN, VERMILLION = "#B35A00", "#0067A3", "#00805A", "#9E2A00"
 HELD_OUT = "#8C3B6C"  # poses that no fit saw
-# By what name tables and charts have the RMS distance that the noise of points gives by itself.
-NOISE_ALONE = "noise alone"
-
-STAGE_LABELS: dict[StageName, str] = {
-    "initial": "initial guess",
-    "stiffness_only": "stiffness alone",
-    "algorithm1": "Algorithm 1",
-    "batch": "declared model, fitted",
-    "closed": "with added effects",
+FORCE = "#6A3D9A"
+# Stages that are compared, in every figure.
+STAGE_LINES: dict[str, dict[str, Any]] = {
+    "before": {"color": ORANGE, "ls": "--"},
+    "after": {"color": BLUE, "ls": "-"},
+}
+# What stands in a scene, by the kinds of its marks.
+STYLES: dict[str, dict[str, Any]] = {
+    "grid": {"color": "#E3E3E3", "lw": 0.6},
+    "shadow": {"color": "#9AA5B1", "lw": 1.0},
+    "plumb": {"color": "#9AA5B1", "lw": 0.8, "ls": ":"},
+    "world": {"color": GREY, "lw": 0.9},
+    "weight": {"color": GREY, "lw": 0.9},
+    "force": {"color": FORCE, "lw": 1.2},
+    "force-read": {"color": BLACK, "lw": 1.0, "ls": ":"},
+    "taken": {"color": "#9AA5B1", "lw": 1.2},
+    "pulled": {"color": BLUE, "lw": 5, "solid_capstyle": "butt"},
+    "pull": {"color": VERMILLION, "lw": 1.6},
+    "next": {"color": VERMILLION, "lw": 2.2},
+    "next-letter": {"color": VERMILLION, "fontsize": 10},
+    "letter": {"color": GREY, "fontsize": 7},
+    "marker": {"color": "#C9D0D8", "lw": 1.0},
+    "axis-x": {"color": "#D0103A", "lw": 1.2},
+    "axis-y": {"color": "#00805A", "lw": 1.2},
+    "axis-z": {"color": "#3A3AD6", "lw": 1.2},
+    "fixture start": {"color": BLACK, "marker": "s", "ms": 3, "markevery": [0]},
+    "fixture end": {"color": BLACK, "marker": "o", "ms": 3, "markevery": [0]},
 }
 
 _STYLE: dict[Any, Any] = {
@@ -108,15 +126,6 @@ def headline(drawing: Figure, text: str) -> None:
     drawing.suptitle(textwrap.fill(text, letters, break_on_hyphens=False), fontsize=11)
 
 
-def drawn(drawing: Figure, dpi: float) -> NDArray[np.uint8]:
-    """Pixels (H, W, 4; red, green, blue, opacity) of a figure without its background."""
-    drawing.set_dpi(dpi)
-    drawing.patch.set_alpha(0.0)
-    canvas = FigureCanvasAgg(drawing)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())
-
-
 @contextmanager
 def styled(
     size: tuple[float, float], layout: Literal["constrained"] | None = "constrained"
@@ -128,44 +137,53 @@ def styled(
         yield drawing
 
 
-def before_after(outcome: Outcome) -> tuple[Stage | None, Stage | None]:
-    """The stages that a figure compares: the last one, and the one that it improves on.
-
-    With effects added: the declared model fitted, and the model with the effects. Otherwise: the
-    initial guess, and the declared model fitted.
-    """
-    with_shapes = [stage for stage in outcome.stages if stage.shapes]
-    if not with_shapes:
-        return None, None
-    after = with_shapes[-1]
-    name: StageName = "batch" if after.name == "closed" else "initial"
-    before = next((stage for stage in with_shapes if stage.name == name), None)
-    return (None if before is after else before), after
+@contextmanager
+def chart(
+    outcome: Outcome, said: str, height: float, panels: int = 1, width: float = WIDTH
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Open a figure of a run with panels below one another; its headline tells what it shows."""
+    with styled((width, height)) as drawing:
+        yield drawing, list(drawing.subplots(panels, 1, squeeze=False, sharex=True)[:, 0])
+        headline(drawing, f"{outcome.config.cable.name}: {said}")
 
 
-# A stage that is compared: "before" or "after", what to call it, and the stage.
-Compared = tuple[str, str, Stage]
-
-
-def compared(outcome: Outcome) -> list[Compared]:
-    """The stages of `before_after` that there are."""
-    stages = zip(("before", "after"), before_after(outcome), strict=True)
-    return [(kind, label_of(stage, outcome), stage) for kind, stage in stages if stage is not None]
-
-
-def label_of(stage: Stage, outcome: Outcome) -> str:
-    """What to call a stage in a figure."""
-    if stage.name == "closed" and outcome.effects:
-        return "with " + " and ".join(effect.name for effect in outcome.effects)
-    return STAGE_LABELS[stage.name]
-
-
-def millimetres(value: float | None) -> str:
-    """A length [m] as text in mm, with three digits; a dash for none."""
-    return "-" if value is None else f"{1e3 * value:.3g} mm"
+def line_of(label: str, **style: Any) -> Line2D:
+    """A line in a legend."""
+    return Line2D([], [], label=label, **style)
 
 
 def dot(label: str, marker: str, color: str, fill: str = "") -> Line2D:
     """A marker in a legend."""
     fill = fill or ("white" if marker == "D" else color)
-    return Line2D([], [], ls="none", ms=7, marker=marker, color=color, mfc=fill, label=label)
+    return line_of(label, ls="none", ms=7, marker=marker, color=color, mfc=fill)
+
+
+def draw_marks(axes: Axes, marks: Iterable[Mark]) -> None:
+    """Draw what stands in a room, seen from a corner, or lies on a board."""
+    for mark in marks:
+        points = seen(mark.points)
+        if mark.label:
+            axes.text(
+                points[0, 0],
+                points[0, 1],
+                mark.label,
+                **STYLES[mark.kind],
+                ha="center",
+                va="center",
+                bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 0.5},
+            )
+        elif mark.kind in STYLES:
+            axes.plot(*points.T, **STYLES[mark.kind])
+
+
+def frame(axes: Axes, scene: Scene) -> None:
+    """Show all of a room, without ticks: the floor's squares tell its size; or of a board."""
+    if not isinstance(scene, Room):
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(xlabel="x [m]", ylabel="y [m]")
+        return
+    width, height = scene.window / 2
+    axes.set(xlim=(-width, width), ylim=(-height, height), xticks=[], yticks=[])
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+    axes.set_aspect("equal")

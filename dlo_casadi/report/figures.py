@@ -23,23 +23,28 @@ from dlo_casadi.report.canvas import (
     BLUE,
     GREY,
     HELD_OUT,
-    NOISE_ALONE,
     ORANGE,
+    STAGE_LINES,
+    STYLES,
     VERMILLION,
-    WIDTH,
-    before_after,
-    compared,
+    chart,
     dot,
-    headline,
+    draw_marks,
+    frame,
+    line_of,
+    save_figure,
+)
+from dlo_casadi.report.scene import Mark, Scene, next_marks, pull_marks, scene_of
+from dlo_casadi.report.words import (
+    NOISE_ALONE,
+    compared,
+    cross_validated,
+    directions,
+    finding_of,
     label_of,
     millimetres,
-    save_figure,
-    styled,
 )
-from dlo_casadi.report.figures_scene import next_pose_figure, unexplained_figure
-from dlo_casadi.report.geometry import directions, residual_along, residual_range, rest_about
-from dlo_casadi.report.text_findings import cross_validated, finding_of
-from dlo_casadi.session.outcome import Outcome, PoseInput
+from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.thresholds import NORMAL_95
 
 # A candidate that was not refitted.
@@ -99,8 +104,8 @@ def errors_figure(outcome: Outcome) -> Figure:
         own = [kind for kind in shown if kind != "cross-validated" or stage.name in validated]
         rows += [(k, kind, known[kind]) for kind in own]
     places = [-(i + 0.8 * k) for i, (k, *_) in enumerate(rows)]
-    with styled((WIDTH, 1.6 + 0.2 * len(rows) + 0.2 * len(outcome.stages))) as drawing:
-        axes = drawing.subplots()
+    height = 1.6 + 0.2 * len(rows) + 0.2 * len(outcome.stages)
+    with chart(outcome, "error of each stage", height) as (drawing, (axes,)):
         left, right = _error_axis(axes, [value for *_, value in rows], floor, 4.0)
         for y, (_, kind, value) in zip(places, rows, strict=True):
             if value is None or not np.isfinite(value):
@@ -128,17 +133,16 @@ def errors_figure(outcome: Outcome) -> Figure:
         axes.set_yticks(middles, names)
         handles = [dot(kind, *_KINDS[kind]) for kind in shown]
         drawing.legend(handles=[*handles, _floor(floor)], loc="outside lower center", ncols=2)
-        headline(drawing, f"{outcome.config.cable.name}: error of each stage")
     return drawing
 
 
 def pose_errors_figure(outcome: Outcome) -> Figure:
     """Error of every pose, before and after; a row of it can be chosen on the page."""
     floor = outcome.measurement.noise_distance
-    looks = {"before": (ORANGE, "^"), "after": (BLUE, "o")}
+    looks = {"before": ("^", ORANGE), "after": ("o", BLUE)}
     stages = [(stage, label, *looks[kind]) for kind, label, stage in compared(outcome)]
-    with styled((WIDTH, 1.6 + 0.2 * len(stages) + 0.22 * max(3, len(outcome.poses)))) as drawing:
-        axes = drawing.subplots()
+    height = 1.6 + 0.2 * len(stages) + 0.22 * max(3, len(outcome.poses))
+    with chart(outcome, "error of each pose", height) as (drawing, (axes,)):
         found = [[stage.shapes.get(x.name) for stage, *_ in stages] for x in outcome.poses]
         errors = [[None if shape is None else shape.rmse for shape in own] for own in found]
         left, right = _error_axis(axes, (x for own in errors for x in own), floor, 1.6)
@@ -146,7 +150,7 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
             at = np.clip([np.nan if x is None else 1e3 * x for x in own], left, right)
             axes.plot(at, [-k] * len(at), color=GREY, lw=1.2, zorder=1)
             said = []
-            for x, error, (_, label, color, marker) in zip(at, own, stages, strict=True):
+            for x, error, (_, label, marker, color) in zip(at, own, stages, strict=True):
                 fill = "white" if pose.role == "held_out" else color
                 axes.plot(x, -k, marker, color=color, mfc=fill, mew=1.5, ms=6)
                 said.append(f"{label} {millimetres(error)}")
@@ -154,12 +158,10 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
             row.set(gid=f"choose-{k}", label="; ".join([_name(pose), *said]))
         axes.set_yticks(range(0, -len(outcome.poses), -1), [_short(x.name) for x in outcome.poses])
         axes.set_ylim(0.6 - len(outcome.poses), 0.6)
-        handles = [dot(label, marker, color) for _, label, color, marker in stages]
-        handles.append(_floor(floor))
+        handles = [*(dot(*look) for _, *look in stages), _floor(floor)]
         if any(pose.role == "held_out" for pose in outcome.poses):
             handles.append(dot("hollow: held out", "o", GREY, fill="white"))
         drawing.legend(handles=handles, loc="outside lower center", ncols=1)
-        headline(drawing, f"{outcome.config.cable.name}: error of each pose")
     return drawing
 
 
@@ -185,7 +187,7 @@ def _error_axis(
 
 
 def _floor(floor: float) -> Line2D:
-    return Line2D([], [], color=BLACK, ls="--", label=f"{NOISE_ALONE} {millimetres(floor)}")
+    return line_of(f"{NOISE_ALONE} {millimetres(floor)}", color=BLACK, ls="--")
 
 
 def _name(pose: PoseInput) -> str:
@@ -201,11 +203,12 @@ def _short(name: str) -> str:
 
 def residuals_figure(outcome: Outcome) -> Figure:
     """Residual along the arc in noise units, before and after, a line for each pose."""
-    panels = [(*found, way) for found in compared(outcome) for way in directions(outcome)]
+    ways = list(enumerate(directions(outcome)))
+    panels = [(*found, *way) for found in compared(outcome) for way in ways]
     noise = outcome.measurement.std
-    with styled((WIDTH, 1.4 + 1.9 * len(panels))) as drawing:
-        grid = drawing.subplots(len(panels), 1, squeeze=False, sharex=True)
-        for axes, (kind, label, stage, direction) in zip(grid[:, 0], panels, strict=True):
+    said = f"residuals, noise std {millimetres(noise)} ({outcome.measurement.std_source})"
+    with chart(outcome, said, 1.4 + 1.9 * len(panels), len(panels)) as (drawing, grid):
+        for axes, (kind, label, stage, way, direction) in zip(grid, panels, strict=True):
             axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
             axes.axhline(0, color=GREY, lw=0.8)
             for k, pose in enumerate(outcome.poses):
@@ -217,7 +220,7 @@ def residuals_figure(outcome: Outcome) -> Figure:
                 error = "" if shape.rmse is None else f", RMS distance {millimetres(shape.rmse)}"
                 axes.plot(
                     shape.s[every],
-                    residual_along(shape, direction)[every] / noise,
+                    np.atleast_2d(shape.residual.T)[way, every] / noise,
                     color=HELD_OUT if held_out else BLUE,
                     ls="--" if held_out else "-",
                     lw=1.1,
@@ -231,26 +234,32 @@ def residuals_figure(outcome: Outcome) -> Figure:
             title = f"{kind}: {label}{direction and f', along {direction}'}"
             axes.set_title(textwrap.fill(title + quality, 52), loc="left")
             axes.set_ylabel("residual [noise std]")
-            axes.set_ylim(residual_range(stage, noise))
-        grid[-1, 0].set_xlabel("arc length from the start s [m]")
-        grid[-1, 0].set_xlim(0, outcome.config.cable.length)
-        _legend_of_poses(drawing, outcome.poses, "")
-        headline(
-            drawing,
-            f"{outcome.config.cable.name}: residuals, noise std "
-            f"{millimetres(noise)} ({outcome.measurement.std_source})",
-        )
+            axes.set_ylim(_residual_range(stage, noise))
+        grid[-1].set_xlabel("arc length from the start s [m]")
+        grid[-1].set_xlim(0, outcome.config.cable.length)
+        _legend_of_poses(drawing, outcome.poses)
     return drawing
 
 
-def _legend_of_poses(drawing: Figure, poses: Iterable[PoseInput], marker: str) -> None:
+def _residual_range(stage: Stage, noise: float) -> tuple[float, float]:
+    """From where to where residuals are drawn, in standard deviations `noise` [m] of them.
+
+    Beyond 95 % of the noise, and all residuals; of poses that were measured in another equilibrium
+    than the predicted one, which are off by a hundred times as much, only where all are.
+    """
+    shown = [shape for shape in stage.shapes.values() if len(shape.residual)]
+    near = [shape for shape in shown if shape.measured_branch is None]
+    values = np.concatenate([np.zeros(0), *(shape.residual.ravel() for shape in near or shown)])
+    low, high = values.min(initial=-2.0 * noise) / noise, values.max(initial=2.0 * noise) / noise
+    return low - 0.08 * (high - low), high + 0.08 * (high - low)
+
+
+def _legend_of_poses(drawing: Figure, poses: Iterable[PoseInput], **style: Any) -> None:
     """Tell fit poses, held-out poses if there are any, and the band of noise apart."""
-    style: dict[str, Any] = {"marker": marker, "ls": "none"} if marker else {}
-    handles = [Line2D([], [], color=BLUE, label="fit pose", **style)]
+    handles = [line_of("fit pose", color=BLUE, **style)]
     if any(pose.role == "held_out" for pose in poses):
-        held = {"ls": "--"} | style
-        handles.append(Line2D([], [], color=HELD_OUT, label="held-out pose", **held))
-    handles.append(Line2D([], [], color=_BAND, lw=8, label="95 % of the noise lies within"))
+        handles.append(line_of("held-out pose", color=HELD_OUT, **({"ls": "--"} | style)))
+    handles.append(line_of("95 % of the noise lies within", color=_BAND, lw=8))
     drawing.legend(handles=handles, loc="outside lower center", ncols=2)
 
 
@@ -259,9 +268,9 @@ def readings_figure(outcome: Outcome) -> Figure:
     stage = outcome.stages[-1]
     names = sorted({name for shape in stage.shapes.values() for name in shape.readings})
     poses = [x for x in outcome.poses if x.name in stage.shapes and stage.shapes[x.name].readings]
-    with styled((8.5, 0.9 + 2.4 * len(names))) as drawing:
-        grid = drawing.subplots(len(names), 1, squeeze=False, sharex=True)
-        for axes, name in zip(grid[:, 0], names, strict=True):
+    said = f"readings, measured minus predicted ({label_of(stage, outcome)})"
+    with chart(outcome, said, 0.9 + 2.4 * len(names), len(names), 8.5) as (drawing, grid):
+        for axes, name in zip(grid, names, strict=True):
             std, unit = outcome.measurement.std_of(name.split("_")[1])
             axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
             axes.axhline(0, color=GREY, lw=0.8)
@@ -272,20 +281,13 @@ def readings_figure(outcome: Outcome) -> Figure:
                 color = HELD_OUT if pose.role == "held_out" else BLUE
                 apart = 0.2 * (np.arange(len(known)) - (len(known) - 1) / 2)
                 axes.plot(k + apart, (known - model) / std, ".-", color=color, lw=0.6, ms=6)
-            count = len(
-                next(x.readings[name][0] for x in stage.shapes.values() if name in x.readings)
-            )
-            parts = f"{', '.join('xyz'[:count])} from left to right, " if count > 1 else ""
+            parts = f"{', '.join('xyz'[: len(apart)])} from left to right, "
+            parts = parts if len(apart) > 1 else ""
             axes.set_title(f"{name}: {parts}noise {std:.3g} {unit}", loc="left")
             axes.set_ylabel("residual / noise")
         ticks = [pose.name for pose in poses]
-        grid[-1, 0].set_xticks(range(len(poses)), ticks, rotation=60, ha="right", fontsize=8)
-        _legend_of_poses(drawing, poses, "o")
-        headline(
-            drawing,
-            f"{outcome.config.cable.name}: readings, measured minus predicted "
-            f"({label_of(stage, outcome)})",
-        )
+        grid[-1].set_xticks(range(len(poses)), ticks, rotation=60, ha="right", fontsize=8)
+        _legend_of_poses(drawing, poses, marker="o", ls="none")
     return drawing
 
 
@@ -294,39 +296,33 @@ def readings_figure(outcome: Outcome) -> Figure:
 
 def rest_curvature_figure(outcome: Outcome) -> Figure:
     """Rest curvature of the last stage with its band, and of the fit that it improves on."""
-    before, after = before_after(outcome)
-    shown = directions(outcome)
-    with styled((WIDTH, 1.9 + 1.9 * len(shown))) as drawing:
-        grid = drawing.subplots(len(shown), 1, squeeze=False, sharex=True)
-        for axes, direction in zip(grid[:, 0], shown, strict=True):
-            if before is not None and before.name == "batch":
-                rest = rest_about(before, direction)
-                axes.plot(rest.s, rest.value, "--", color=ORANGE, label=label_of(before, outcome))
-            if after is not None:
-                rest = rest_about(after, direction)
-                half = NORMAL_95 * rest.std
-                axes.plot(rest.s, rest.value, color=BLUE, label=label_of(after, outcome))
-                axes.fill_between(
-                    rest.s,
-                    rest.value - half,
-                    rest.value + half,
-                    color=BLUE,
-                    alpha=0.2,
-                    lw=0,
-                    label="its 95 % band",
-                )
+    ways = directions(outcome)
+    straight = outcome.config.cable.rest_shape == "straight"
+    said = (
+        f"rest curvature ({'declared straight, not fitted' if straight else 'shape without load'})"
+    )
+    shown = [x for x in compared(outcome) if x.kind == "after" or x.stage.name == "batch"]
+    with chart(outcome, said, 1.9 + 1.9 * len(ways), len(ways)) as (drawing, grid):
+        for k, (axes, direction) in enumerate(zip(grid, ways, strict=True)):
+            for kind, label, stage in shown:
+                rest = stage.rest_curvature
+                value, std = np.atleast_2d(rest.value)[k], np.atleast_2d(rest.std)[k]
+                axes.plot(rest.s, value, **STAGE_LINES[kind], label=label)
+                if kind == "after":
+                    edges = (value + sign * NORMAL_95 * std for sign in (-1, 1))
+                    style: dict[str, Any] = {
+                        "color": BLUE,
+                        "alpha": 0.2,
+                        "lw": 0,
+                        "label": "its 95 % band",
+                    }
+                    axes.fill_between(rest.s, *edges, **style)
             axes.axhline(0, color=GREY, lw=0.8)
             about = direction and f" k_{direction}"
-            axes.set(
-                xlim=(0, outcome.config.cable.length),
-                ylabel=f"rest curvature{about} [1/m]",
-            )
-        grid[-1, 0].set_xlabel("arc length from the start s [m]")
-        handles, _ = grid[0, 0].get_legend_handles_labels()
+            axes.set(xlim=(0, outcome.config.cable.length), ylabel=f"rest curvature{about} [1/m]")
+        grid[-1].set_xlabel("arc length from the start s [m]")
+        handles, _ = grid[0].get_legend_handles_labels()
         drawing.legend(handles=handles, loc="outside lower center", ncols=1)
-        straight = outcome.config.cable.rest_shape == "straight"
-        note = "declared straight, not fitted" if straight else "shape without load"
-        headline(drawing, f"{outcome.config.cable.name}: rest curvature ({note})")
     return drawing
 
 
@@ -337,8 +333,7 @@ def moment_figure(outcome: Outcome) -> Figure | None:
     shown = [p for p in outcome.poses if p.role == "fit" and len(p.points) >= LEAST_POINTS]
     if not weight or not shown or cable.rest_shape != "straight":
         return None  # the moment needs the weight, and the bend the shape without load
-    with styled((WIDTH, 3.8)) as drawing:
-        axes = drawing.subplots()
+    with chart(outcome, "moment against curvature", 3.8) as (drawing, (axes,)):
         most = 0.0
         for pose in shown:
             found = measured_moment_curve(pose.points, cable.length, weight, gravity, pose.s)
@@ -350,7 +345,6 @@ def moment_figure(outcome: Outcome) -> Figure | None:
         axes.plot(grid, 1e3 * law, color=VERMILLION, label="fitted law of the section")
         axes.set(xlabel="curvature [1/m]", ylabel="bending moment [N mm]", xlim=(0, None))
         drawing.legend(loc="outside lower center", ncols=1)
-        headline(drawing, f"{cable.name}: moment against curvature")
     return drawing
 
 
@@ -361,45 +355,80 @@ def candidates_figure(outcome: Outcome) -> Figure:
     """Candidates for a missing effect: score, and cross-validated error where refitted."""
     added = {effect.name for effect in outcome.effects}
     tied = {name for effect in outcome.effects for name in effect.indistinguishable_from}
-    rows = list(outcome.candidates)
-    scores = [row.score for row in rows]
-    with styled((8.5, 1.9 + 0.36 * len(rows))) as drawing:
-        axes = drawing.subplots()
-        for k, (row, score) in enumerate(zip(rows, scores, strict=True)):
-            tried = row.reason or row.rmse_cross_validated is not None
-            lost = GREY if tried else _UNTRIED
-            known = BLUE if row.name in added else lost
-            color = ORANGE if row.name in tied else known
-            axes.barh(-k, score, height=0.5, color=color)
-            if color == GREY:
-                axes.text(0, -k - 0.38, f" {finding_of(outcome, row)[1]}", va="center", fontsize=7)
+    rows = outcome.candidates
+    said = "what the declared model may lack: refits, then by score"
+    if outcome.verdict == "unexplained":
+        said = "candidates tried; what is left is not explained by any"
+    elif not outcome.effects:
+        said = "candidates tried; the declared model needs none"
+    looks = [
+        (BLUE, "added to the model"),
+        (ORANGE, "cannot be told apart from it"),
+        (GREY, "refitted, not added"),
+        (_UNTRIED, "not refitted"),
+    ]
+    found = []
+    with chart(outcome, said, 1.9 + 0.36 * len(rows), width=8.5) as (drawing, (axes,)):
+        for k, row in enumerate(rows):
             error = row.rmse_cross_validated
-            text = f" {score:,.0f}" if score >= 100 else f" {score:.2g}"
+            look = 2 if row.reason or error is not None else 3
+            look = 1 if row.name in tied else 0 if row.name in added else look
+            found.append(look)
+            axes.barh(-k, row.score, height=0.5, color=looks[look][0])
+            if look == 2:
+                axes.text(0, -k - 0.38, f" {finding_of(outcome, row)[1]}", va="center", fontsize=7)
+            text = f" {row.score:,.0f}" if row.score >= 100 else f" {row.score:.2g}"
             text += "" if error is None else f"   cross-validated {millimetres(error)}"
-            axes.text(score, -k, text, va="center", fontsize=9)
+            axes.text(row.score, -k, text, va="center", fontsize=9)
         axes.set_yticks([-k for k in range(len(rows))], [row.name for row in rows])
-        axes.set_xlim(0, 1.55 * max([*scores, 1e-9]))
+        axes.set_xlim(0, 1.55 * max(1e-9, *(row.score for row in rows)))
         axes.set_ylim(0.5 - len(rows), 0.5)
         axes.grid(visible=False, axis="y")
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
         axes.set_xlabel("score: fall of chi-square that adding it promises")
-        handles = [
-            Patch(color=BLUE, label="added to the model"),
-            Patch(color=ORANGE, label="cannot be told apart from it"),
-            Patch(color=GREY, label="refitted, not added"),
-            Patch(color=_UNTRIED, label="not refitted"),
-        ]
-        refitted = [bool(row.reason) or row.rmse_cross_validated is not None for row in rows]
-        shown = [bool(added), bool(tied), sum(refitted) > len(added | tied), not all(refitted)]
-        handles = [handle for handle, show in zip(handles, shown, strict=True) if show]
+        handles = [Patch(color=c, label=label) for k, (c, label) in enumerate(looks) if k in found]
         drawing.legend(handles=handles, loc="outside lower center", ncols=2)
-        title = "what the declared model may lack: refits, then by score"
-        if outcome.verdict == "unexplained":
-            title = "candidates tried; what is left is not explained by any"
-        elif not outcome.effects:
-            title = "candidates tried; the declared model needs none"
-        headline(drawing, f"{outcome.config.cable.name}: {title}")
     return drawing
 
 
-# ---- the board ---------------------------------------------------------------------------------
+# ---- all poses in one scene --------------------------------------------------------------------
+
+
+def unexplained_figure(outcome: Outcome) -> Figure:
+    """Where the cable is pulled, and how, in each fit pose."""
+    load = outcome.unexplained
+    assert load is not None
+    low, high = load.interval
+    size = float(np.linalg.norm(load.force))
+    handles = [
+        line_of("measured", **STYLES["taken"]),
+        line_of(f"pulled at {low:.3f} to {high:.3f} m (95 %)", **STYLES["pulled"]),
+        line_of(f"force in each pose, on average {size:.3g} N", **STYLES["pull"]),
+    ]
+    said = "unexplained, pulled by something that is not in the model"
+    return _scene_figure(outcome, pull_marks, handles, said)
+
+
+def next_pose_figure(outcome: Outcome) -> Figure:
+    """Where to hold the end in the next pose, among those that were taken."""
+    handles = [
+        line_of("measured", **STYLES["taken"]),
+        dot("next end", "P", VERMILLION),
+        dot("starts", "s", BLACK),
+        dot("ends", "o", BLACK),
+    ]
+    return _scene_figure(outcome, next_marks, handles, "which pose to measure next")
+
+
+def _scene_figure(
+    outcome: Outcome,
+    marks: Callable[[Outcome, Scene], list[Mark]],
+    handles: list[Line2D],
+    said: str,
+) -> Figure:
+    with chart(outcome, said, 4.6) as (drawing, (axes,)):
+        scene, under = scene_of(outcome)
+        draw_marks(axes, [*under, *marks(outcome, scene)])
+        frame(axes, scene)
+        drawing.legend(handles=handles, loc="outside lower center", ncols=1 + len(handles) // 4)
+    return drawing

@@ -1,39 +1,56 @@
-"""Figures of poses: measured points on the predicted shapes, on pages of one scale."""
+"""Figures of poses: measured points on predicted shapes, all in one frame, one predicted shape."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from dlo_casadi.equilibrium.cable_shape import CableShape
 from dlo_casadi.equilibrium.spread import EDGE
-from dlo_casadi.report.arrows import forces_read
 from dlo_casadi.report.canvas import (
     BLACK,
     BLUE,
+    FORCE,
+    GREY,
     HELD_OUT,
-    ORANGE,
-    before_after,
-    label_of,
-    millimetres,
+    STAGE_LINES,
+    STYLES,
+    VERMILLION,
+    draw_marks,
+    frame,
+    line_of,
     save_figure,
     styled,
 )
-from dlo_casadi.report.figures_room import FORCE, STYLES, draw_marks, frame
-from dlo_casadi.report.geometry import band_outline, magnified
-from dlo_casadi.report.room import Room, around, rooms, seen
-from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
+from dlo_casadi.report.scene import (
+    Room,
+    Scene,
+    around,
+    arrow,
+    band_outline,
+    beside,
+    scene_of,
+    scenes_of,
+    seen,
+)
+from dlo_casadi.report.tables import error_rows
+from dlo_casadi.report.words import Compared, compared, label_of, millimetres
+from dlo_casadi.session.outcome import Outcome, PoseInput
 
 FloatArray = NDArray[np.floating]
 
 _POSES_A_PAGE = 20
+# Points of a measured line that are drawn, about: on a page of poses, with all poses in one frame.
+_POINTS, _POINTS_IN_ONE = 60, 40
 # A typical deviation is drawn about this share of the cable's length wide.
 _VISIBLE = 0.02
 _FACTORS = (1, 5, 10, 20, 50, 100)
@@ -42,6 +59,11 @@ _NARROWEST, _PANEL, _TALLEST = 7.5, 3.1, 8.0
 # Room [inch] for ticks and names of axes, the headline, the legend, titles of two lines, the edge.
 _LEFT, _BOTTOM, _BESIDE = 0.8, 0.85, 0.3
 _TOP, _LEGEND, _ABOVE, _EDGE = 0.95, 0.45, 0.45, 0.1
+# How far beyond the tip of an arrow its number stands, as a share of its length.
+_BEYOND = 0.2
+
+
+# ---- pages of poses ----------------------------------------------------------------------------
 
 
 def draw_poses(folder: Path, outcome: Outcome) -> None:
@@ -51,69 +73,149 @@ def draw_poses(folder: Path, outcome: Outcome) -> None:
     for page in range(pages):
         name = "poses.png" if pages == 1 else f"poses_{page + 1}.png"
         shown = poses[page * _POSES_A_PAGE : (page + 1) * _POSES_A_PAGE]
-        _draw_page(folder / name, outcome, shown)
+        save_figure(folder / name, _page(outcome, shown))
 
 
-def _draw_page(path: Path, outcome: Outcome, poses: Sequence[PoseInput]) -> None:
-    lines = _shown_stages(outcome)
+def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
+    config, stages = outcome.config, compared(outcome)
+    scenes = scenes_of(config, poses, [item.stage for item in stages])
+    last = stages[-1].stage.shapes if stages else {}
+    declared = {pose.name: pose for pose in config.experiment.poses}
+    marks = [
+        around(scene, declared[pose.name], pose.points, last.get(pose.name))
+        for pose, scene in zip(poses, scenes, strict=True)
+    ]
+    room = scenes[0] if isinstance(scenes[0], Room) else None
+    if room is None:
+        shapes = [item.stage.shapes.get(pose.name) for item in stages for pose in poses]
+        center, span = _window(
+            [pose.points for pose in poses if len(pose.points)]
+            + [shape.curve for shape in shapes if shape is not None]
+            + [mark.points for _, over in marks for mark in over]
+        )
+    else:
+        center, span = np.zeros(2), room.window
+    factor = _magnification(stages, config.cable.length)
     rows, columns = _arranged(len(poses))
-    factor = _magnification(outcome, outcome.config.cable.length)
-    in_space = outcome.config.experiment.in_space
-    standing = rooms(outcome.config, poses, [stage for stage, *_ in lines]) if in_space else []
-    draw_forces = lines and not in_space
-    arrows = forces_read(lines[-1][0], outcome.config.cable.length) if draw_forces else {}
-    center, span = _common_frame(outcome, poses, arrows)
-    if standing:
-        span = standing[0].window
-    size, spaces = _laid_out(rows, columns, float(span[1] / span[0]), ticks=not standing)
+    size, spaces = _laid_out(rows, columns, float(span[1] / span[0]), ticks=room is None)
     # Asked where every tick and title ends, an engine would take as long as all the drawing.
     with styled(size, layout=None) as drawing:
         grid = drawing.subplots(
             rows, columns, squeeze=False, sharex=True, sharey=True, gridspec_kw=spaces
         )
-        for axes, pose, room in zip_longest(grid.ravel()[: len(poses)], poses, standing):
+        shown = zip(grid.flat, poses, scenes, marks, strict=False)
+        for axes, pose, scene, (under, over) in shown:
             if room is not None:
-                _draw_in_room(axes, outcome, pose, lines, factor, room)
-                continue
-            _draw_pose(axes, pose, lines, factor, np.asarray)
-            for kind, arrow in arrows.get(pose.name, ()):
-                axes.plot(*arrow.T, **STYLES[kind])
+                frame(axes, scene)
+            draw_marks(axes, under)
+            _draw_pose(axes, pose, stages, factor, scene)
+            draw_marks(axes, over)
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
         for axes in grid.ravel()[len(poses) :]:
             axes.set_axis_off()
-        if not standing:
+        if room is None:
             _label_grid(grid, len(poses))
             _make_room(grid)
-        handles: list[Line2D | Patch] = [
-            Line2D([], [], color=BLACK, marker=".", ls="none", ms=7, label="measured")
-        ]
-        handles += [
-            Line2D([], [], color=color, ls=style, label=label_of(stage, outcome))
-            for stage, color, style in lines
-        ]
-        boundary = outcome.config.experiment.boundary
-        if standing and "clamped" in (boundary.start, boundary.end):
-            handles += [
-                Line2D([], [], **STYLES[f"axis-{name}"], label=f"clamp's {name}") for name in "xyz"
-            ]
-        if standing or outcome.measurement.readings:
-            handles.append(Line2D([], [], color=FORCE, label="force on the ends"))
-        if outcome.measurement.readings:
-            handles.append(Line2D([], [], color=BLACK, ls=":", label="force as read"))
-        if any(pose.role == "held_out" for pose in poses):
-            handles.append(Patch(fc="white", ec=HELD_OUT, lw=2, label="held out of the fit"))
+        handles = _legend_of(outcome, poses, stages)
         drawing.legend(handles=handles, loc="lower center", ncols=len(handles))
-        drawn = "" if factor == 1 else f"; deviations drawn {factor} times as large"
-        if standing:
-            drawn += f"; squares of {standing[0].square:g} mm"
+        said = "" if factor == 1 else f"; deviations drawn {factor} times as large"
+        said += "" if room is None else f"; squares of {room.square:g} mm"
         drawing.suptitle(
-            f"{outcome.config.cable.name}: predicted from the end conditions alone\n"
-            f"RMS distance to the measured points above each pose{drawn}",
+            f"{config.cable.name}: predicted from the end conditions alone\n"
+            f"RMS distance to the measured points above each pose{said}",
             fontsize=11,
             y=1 - _EDGE / size[1],
         )
-    save_figure(path, drawing)
+    return drawing
+
+
+def _legend_of(
+    outcome: Outcome, poses: Sequence[PoseInput], stages: Sequence[Compared]
+) -> list[Line2D | Patch]:
+    experiment, readings = outcome.config.experiment, outcome.measurement.readings
+    handles: list[Line2D | Patch] = [
+        line_of("measured", color=BLACK, marker=".", ls="none", ms=7),
+        *(line_of(label, **STAGE_LINES[kind]) for kind, label, _ in stages),
+    ]
+    if experiment.in_space and "clamped" in (experiment.boundary.start, experiment.boundary.end):
+        handles += [line_of(f"clamp's {name}", **STYLES[f"axis-{name}"]) for name in "xyz"]
+    if experiment.in_space or readings:
+        handles.append(line_of("force on the ends", color=FORCE))
+    if readings:
+        handles.append(line_of("force as read", color=BLACK, ls=":"))
+    if any(pose.role == "held_out" for pose in poses):
+        handles.append(Patch(fc="white", ec=HELD_OUT, lw=2, label="held out of the fit"))
+    return handles
+
+
+def _draw_pose(
+    axes: Axes,
+    pose: PoseInput,
+    stages: Sequence[Compared],
+    factor: int,
+    scene: Scene,
+) -> None:
+    def place(points: FloatArray) -> FloatArray:
+        return seen(scene.points(points))
+
+    last = stages[-1].stage.shapes.get(pose.name) if stages else None
+    elsewhere = last is not None and last.measured_branch is not None
+    factor = 1 if elsewhere else factor  # so far off, larger deviations would leave the picture
+    for kind, _, stage in stages:
+        shape = stage.shapes.get(pose.name)
+        if shape is not None:
+            magnified = factor != 1 and len(pose.points)
+            curve = beside(pose, shape, factor) if magnified else shape.curve
+            axes.plot(*place(curve).T, **STAGE_LINES[kind])
+            spread = shape.spread if factor == 1 and stage is stages[-1].stage else None
+            if spread is not None and spread.ndim == 1:
+                outline = place(band_outline(shape.curve, EDGE * spread))
+                axes.fill(*outline.T, color=STAGE_LINES[kind]["color"], alpha=0.2)
+    if len(pose.points):
+        shown = pose.points[:: max(1, len(pose.points) // _POINTS)]
+        axes.plot(*place(shown).T, ".", color=BLACK, ms=2.5)
+    axes.set_aspect("equal")
+    title = pose.name
+    if last is not None:
+        ends = place(last.curve[[0, -1]])
+        axes.plot(*ends[0], "s", color=BLACK, ms=4)
+        axes.plot(*ends[1], "o", color=BLACK, ms=4)
+    if not len(pose.points):
+        title += ": not read"
+    elif last is None:
+        title += ": no equilibrium"
+    elif last.rmse is not None:
+        title += f": {millimetres(last.rmse)}"
+    if last is not None and not last.stable:
+        title += ", unstable"
+    if last is not None and last.measured_branch is not None:
+        title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch; true size"
+    axes.set_title(title)
+    if pose.role == "held_out":
+        axes.title.set_color(HELD_OUT)
+        for spine in axes.spines.values():
+            spine.set(visible=True, color=HELD_OUT, linewidth=2)
+
+
+def _magnification(stages: Sequence[Compared], size: float) -> int:
+    """Factor on deviations that makes those of the stage before visible in a figure."""
+    shapes = stages[0].stage.shapes.values() if stages else ()
+    errors = [shape.rmse for shape in shapes if shape.rmse]
+    if not errors:
+        return 1
+    wanted = _VISIBLE * size / float(np.median(errors))
+    return max(factor for factor in _FACTORS if factor == 1 or factor <= wanted)
+
+
+def _window(lines: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Middle and size [m] of a window that holds all lines (K, 2)."""
+    corners = np.concatenate(lines) if lines else np.zeros((1, 2))
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    span = 1.08 * (high - low) + 0.02 * max(float((high - low).max()), 1e-3)
+    # A slender window would leave no room for the axis: at least a third of the other side.
+    span = np.maximum(span, span.max() / 3)
+    return (low + high) / 2, span
 
 
 def _laid_out(
@@ -180,98 +282,75 @@ def _arranged(count: int) -> tuple[int, int]:
     return math.ceil(count / columns), columns
 
 
-def _shown_stages(outcome: Outcome) -> list[tuple[Stage, str, str]]:
-    """Stages drawn for each pose, with colour and line style."""
-    before, after = before_after(outcome)
-    lines = [(before, ORANGE, "--"), (after, BLUE, "-")]
-    return [(stage, color, style) for stage, color, style in lines if stage is not None]
+# ---- in one frame ------------------------------------------------------------------------------
 
 
-def _magnification(outcome: Outcome, size: float) -> int:
-    """Factor on deviations that makes those of the stage before visible in a figure."""
-    before, after = before_after(outcome)
-    stage = before or after
-    errors = [shape.rmse for shape in stage.shapes.values() if shape.rmse] if stage else []
-    if not errors:
-        return 1
-    wanted = _VISIBLE * size / float(np.median(errors))
-    return max(factor for factor in _FACTORS if factor == 1 or factor <= wanted)
+def outcome_figure(outcome: Outcome) -> Figure:
+    """All poses in one frame: measured points, and the shapes predicted from their ends alone."""
+    stage = outcome.stages[-1]
+    with styled((7.0, 5.0)) as drawing:
+        axes = drawing.subplots()
+        scene, _ = scene_of(outcome)
+        draw_marks(axes, scene.ground())
+        for pose in outcome.poses:
+            color = HELD_OUT if pose.role == "held_out" else BLUE
+            shape = stage.shapes.get(pose.name)
+            if shape is not None:
+                axes.plot(*seen(scene.points(shape.curve)).T, color=color, lw=1.4)
+            if len(pose.points):
+                shown = pose.points[:: max(1, len(pose.points) // _POINTS_IN_ONE)]
+                axes.plot(*seen(scene.points(shown)).T, ".", color=BLACK, ms=2.5)
+        axes.plot([], [], ".", color=BLACK, label="measured")
+        axes.plot([], [], color=BLUE, label=label_of(stage, outcome))
+        if any(pose.role == "held_out" for pose in outcome.poses):
+            axes.plot([], [], color=HELD_OUT, label="held out of the fit")
+        frame(axes, scene)
+        errors = ", ".join(f"{name} {value}" for name, value in error_rows(outcome)[:2])
+        axes.set_title(f"{outcome.config.cable.name}: {errors}")
+        drawing.legend(loc="outside lower center", ncols=3)
+    return drawing
 
 
-def _draw_in_room(
-    axes: Axes,
-    outcome: Outcome,
-    pose: PoseInput,
-    lines: Sequence[tuple[Stage, str, str]],
-    factor: int,
-    room: Room,
-) -> None:
-    declared = next(item for item in outcome.config.experiment.poses if item.name == pose.name)
-    shape = lines[-1][0].shapes.get(pose.name) if lines else None
-    under, over = around(room, declared, pose.points, shape)
-    frame(axes, room)
-    draw_marks(axes, under)
-    _draw_pose(axes, pose, lines, factor, lambda points: seen(room.points(points)))
-    draw_marks(axes, over)
-
-
-def _draw_pose(
-    axes: Axes,
-    pose: PoseInput,
-    lines: Sequence[tuple[Stage, str, str]],
-    factor: int,
-    place: Callable[[FloatArray], FloatArray],
-) -> None:
-    last = lines[-1][0].shapes.get(pose.name) if lines else None
-    elsewhere = last is not None and last.measured_branch is not None
-    factor = 1 if elsewhere else factor  # so far off, larger deviations would leave the picture
-    for stage, color, style in lines:
-        shape = stage.shapes.get(pose.name)
-        if shape is not None:
-            axes.plot(*place(magnified(pose, shape, factor)).T, color=color, ls=style)
-            spread = shape.spread if factor == 1 and stage is lines[-1][0] else None
-            if spread is not None and spread.ndim == 1:
-                outline = place(band_outline(shape.curve, EDGE * spread))
-                axes.fill(*outline.T, color=color, alpha=0.2)
-    if len(pose.points):
-        shown = pose.points[:: max(1, len(pose.points) // 60)]
-        axes.plot(*place(shown).T, ".", color=BLACK, ms=2.5)
-    axes.set_aspect("equal")
-    if last is not None:
-        ends = place(last.curve[[0, -1]])
-        axes.plot(*ends[0], "s", color=BLACK, ms=4)
-        axes.plot(*ends[1], "o", color=BLACK, ms=4)
-    title = pose.name
-    if not len(pose.points):
-        title += ": not read"
-    elif last is None:
-        title += ": no equilibrium"
-    elif last.rmse is not None:
-        title += f": {millimetres(last.rmse)}"
-    if last is not None and not last.stable:
-        title += ", unstable"
-    if last is not None and last.measured_branch is not None:
-        title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch; true size"
-    axes.set_title(title)
-    if pose.role == "held_out":
-        axes.title.set_color(HELD_OUT)
-        for spine in axes.spines.values():
-            spine.set(visible=True, color=HELD_OUT, linewidth=2)
-
-
-def _common_frame(
-    outcome: Outcome,
-    poses: Sequence[PoseInput],
-    arrows: Mapping[str, Sequence[tuple[str, FloatArray]]],
-) -> tuple[FloatArray, FloatArray]:
-    """Middle and size [m] of a window that holds everything drawn."""
-    drawn = [pose.points for pose in poses if len(pose.points)]
-    for stage, _, _ in _shown_stages(outcome):
-        drawn += [stage.shapes[pose.name].curve for pose in poses if pose.name in stage.shapes]
-    drawn += [arrow for pose in poses for _, arrow in arrows.get(pose.name, ())]
-    corners = np.concatenate(drawn) if drawn else np.zeros((1, 2))
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    span = 1.08 * (high - low) + 0.02 * max(float((high - low).max()), 1e-3)
-    # A slender window would leave no room for the axis: at least a third of the other side.
-    span = np.maximum(span, span.max() / 3)
-    return (low + high) / 2, span
+def prediction_figure(shape: CableShape) -> Figure:
+    """A predicted shape with the forces on its fixtures."""
+    points, eq = shape.points(), shape.equilibrium
+    forces = {"start": eq.lam_start, "end": eq.lam}
+    largest = max(float(np.linalg.norm(force)) for force in forces.values())
+    reach = 0.25 * float(np.ptp(points, axis=0).max()) / max(largest, 1e-12)
+    in_space = shape.cable.model.in_space
+    with styled((7.0, 6.0)) as drawing:
+        axes: Any = drawing.add_subplot(projection="3d" if in_space else None)
+        if not in_space:
+            band = band_outline(points, shape.band())
+            axes.fill(*band.T, color=BLUE, alpha=0.15, lw=0, label="90 % of next hangings")
+        axes.plot(*points.T, color=BLUE, lw=2.5, label="cable")
+        if shape.other_side is not None:
+            other = shape.other_side.points()
+            axes.plot(*other.T, "--", color=BLUE, lw=1.5, label="on the other side")
+        for at, (side, force) in zip((points[0], points[-1]), forces.items(), strict=True):
+            if side == "end" and shape.pose.end is None:
+                continue
+            marker = "s" if side == "start" else "o"
+            axes.plot(*at[:, None], marker, color=BLACK, ms=7, label=side)
+            size = float(np.linalg.norm(force))
+            if size <= 1e-3 * largest or largest == 0:
+                continue
+            axes.plot(*arrow(at, reach * force).T, color=VERMILLION, lw=1.8)
+            beyond = at + (1 + _BEYOND) * reach * force
+            paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
+            number = axes.text(*beyond, f"{size:.3g} N", ha="center", va="center", bbox=paper)
+            number.set_color(VERMILLION)
+            axes.plot(*beyond[:, None], alpha=0)  # a text does not count for the axes' limits
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.12)
+        axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})
+        axes.plot([], [], color=VERMILLION, label="force of the cable on its fixtures")
+        drawing.legend(loc="outside lower center", ncols=4)
+        state = "stable" if eq.stable else "NOT stable"
+        axes.set_title(
+            f"energy {eq.energy:.4g} J, smallest bend radius {millimetres(eq.min_bend_radius)}, "
+            f"{state}",
+            color=GREY if eq.stable else VERMILLION,
+        )
+        drawing.suptitle(f"{shape.cable.model.cable.name}: predicted shape", fontsize=12)
+    return drawing

@@ -1,30 +1,70 @@
-"""report.html: one page for the person at the bench, in one file that asks for nothing else."""
+"""report.html and failed.html: one page for the person at the bench, alone in one file."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-from dlo_casadi.errors import counted
-from dlo_casadi.report.canvas import compared, inline_svg
+from dlo_casadi.config import Config
+from dlo_casadi.effects import EFFECTS
+from dlo_casadi.errors import DloError, counted
+from dlo_casadi.io.files import write_file
+from dlo_casadi.report.canvas import inline_svg
 from dlo_casadi.report.figures import figures_of
-from dlo_casadi.report.page_data import page_data
-from dlo_casadi.report.page_pictures import pictures, scene_pictures
-from dlo_casadi.report.page_views import view_pictures
-from dlo_casadi.report.room import VIEWS
-from dlo_casadi.report.text_parameters import vector
-from dlo_casadi.session.outcome import Outcome
+from dlo_casadi.report.page_pictures import pictures, pose_pictures, scene_pictures, view_pictures
+from dlo_casadi.report.scene import VIEWS
+from dlo_casadi.report.tables import (
+    describe,
+    fitted_rows,
+    fixed_rows,
+    footnotes,
+    nuisance_rows,
+    rest_rows,
+    stage_rows,
+    timing_rows,
+)
+from dlo_casadi.report.words import (
+    CANDIDATE_ORDER,
+    NOISE_ALONE,
+    all_warnings,
+    compared,
+    finding_of,
+    label_of,
+    mesh_text,
+    millimetres,
+    p_value_note,
+    reading_text,
+    separation_text,
+    vector,
+    verdict_lines,
+)
+from dlo_casadi.session.outcome import Outcome, ParameterEstimate, PoseInput
+from dlo_casadi.thresholds import NORMAL_95
 
 # By which a page is known as written by this package.
 GENERATOR = '<meta name="generator" content="dlo_casadi">'
+# Where a number does not exist.
+NOTHING = "–"
+VERDICT_WORDS = {
+    None: "Not diagnosed",
+    "complete": "Complete",
+    "effect_found": "Effect found",
+    "unexplained": "Unexplained",
+}
+
+
+# ---- of a run ----------------------------------------------------------------------------------
 
 
 def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> str:
@@ -40,9 +80,9 @@ def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> 
     """
     shown = pictures(outcome)
     charts = figures_of(outcome) if drawn is None else drawn
-    return render(
+    return _render(
         "report.html",
-        outcome.config.experiment.in_space,
+        outcome.config,
         pictures=shown,
         photographs=view_pictures(outcome.poses, compared(outcome)),
         room=shown[0].behind.room,
@@ -53,18 +93,177 @@ def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> 
     )
 
 
-def render(template: str, in_space: bool, **data: Any) -> str:
-    """Fill a template with data.
+def page_data(outcome: Outcome) -> dict[str, Any]:
+    """Everything that the template of a run writes, but for pictures and charts."""
+    first, *details = (line.strip() for line in verdict_lines(outcome))
+    labels = {item.kind: item.label for item in compared(outcome)}
+    m, proposal = outcome.measurement, outcome.next_pose
+    return {
+        "verdict": outcome.verdict or "off",
+        "verdict_word": "Fit failed" if outcome.fit.failed else VERDICT_WORDS[outcome.verdict],
+        "sentence": sentence(first),
+        "details": details,
+        "tiles": tiles(outcome),
+        "warnings": all_warnings(outcome),
+        "before": labels.get("before"),
+        "after": labels.get("after"),
+        "last": label_of(outcome.stages[-1], outcome),
+        "stages": stage_rows(outcome, NOTHING),
+        "noise": millimetres(m.std),
+        "noise_alone": NOISE_ALONE,
+        "noise_distance": millimetres(m.noise_distance),
+        "noise_source": m.std_source,
+        "correlation": millimetres(m.correlation_length) if m.correlation_length > 0 else None,
+        "candidates": candidate_rows(outcome),
+        "candidate_order": CANDIDATE_ORDER,
+        "p_value_note": p_value_note(outcome),
+        "parameters": parameter_rows(outcome),
+        "nuisances": nuisance_rows(outcome),
+        "fixed": fixed_rows(outcome),
+        "footnotes": footnotes(outcome),
+        "next_pose": proposal,
+        "next_pose_said": proposal
+        and f"{sentence(separation_text(proposal))} {reading_text(proposal.reading)}",
+        "unexplained": outcome.unexplained,
+        "timing": timing_rows(outcome),
+        "mesh": mesh_text(outcome),
+        "versions": outcome.versions,
+    }
+
+
+def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
+    """The numbers that most readers come for: name, value, remark."""
+    rows, m, shown = [], outcome.measurement, compared(outcome)
+    if shown:
+        after = shown[-1].stage
+        stiffness = after.parameters.get("bending_stiffness")
+        if stiffness is not None:
+            value, interval, remark = describe(stiffness)
+            rows.append(("bending stiffness", value, f"95 %: {interval}" if interval else remark))
+        role, key = "held-out poses", "rmse_held_out"
+        if after.rmse_held_out is None:
+            role, key = "fit poses", "rmse_fit"
+        was = [f"{x.label}: {millimetres(getattr(x.stage, key), NOTHING)}" for x in shown[:-1]]
+        now = millimetres(getattr(after, key), NOTHING)
+        rows.append((f"error, {role}", now, "".join(was)))
+    rows.append((NOISE_ALONE, millimetres(m.noise_distance), f"of the points, {m.std_source}"))
+    lost = f"; {len(m.held_out_missing)} held out were not measured" if m.held_out_missing else ""
+    count = f"{m.poses_fit} + {m.poses_held_out}"
+    return [*rows, ("poses", count, f"to fit + held out to check{lost}")]
+
+
+def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
+    """Candidates for a missing effect, as ranked, with what could not be told apart."""
+    largest = max([row.score for row in outcome.candidates], default=0.0)
+    rows = []
+    for row in outcome.candidates:
+        status, said = finding_of(outcome, row)
+        rows.append(
+            {
+                "name": row.name,
+                "meaning": meaning(row.name),
+                "score": f"{row.score:,.0f}" if row.score >= 100 else f"{row.score:.2g}",
+                "share": max(row.score, 0.0) / largest if largest > 0 else 0.0,
+                "p_value": f"{row.p_value:.2g}",
+                "validated": millimetres(row.rmse_cross_validated, NOTHING),
+                "status": status,
+                "said": said,
+            }
+        )
+    return rows
+
+
+def meaning(name: str) -> str:
+    """What an effect is, in a line."""
+    text = inspect.getdoc(EFFECTS[name]) or "" if name in EFFECTS else ""
+    return text.partition("\n")[0].replace("`", "")
+
+
+def parameter_rows(outcome: Outcome) -> list[dict[str, str]]:
+    """Fitted parameters of the last stage with 95 % intervals, and what the data cannot tell."""
+    keys = ("name", "value", "interval", "remark", "doubt")
+    rows = []
+    for name, value, interval, remark in fitted_rows(outcome):
+        found = outcome.stages[-1].parameters[name]
+        doubt = "unknown" if found.identifiable is False else "bound" if found.at_bound else ""
+        rows.append((name, value, interval or symmetric_interval(found), remark, doubt))
+    rows += [(*row, "") for row in rest_rows(outcome)]
+    return [dict(zip(keys, row, strict=True)) for row in rows]
+
+
+def symmetric_interval(estimate: ParameterEstimate) -> str:
+    """A 95 % interval from the standard deviation, where no profile was computed."""
+    if estimate.identifiable is False or not estimate.std > 0:
+        return ""
+    low, high = (estimate.value + sign * NORMAL_95 * estimate.std for sign in (-1, 1))
+    return f"{low:.4g} to {high:.4g} {estimate.unit}".rstrip()
+
+
+# ---- of a run that has failed ------------------------------------------------------------------
+
+
+def write_failure_page(
+    path: Path, config: Config, error: DloError, poses: Sequence[PoseInput] = ()
+) -> None:
+    """Write the page of a run that has failed, whole or not at all.
 
     Parameters
     ----------
-    template : str
-        Name of a file in `templates/`.
-    in_space : bool
-        Whether its pictures are rooms that can be turned.
+    path : Path
+        The file.
+    config : Config
+        What was run.
+    error : DloError
+        How it ended.
+    poses : sequence of PoseInput
+        The poses as they were read; empty if it did not come to that.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
+    write_file(path, failure_page(config, error, poses))
+
+
+def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = ()) -> str:
+    """The text of failed.html."""
+    known = {pose.name: pose for pose in poses}
+    nothing = np.zeros((0, len(config.experiment.gravity)))
+    shown = [
+        known.get(pose.name, PoseInput(pose.name, pose.role, nothing))
+        for pose in config.experiment.poses
+    ]
+    heading, _, rest = error.message.partition("\n")
+    return _render(
+        "failed.html",
+        config,
+        kind=type(error).__name__,
+        heading=sentence(heading),
+        rest=rest,
+        hints=hints([error.message, *(pose.problem for pose in shown)]),
+        read=sum(pose.readable for pose in shown),
+        reached=bool(poses),
+        skipped=[item for item in config.skipped if item.name not in {x.name for x in shown}],
+        pictures=pose_pictures(config, shown),
+        photographs=view_pictures(shown),
+    )
+
+
+def hints(messages: Sequence[str]) -> list[str]:
+    """What the messages say to try, each once."""
+    found = [hint for text in messages for hint in re.findall(r"Try: (.+)", text)]
+    return list(dict.fromkeys(hint[:1].upper() + hint[1:] for hint in found))
+
+
+# ---- of both -----------------------------------------------------------------------------------
+
+
+def _render(template: str, config: Config, **data: Any) -> str:
+    """Fill a file of `templates/` with data."""
     page = _environment().get_template(template)
-    names = ["page", *["room"] * in_space]
+    in_space = config.experiment.in_space
+    names = ["page", *["room"] * in_space]  # pictures in space are rooms that can be turned
     scripts = [_text(f"{name}.js") for name in names]
     return page.render(
         generator=Markup(GENERATOR),
@@ -72,8 +271,28 @@ def render(template: str, in_space: bool, **data: Any) -> str:
         views=VIEWS if in_space else None,
         scripts=[Markup(script) for script in scripts],
         policy=" ".join(f"'sha256-{_hash(script)}'" for script in scripts),
+        title=config.cable.name,
+        config_name=config.name,
+        photographed=config.experiment.measurement.kind == "images",
+        configuration=configuration_text(config),
         **data,
     )
+
+
+def sentence(line: str) -> str:
+    """A line of the terminal as a sentence of its own."""
+    text = line.removeprefix("Verdict: ")
+    for word in ("unexplained. ", "complete. ", "the fit has failed. "):
+        text = text.removeprefix(word)
+    return text[:1].upper() + text[1:]
+
+
+def configuration_text(config: Config) -> str:
+    """The configuration as it stands in its file."""
+    try:
+        return config.path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        return f"# {config.path.name} cannot be read any more: {error.strerror}"
 
 
 def units(text: str) -> str:
@@ -96,12 +315,8 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {
-        "units": units,
-        "breakable": breakable,
-        "vector": vector,
-        "counted": counted,
-    }
+    for item in (units, breakable, vector, counted):
+        environment.filters[item.__name__] = item
     return environment
 
 

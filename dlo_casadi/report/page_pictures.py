@@ -8,7 +8,7 @@ their places there, and the page draws them anew as the room is turned.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,26 +17,43 @@ from numpy.typing import NDArray
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.errors import counted
-from dlo_casadi.report.arrows import forces_read
-from dlo_casadi.report.canvas import Compared, compared, millimetres
-from dlo_casadi.report.geometry import beside
-from dlo_casadi.report.page_backgrounds import Background, Box, backgrounds, flat, in_room
-from dlo_casadi.report.room import Mark, Room, around
-from dlo_casadi.report.scene import next_marks, pull_marks, scene_of
-from dlo_casadi.report.text_findings import branch_text
+from dlo_casadi.report.photographs import PHOTOGRAPHS, photograph_of
+from dlo_casadi.report.scene import (
+    Mark,
+    Room,
+    Scene,
+    around,
+    beside,
+    held_places,
+    next_marks,
+    pull_marks,
+    scene_of,
+    scenes_of,
+    seen,
+)
+from dlo_casadi.report.words import Compared, branch_text, compared, millimetres
+from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput
 from dlo_casadi.session.pose_shape import PoseShape
+from dlo_casadi.vision import nearest_in_order
 
 FloatArray = NDArray[np.floating]
+Box = tuple[float, float, float, float]
+
+# Of a part of a photograph about the cable: its sides over those of the cable.
+_ROOM = 1.3
+_GRID = 100.0  # mm
+_PER_POINT = 4  # of a predicted curve in a photograph, between two of its points
 
 
 @dataclass(frozen=True)
 class Line:
-    """One line over a picture.
+    """A line of a picture, or a word in it.
 
     Parameters
     ----------
-    kind : "measured", "before" or "after"
+    kind : str
+        "measured", "before", "after", or that of a `scene.Mark`.
     points : str
         "u,v u,v ..." as SVG has it.
     near : str
@@ -44,6 +61,8 @@ class Line:
         by moving them away from those.
     solid, near_solid : str
         The same points in a room, "x,y,z x,y,z ...".
+    label : str
+        The word, if it is one.
     """
 
     kind: str
@@ -51,16 +70,79 @@ class Line:
     near: str = ""
     solid: str = ""
     near_solid: str = ""
+    label: str = ""
 
 
 @dataclass(frozen=True)
-class Solid:
-    """A line beside the cable, or a word there (see `room.Mark`), as the page has it."""
+class Background:
+    """What lies under the lines: a photograph [px], the board or a room [mm, y down].
 
-    kind: str
-    points: str
-    solid: str = ""
-    label: str = ""
+    Parameters
+    ----------
+    whole : (left, top, width, height)
+        All there is.
+    scene : Scene or None
+        Where the pose stands; None of a photograph in space, which has the world's coordinates.
+    place : callable or None
+        Maps points of the scene into it; None where the camera was not located.
+    photograph : str
+        As a data URI; empty for the board.
+    """
+
+    whole: Box
+    scene: Scene | None
+    place: Callable[[FloatArray], FloatArray] | None
+    photograph: str = ""
+
+    @property
+    def room(self) -> Room | None:
+        """The room, if it is one."""
+        return self.scene if isinstance(self.scene, Room) else None
+
+    @property
+    def grid(self) -> tuple[Box, ...]:
+        """Lines (x1, y1, x2, y2) of the board, every 100 mm."""
+        if self.photograph or self.room is not None:
+            return ()
+        left, top, width, height = self.whole
+        across = np.arange(np.ceil(left / _GRID), np.floor((left + width) / _GRID) + 1) * _GRID
+        down = np.arange(np.ceil(top / _GRID), np.floor((top + height) / _GRID) + 1) * _GRID
+        return (
+            *((float(x), top, float(x), top + height) for x in across),
+            *((left, float(y), left + width, float(y)) for y in down),
+        )
+
+    def points(self, points: FloatArray) -> FloatArray:
+        """Points (K, d) [m] of the world in the picture; none where it was not located."""
+        if self.place is None or not len(points):
+            return np.zeros((0, 2))
+        return np.asarray(self.place(points if self.scene is None else self.scene.points(points)))
+
+    def solid(self, points: FloatArray, decimals: int) -> str:
+        """Points (K, 3) [m] of the world as they stand in a room, if it is one."""
+        return "" if self.room is None else _text(self.room.points(points), decimals)
+
+    def drawn(self, mark: Mark) -> Line:
+        """A mark of the scene as the page has it."""
+        at = np.zeros((0, 2)) if self.place is None else self.place(mark.points)
+        solid = "" if self.room is None else _text(mark.points, 1)
+        return Line(mark.kind, svg(at, 1), solid=solid, label=mark.label)
+
+    def about(self, lines: Sequence[FloatArray]) -> Box:
+        """The part of a photograph about all lines, sides in the same ratio; all of a board."""
+        if not self.photograph:
+            return self.whole
+        left, top, width, height = self.whole
+        drawn = np.concatenate(lines)
+        corner, size = np.array([left, top]), np.array([width, height])
+        drawn = np.clip(drawn[np.isfinite(drawn).all(axis=1)], corner, corner + size)
+        if not len(drawn):
+            return self.whole
+        low, high = drawn.min(axis=0), drawn.max(axis=0)
+        share = min(1.0, max(0.25, _ROOM * float(((high - low) / size).max())))
+        at = np.clip((low + high - share * size) / 2, corner, corner + (1 - share) * size)
+        x, y, wide, high_ = (round(float(v), 1) for v in (*at, share * width, share * height))
+        return x, y, wide, high_
 
 
 @dataclass(frozen=True)
@@ -79,7 +161,7 @@ class Picture:
         The kind is that of the line that a fact is about.
     notes : tuple of str
         What the camera step noticed, or why the pose could not be read.
-    under, over : tuple of Solid
+    under, over : tuple of Line
         What stands there behind the cable, and in front of it; in a plane the forces that were
         read, beside the predicted ones.
     """
@@ -95,18 +177,50 @@ class Picture:
     facts: tuple[tuple[str, str, str], ...] = ()
     problem: str = ""
     notes: tuple[str, ...] = ()
-    under: tuple[Solid, ...] = ()
-    over: tuple[Solid, ...] = ()
+    under: tuple[Line, ...] = ()
+    over: tuple[Line, ...] = ()
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """A picture of every pose of a run, in the order in which they were taken."""
-    return _pictures(outcome.config, outcome.poses, compared(outcome), outcome.measurement)
+    return pose_pictures(outcome.config, outcome.poses, compared(outcome), outcome.measurement)
 
 
-def pictures_of_failure(config: Config, poses: Sequence[PoseInput]) -> list[Picture]:
-    """A picture of every pose of a run that has failed, with what was measured until then."""
-    return _pictures(config, poses, [], None)
+def pose_pictures(
+    config: Config,
+    poses: Sequence[PoseInput],
+    stages: Sequence[Compared] = (),
+    measurement: MeasurementSummary | None = None,
+) -> list[Picture]:
+    """A picture of every pose; of a run that has failed with what was measured until then.
+
+    Parameters
+    ----------
+    stages : sequence of Compared
+        Whose predictions are drawn.
+    """
+    scenes = scenes_of(config, poses, [item.stage for item in stages])
+    last = {} if not stages else stages[-1].stage.shapes
+    declared = {pose.name: pose for pose in config.experiment.poses}
+    marks = [
+        around(scene, declared[pose.name], pose.points, last.get(pose.name))
+        for pose, scene in zip(poses, scenes, strict=True)
+    ]
+    lines = [pose.points for pose in poses if len(pose.points)]
+    lines += [shape.curve for item in stages for shape in item.stage.shapes.values()]
+    lines += [mark.points for _, over in marks for mark in over]
+    behind = [_in_room(scene) for scene in scenes if isinstance(scene, Room)]
+    if not behind:
+        behind = [_board(config, scenes[0], lines)] * len(poses)
+    if not config.experiment.in_space and config.experiment.measurement.kind == "images":
+        behind = [
+            _photographed(declared[pose.name], pose, board, PHOTOGRAPHS // len(poses))
+            for pose, board in zip(poses, behind, strict=True)
+        ]
+    return [
+        _picture(pose, declared[pose.name], own, beside_it, stages, measurement)
+        for pose, own, beside_it in zip(poses, behind, marks, strict=True)
+    ]
 
 
 def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
@@ -115,45 +229,81 @@ def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
         "pull": ("with the pull as an arrow in each pose", outcome.unexplained, pull_marks),
         "next": ("with the proposed end", outcome.next_pose, next_marks),
     }
-    shown = {key: value for key, value in said.items() if value[1] is not None}
     room, under = scene_of(outcome)
     if not isinstance(room, Room):
         return {}
+    behind = _in_room(room)
     return {
         key: Picture(
             name=key,
             role="fit",
             alt=f"Measured cables in space, {text}",
-            behind=in_room(room),
-            box=in_room(room).whole,
-            under=tuple(map(_drawn, [*under, *marks(outcome, room)])),
+            behind=behind,
+            box=behind.whole,
+            under=tuple(map(behind.drawn, [*under, *marks(outcome, room)])),
         )
-        for key, (text, _, marks) in shown.items()
+        for key, (text, found, marks) in said.items()
+        if found is not None
     }
 
 
-def _pictures(
-    config: Config,
-    poses: Sequence[PoseInput],
-    stages: Sequence[Compared],
-    measurement: MeasurementSummary | None,
-) -> list[Picture]:
-    behind = backgrounds(config, poses, [stage for *_, stage in stages])
-    in_plane = stages and not config.experiment.in_space
-    read = forces_read(stages[-1][2], config.cable.length) if in_plane else {}
-    declared = {pose.name: pose for pose in config.experiment.poses}
-    return [
-        _picture(pose, declared[pose.name], b, stages, read.get(pose.name, ()), measurement)
-        for pose, b in zip(poses, behind, strict=True)
-    ]
+def view_pictures(poses: Sequence[PoseInput], stages: Sequence[Compared] = ()) -> list[Picture]:
+    """A picture of every usable photograph of poses in space, those of a pose side by side.
+
+    Parameters
+    ----------
+    stages : sequence of Compared
+        Whose predictions are projected into it.
+    """
+    shown = [(pose, view) for pose in poses for view in pose.views]
+    return [_view_picture(pose, view, stages, PHOTOGRAPHS // len(shown)) for pose, view in shown]
+
+
+# ---- backgrounds -------------------------------------------------------------------------------
+
+
+def _in_room(room: Room) -> Background:
+    """A room as it is seen at first."""
+    low, size = -room.window / 2, room.window
+    whole = (float(low[0]), float(low[1]), float(size[0]), float(size[1]))
+    return Background(whole, room, lambda points: seen(points) * [1.0, -1.0])
+
+
+def _to_millimetres(points: FloatArray) -> FloatArray:
+    return np.asarray(points) * [1e3, -1e3]
+
+
+def _board(config: Config, scene: Scene, lines: Sequence[FloatArray]) -> Background:
+    """The part of the board that holds all lines (K, 2) [m] and all fixtures."""
+    held = [held_places(pose) for pose in config.experiment.poses]
+    drawn = _to_millimetres(np.concatenate([*held, *lines]))
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    span = float((high - low).max())
+    size = np.maximum(high - low + 0.12 * span, 0.45 * span)
+    left, top = (low + high - size) / 2
+    whole = (float(left), float(top), float(size[0]), float(size[1]))
+    return Background(whole, scene, _to_millimetres)
+
+
+def _photographed(declared: Pose, pose: PoseInput, board: Background, budget: int) -> Background:
+    """The photograph of a pose, if it was located and can be read; else the board."""
+    located = pose.to_pixels is not None or not len(pose.points)
+    photograph = photograph_of(declared.paths[0], budget) if located else None
+    if photograph is None:
+        return board
+    uri, width, height = photograph
+    return Background((-0.5, -0.5, float(width), float(height)), board.scene, pose.to_pixels, uri)
+
+
+# ---- one picture -------------------------------------------------------------------------------
 
 
 def _picture(
     pose: PoseInput,
     declared: Pose,
     behind: Background,
+    marks: tuple[Sequence[Mark], Sequence[Mark]],
     stages: Sequence[Compared],
-    read: Sequence[tuple[str, FloatArray]],
     measurement: MeasurementSummary | None,
 ) -> Picture:
     lines, facts = [], []
@@ -166,49 +316,51 @@ def _picture(
             continue
         drawn.append(behind.points(shape.curve))
         near = beside(pose, shape) if len(measured) else measured
-        lines.append(
-            Line(
-                kind,
-                svg(drawn[-1], 1),
-                svg(behind.points(near), 2),
-                _solid(behind.room, shape.curve, 1),
-                _solid(behind.room, near, 2),
-            )
-        )
+        places = svg(drawn[-1], 1), svg(behind.points(near), 2)
+        lines.append(Line(kind, *places, behind.solid(shape.curve, 1), behind.solid(near, 2)))
         if shape.rmse is not None:
             facts.append((kind, label, millimetres(shape.rmse)))
         if not shape.stable:
             facts.append((kind, label, "not stable"))
         if shape.measured_branch is not None:
             facts.append((kind, label, branch_text(shape.measured_branch)))
-    if lines:
-        ends = [drawn[-1][:1], drawn[-1][-1:]]
-    else:
-        nowhere = (np.nan,) * len(declared.start)
-        held = (declared.start, declared.end or nowhere)
-        ends = [behind.points(np.array([place])) for place in held]
+    ends = drawn[-1][:1], drawn[-1][-1:]
+    if not lines:
+        held = behind.points(held_places(declared))
+        ends = held[:1], held[1:]
     if len(measured):
-        solid = _solid(behind.room, pose.points, 2)
-        lines.append(Line("measured", svg(measured, 2), solid=solid))
-        facts.append(("measured", "measured", _seen(pose)))
-    last = stages[-1][2].shapes.get(pose.name) if stages else None
+        lines.append(Line("measured", svg(measured, 2), solid=behind.solid(pose.points, 2)))
+        text = counted(len(pose.points), "point")
+        text += "" if pose.coverage is None else f", {pose.coverage:.0%} of the cable"
+        facts.append(("measured", "measured", text))
+    last = stages[-1].stage.shapes.get(pose.name) if stages else None
     if behind.room is not None and last is not None:
-        facts.append(("force", "forces on start, end", _newtons(last.forces)))
+        sizes = ", ".join(f"{np.linalg.norm(force):.3g}" for force in last.forces)
+        facts.append(("force", "forces on start, end", f"{sizes} N"))
     if last is not None and measurement is not None:
         facts += [("force-read", *fact) for fact in _readings(measurement, last)]
-    under, over = _around(declared, pose, last, behind.room)
-    arrows = [(kind, behind.points(line)) for kind, line in read]
-    over += tuple(Solid(kind, svg(line, 1)) for kind, line in arrows)
-    start, end = (None if behind.room else _point(at) for at in ends)
+    what = "Photograph" if behind.photograph else "Drawing of the board"
+    what = f"{'Drawing in space' if behind.room else what}, pose {pose.name}"
+    if not len(pose.points):
+        alt = f"{what}: no cable was measured."
+    elif last is None or last.rmse is None:
+        alt = f"{what}, with the measured line."
+    else:
+        alt = (
+            f"{what}, with the measured line and the predicted ones; {stages[-1].label}, they are "
+            f"{millimetres(last.rmse)} apart."
+        )
+    under, over = (tuple(map(behind.drawn, some)) for some in marks)
+    arrows = [] if behind.room else [behind.points(mark.points) for mark in marks[1]]
     return Picture(
         name=pose.name,
         role=pose.role,
-        alt=_alt(pose, behind, stages),
+        alt=alt,
         behind=behind,
-        box=behind.about([*drawn, *ends, *(line for _, line in arrows)]),
+        box=behind.about([*drawn, *ends, *arrows]),
         lines=tuple(line for line in lines if line.points),
-        start=start,
-        end=end,
+        start=None if behind.room else _point(ends[0]),
+        end=None if behind.room else _point(ends[1]),
         facts=tuple(facts),
         problem=pose.problem,
         notes=pose.messages,
@@ -217,74 +369,68 @@ def _picture(
     )
 
 
-def _around(
-    declared: Pose, pose: PoseInput, shape: PoseShape | None, room: Room | None
-) -> tuple[tuple[Solid, ...], tuple[Solid, ...]]:
-    """What stands in a room behind a cable and in front of it."""
-    if room is None:
-        return (), ()
-    under, over = around(room, declared, pose.points, shape)
-    return tuple(map(_drawn, under)), tuple(map(_drawn, over))
+def _readings(measurement: MeasurementSummary, shape: PoseShape) -> list[tuple[str, str]]:
+    """Each reading by its name: how far from the predicted one, in units and in its noise."""
+    facts = []
+    for name, (known, model) in shape.readings.items():
+        std, unit = measurement.std_of(name.split("_")[1])
+        off, size = float(np.linalg.norm(known - model)), float(np.linalg.norm(known))
+        text = f"{size:.3g} {unit}, off by {off:.2g} {unit} ({off / std:.1f} std)"
+        facts.append((name.replace("_", " "), text))
+    return facts
 
 
-def _drawn(mark: Mark) -> Solid:
-    return Solid(mark.kind, svg(flat(mark.points), 1), _text(mark.points, 1), mark.label)
+def _view_picture(
+    pose: PoseInput, view: ViewInput, stages: Sequence[Compared], budget: int
+) -> Picture:
+    viewpoint, pixels = view.seen.viewpoint, view.seen.pixels
+    photograph, (height, width) = photograph_of(view.image, budget), viewpoint.shape
+    whole = (-0.5, -0.5, float(width), float(height))
+    uri = "" if photograph is None else photograph[0]
+    behind = Background(whole, None, viewpoint.to_pixels, uri)
+    drawn: list[FloatArray] = [pixels]
+    lines, facts = [], []
+    for kind, label, stage in stages:
+        shape = stage.shapes.get(pose.name)
+        if shape is None:
+            continue
+        at = np.arange(len(shape.curve))
+        fine = np.linspace(0, at[-1], _PER_POINT * at[-1] + 1)
+        curve = behind.points(np.column_stack([np.interp(fine, at, x) for x in shape.curve.T]))
+        near = curve[_nearest(pixels, curve)]
+        drawn.append(curve)
+        lines.append(Line(kind, svg(curve[::_PER_POINT], 1), svg(near, 2)))
+        rms = float(np.sqrt(np.mean(np.sum((pixels - near) ** 2, axis=1))))
+        facts.append((kind, label, f"{rms:.2g} px"))
+    return Picture(
+        name=view.name,
+        role=pose.role,
+        alt=f"Photograph {view.name}, with the line that is seen in it"
+        + (" and the predicted ones." if stages else "."),
+        behind=behind,
+        box=behind.about(drawn),
+        lines=(*lines, Line("measured", svg(pixels, 2))),
+        start=_point(drawn[-1][:1]),
+        end=_point(drawn[-1][-1:]),
+        facts=(*facts, ("measured", "measured", counted(len(pixels), "pixel"))),
+    )
 
 
-def _solid(room: Room | None, points: FloatArray, decimals: int) -> str:
-    """Points [m] of the world as they stand in a room; nothing without one."""
-    return "" if room is None else _text(room.points(points), decimals)
+def _nearest(pixels: FloatArray, curve: FloatArray) -> NDArray[np.intp]:
+    """Points (K,) of a projected curve (M, 2) [px] beside the pixels (K, 2), in order."""
+    away = np.linalg.norm(pixels[:, None] - curve[None], axis=2)
+    nearest = away.min(axis=1)
+    found = nearest_in_order(away / (1.0 + np.median(nearest)))
+    return np.where(found >= 0, found, away.argmin(axis=1))
 
 
 def _text(points: FloatArray, decimals: int) -> str:
     return " ".join(",".join(f"{x:.{decimals}f}" for x in point) for point in points)
 
 
-def _newtons(forces: FloatArray) -> str:
-    return ", ".join(f"{np.linalg.norm(force):.3g}" for force in forces) + " N"
-
-
-def _readings(measurement: MeasurementSummary, shape: PoseShape) -> list[tuple[str, str]]:
-    """Each reading by its name: how far from the predicted one, in units and in its noise."""
-    facts = []
-    for name, (known, model) in shape.readings.items():
-        kind = name.split("_")[1]
-        std, unit = measurement.std_of(kind)
-        off = float(np.linalg.norm(known - model))
-        size = float(np.linalg.norm(known))
-        text = f"{size:.3g} {unit}, off by {off:.2g} {unit}"
-        facts.append((name.replace("_", " "), f"{text} ({off / std:.1f} std)"))
-    return facts
-
-
-def _seen(pose: PoseInput) -> str:
-    text = counted(len(pose.points), "point")
-    return text if pose.coverage is None else f"{text}, {pose.coverage:.0%} of the cable"
-
-
-def _what(pose: PoseInput, behind: Background) -> str:
-    kind = "Photograph" if behind.photograph else "Drawing of the board"
-    return f"{'Drawing in space' if behind.room else kind}, pose {pose.name}"
-
-
-def _alt(pose: PoseInput, behind: Background, stages: Sequence[Compared]) -> str:
-    if not len(pose.points):
-        return f"{_what(pose, behind)}: no cable was measured."
-    _, label, stage = stages[-1] if stages else ("", "", None)
-    shape = None if stage is None else stage.shapes.get(pose.name)
-    if shape is None or shape.rmse is None:
-        return f"{_what(pose, behind)}, with the measured line."
-    return (
-        f"{_what(pose, behind)}, with the measured line and the predicted ones; "
-        f"{label}, they are {millimetres(shape.rmse)} apart."
-    )
-
-
 def svg(points: FloatArray, decimals: int) -> str:
     """Points as SVG has them; nothing where the camera cannot see a point of it."""
-    if not np.isfinite(points).all():
-        return ""
-    return " ".join(f"{u:.{decimals}f},{v:.{decimals}f}" for u, v in points)
+    return _text(points, decimals) if np.isfinite(points).all() else ""
 
 
 def _point(points: FloatArray) -> tuple[float, float] | None:

@@ -1,30 +1,103 @@
-"""All poses of a session in one place: where the cable is pulled, where to hold it next."""
+"""Where a cable is drawn: on its board, or in a room; and what stands around it there.
+
+A scene maps places of the world [m] to its own coordinates, in which the page and the figures draw
+the same marks. A board has metres in its plane. A room has millimetres about the middle of a pose,
+the third one up, against gravity.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import cos, radians, sin
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from dlo_casadi.report.arrows import arrow
-from dlo_casadi.report.geometry import measured_line
-from dlo_casadi.report.room import Mark, Room, common_room
-from dlo_casadi.session.outcome import Outcome
+from dlo_casadi.config import Config
+from dlo_casadi.config.sections import Pose
+from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
+from dlo_casadi.session.pose_shape import PoseShape
 
 FloatArray = NDArray[np.floating]
 
-# Half the size of the cross that marks a place, as a share of the cable's length.
-_CROSS = 0.05
-# The longest arrow in a plane, as a share of the cable's length.
-_LONGEST = 0.25
-# Points of a measured line that are drawn, about.
+# From where a room is seen: name, azimuth and elevation [degrees]. The first one is shown at first.
+VIEWS = (
+    ("a corner", -60.0, 24.0),
+    ("the front", -90.0, 0.0),
+    ("the side", 0.0, 0.0),
+    ("above", -90.0, 90.0),
+)
+_MM = 1e3
+# The longest arrow as a share of the cable's length: in a room, at an end and along a planar cable.
+_IN_ROOM, _AT_END, _PULLING = 0.15, 1 / 5, 0.25
+# Other shares of it: an axis of a frame, the air above the floor, half of a cross.
+_AXIS, _AIR, _CROSS = 0.09, 0.06, 0.05
+# An arrow's head, as a share of its length: how long and how wide.
+_HEAD = (0.28, 0.1)
+# Points of a measured line that are drawn beside others, about.
 _POINTS = 60
+
+
+# ---- marks -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A line in a scene, or a word at a place in it.
+
+    Parameters
+    ----------
+    kind : str
+        How it is drawn.
+    points : (K, d)
+    label : str
+        The word, if it is one.
+    """
+
+    kind: str
+    points: FloatArray
+    label: str = ""
+
+
+def arrow(root: FloatArray, shaft: FloatArray) -> FloatArray:
+    """One line (K, d) that draws an arrow from a root (d,) along a shaft (d,).
+
+    Two barbs in a plane, four in space, where it is seen from anywhere.
+    """
+    size = max(float(np.linalg.norm(shaft)), 1e-12)
+    if len(shaft) == 2:
+        normals = [np.array([-shaft[1], shaft[0]])]
+    else:
+        across = np.cross(shaft, np.eye(3)[np.abs(shaft).argmin()])
+        across *= size / max(float(np.linalg.norm(across)), 1e-12)
+        normals = [across, np.cross(shaft, across) / size]
+    tip, back = root + shaft, root + (1 - _HEAD[0]) * shaft
+    sides = [sign * normal for sign in (1, -1) for normal in normals]
+    barbs = [point for side in sides for point in (back + _HEAD[1] * side, tip)]
+    return np.stack([root, tip, *barbs])
+
+
+def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray:
+    """Points (K, d) [m] of the prediction beside the measured ones, distances multiplied."""
+    return np.asarray(pose.points - factor * shape.gap)
+
+
+def band_outline(curve: FloatArray, half_width: FloatArray) -> FloatArray:
+    """Outline (2 M, 2) [m] of a band of half widths (M,) [m] about a planar curve (M, 2)."""
+    tangent = np.gradient(curve, axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
+    side = half_width[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    return np.concatenate([curve + side, (curve - side)[::-1]])
+
+
+# ---- scenes ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Board:
-    """The plane of a cable, in which marks are placed as in a `Room`, in metres.
+    """The plane of a cable.
 
     Parameters
     ----------
@@ -32,85 +105,296 @@ class Board:
         Of the cable.
     newton : float [m/N]
         How long a force is drawn.
-    markers : (K, 5, 2) [m]
+    markers : (K, 5, 2) [m], optional
         Outlines of the squares printed on it.
     """
 
     length: float
     newton: float
-    markers: FloatArray
-    window: None = None  # as large as what is drawn
+    markers: FloatArray | tuple[()] = ()
 
     def points(self, points: FloatArray) -> FloatArray:
         """Points (K, 2) [m], or one of them, as they are."""
         return points.reshape(-1, 2)
 
-    def force(self, at: FloatArray, force: FloatArray) -> Mark:
+    def force(self, at: FloatArray, force: FloatArray, kind: str = "force") -> Mark:
         """A force (2,) [N] as an arrow from a place (2,) [m]."""
-        return Mark("force", arrow(at, self.newton * force))
+        return Mark(kind, arrow(at, self.newton * force))
 
     def ground(self) -> list[Mark]:
         """The markers."""
         return [Mark("marker", outline) for outline in self.markers]
 
 
-def scene_of(outcome: Outcome) -> tuple[Room | Board, list[Mark]]:
-    """A place for all poses, with its ground and the measured lines."""
-    load = outcome.unexplained
-    pulls = np.zeros(0) if load is None else load.force_per_pose
-    place: Room | Board
-    if outcome.config.experiment.in_space:
-        proposal = outcome.next_pose
-        ends = [] if proposal is None else [np.array([proposal.end])]
-        place = common_room(outcome.config, outcome.poses, ends, pulls.reshape(-1, 3))
-    else:
-        place = _board(outcome, pulls.reshape(-1, 2))
+@dataclass(frozen=True)
+class Room:
+    """Space about one pose.
+
+    Parameters
+    ----------
+    upright : (3, 3)
+        Rows: two level directions of the world, and the one up.
+    center : (3,) [mm]
+        Its middle, in those directions from the world's origin.
+    radius : float [mm]
+        Of a ball that holds the cable and the arrows in every pose.
+    floor : float [mm]
+        Height of the floor.
+    length : float [mm]
+        Of the cable.
+    newton : float [mm/N]
+        How long a force is drawn.
+    """
+
+    upright: FloatArray
+    center: FloatArray
+    radius: float
+    floor: float
+    length: float
+    newton: float = 0.0
+
+    @property
+    def square(self) -> float:
+        """Side of the floor's squares [mm]: 1, 2 or 5 times a power of ten."""
+        wanted = self.length / 5
+        tens = 10.0 ** np.floor(np.log10(wanted))
+        return float(tens * max(step for step in (1, 2, 5) if step * tens <= wanted))
+
+    @property
+    def window(self) -> FloatArray:
+        """Width and height [mm] of a picture; only arrows that stand upright may leave it."""
+        return np.array([2.0, 1.7]) * self.radius
+
+    def points(self, points: FloatArray) -> FloatArray:
+        """Points (K, 3) [m] of the world, as they stand in the room [mm]."""
+        return np.asarray(_MM * points.reshape(-1, 3) @ self.upright.T - self.center)
+
+    def force(self, at: FloatArray, force: FloatArray, kind: str = "force") -> Mark:
+        """A force (3,) [N] as an arrow from a point (3,) [mm]."""
+        return Mark(kind, arrow(at, self.newton * self.upright @ force))
+
+    def ground(self) -> list[Mark]:
+        """The floor with its squares, the world's axes and gravity."""
+        reach = self.square * np.floor(0.75 * self.radius / self.square)
+        across = np.arange(-reach, reach + 0.5 * self.square, self.square)
+        lines = np.array(
+            [[[x, -reach], [x, reach]][:: 1 if k % 2 else -1] for k, x in enumerate(across)]
+        )
+        flat = np.concatenate([lines.reshape(-1, 2), lines.reshape(-1, 2)[:, ::-1]])
+        marks = [Mark("grid", np.column_stack([flat, np.full(len(flat), self.floor)]))]
+        corner = np.array([-reach, -reach, self.floor])
+        size = _AXIS * self.length
+        for name, axis in zip("xyz", size * self.upright.T, strict=True):
+            marks.append(Mark("world", np.stack([corner, corner + axis])))
+            marks.append(Mark("letter", (corner + 1.5 * axis)[None], name))
+        foot = np.array([reach, reach, self.floor])
+        rise = np.array([0.0, 0.0, size])
+        top = foot + 2.5 * rise
+        marks.append(Mark("weight", arrow(top, foot - top)))
+        marks.append(Mark("letter", (top + 0.5 * rise)[None], "g"))
+        return marks
+
+    def shadow(self, points: FloatArray) -> list[Mark]:
+        """What a line (K, 3) [mm] throws on the floor, and plumb lines from its ends."""
+        below = np.column_stack([points[:, :2], np.full(len(points), self.floor)])
+        plumb = [Mark("plumb", np.stack([points[k], below[k]])) for k in (0, -1)]
+        return [Mark("shadow", below), *plumb]
+
+    def clamp(self, at: FloatArray, orientation: Sequence[float]) -> list[Mark]:
+        """The axes of a clamp's frame at a point (3,) [mm]."""
+        axes = Rotation.from_quat(orientation).as_matrix().T @ self.upright.T
+        return [
+            Mark(f"axis-{name}", np.stack([at, at + _AXIS * self.length * axis]))
+            for name, axis in zip("xyz", axes, strict=True)
+        ]
+
+
+Scene = Board | Room
+
+
+def seen(points: FloatArray, view: tuple[str, float, float] = VIEWS[0]) -> FloatArray:
+    """Points (..., 3) of a room as they are seen from afar: (..., 2) to the right and up.
+
+    right = (-sin a, cos a, 0), up = (-sin e cos a, -sin e sin a, cos e)
+    with azimuth a and elevation e of the eye. Points (..., 2) of a board are seen as they are.
+    """
+    if points.shape[-1] == 2:
+        return points
+    a, e = radians(view[1]), radians(view[2])
+    axes = np.array([[-sin(a), cos(a), 0.0], [-sin(e) * cos(a), -sin(e) * sin(a), cos(e)]])
+    return np.asarray(points @ axes.T)
+
+
+def upright(gravity: Sequence[float]) -> FloatArray:
+    """Rows (3, 3): two level directions, the first along the world's x if it can be, and up."""
+    g = np.asarray(gravity, dtype=float)
+    size = float(np.linalg.norm(g))
+    up = -g / size if size > 0 else np.array([0.0, 0.0, 1.0])
+    level = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
+    level = level - (level @ up) * up
+    level /= np.linalg.norm(level)
+    return np.stack([level, np.cross(up, level), up])
+
+
+def scenes_of(
+    config: Config, poses: Sequence[PoseInput], stages: Sequence[Stage]
+) -> Sequence[Scene]:
+    """A scene for each pose, all on one scale, in which the last stage's forces can be drawn."""
+    shapes = [shape for stage in stages[-1:] for shape in stage.shapes.values()]
+    if not config.experiment.in_space:
+        read = [force for shape in shapes for _, *pair in _forces_read(shape) for force in pair]
+        return [Board(config.cable.length, _scale(_AT_END * config.cable.length, read))] * len(
+            poses
+        )
+    held = {pose.name: held_places(pose) for pose in config.experiment.poses}
+    drawn = [
+        [pose.points, held[pose.name]]
+        + [stage.shapes[pose.name].curve for stage in stages if pose.name in stage.shapes]
+        for pose in poses
+    ]
+    return _rooms(config, drawn, [force for shape in shapes for force in shape.forces])
+
+
+def held_places(pose: Pose) -> FloatArray:
+    """Where the ends of a pose are held (1 or 2, d) [m]."""
+    return np.array([place for place in (pose.start, pose.end) if place is not None])
+
+
+def _rooms(
+    config: Config, drawn: Sequence[Sequence[FloatArray]], forces: Iterable[FloatArray]
+) -> list[Room]:
+    """Rooms of one size about lines (K, 3) [m], for forces (3,) [N]."""
+    length = _MM * config.cable.length
+    directions = upright(config.experiment.gravity)
+    standing = [_MM * np.concatenate(lines) @ directions.T for lines in drawn]
+    middles = [(points.min(axis=0) + points.max(axis=0)) / 2 for points in standing]
+    away = [np.linalg.norm(x - c, axis=1).max() for x, c in zip(standing, middles, strict=True)]
+    radius = float(max(away)) + _IN_ROOM * length
+    newton = _scale(_IN_ROOM * length, forces)
+    floors = [
+        float((points[:, 2] - middle[2]).min()) - _AIR * length
+        for points, middle in zip(standing, middles, strict=True)
+    ]
+    return [
+        Room(directions, middle, radius, floor, length, newton)
+        for middle, floor in zip(middles, floors, strict=True)
+    ]
+
+
+def _scale(longest: float, forces: Iterable[FloatArray]) -> float:
+    """Length of a newton with which the largest of all forces is drawn as long as told."""
+    largest = max((float(np.linalg.norm(force)) for force in forces), default=0.0)
+    return longest / largest if largest > 0 else 0.0
+
+
+# ---- what stands around one pose ---------------------------------------------------------------
+
+
+def _forces_read(shape: PoseShape) -> list[tuple[int, FloatArray, FloatArray]]:
+    """At each end of which the force was read: its place in the curve, the force, the predicted."""
+    return [
+        (k, *shape.readings[f"{side}_force"])
+        for k, side in ((0, "start"), (-1, "end"))
+        if f"{side}_force" in shape.readings
+    ]
+
+
+def around(
+    scene: Scene, declared: Pose, measured: FloatArray, shape: PoseShape | None
+) -> tuple[list[Mark], list[Mark]]:
+    """What stands behind a cable, and in front of it: ground and shadow; clamps and forces.
+
+    On a board only forces that were read, each after what a sensor would show of the predicted one.
+
+    Parameters
+    ----------
+    declared : Pose
+        How the ends are held.
+    measured : (K, d) [m]
+    shape : PoseShape or None
+        Predicted; without it the measured points throw the shadow.
+    """
+    read = [] if shape is None else _forces_read(shape)
+    line = scene.points(measured if shape is None else shape.curve)
+    if isinstance(scene, Board):
+        pairs = [(k, (("force", model), ("force-read", known))) for k, known, model in read]
+        return [], [scene.force(line[k], force, kind) for k, pair in pairs for kind, force in pair]
+    under, over = scene.ground(), []
+    if len(line):
+        under += scene.shadow(line)
+    for k, side in ((0, "start"), (-1, "end")):
+        held = getattr(declared, side)
+        if held is None:
+            continue
+        at = scene.points(np.array(held))[0] if shape is None else line[k]
+        orientation = getattr(declared, f"{side}_orientation")
+        if orientation is not None:
+            over += scene.clamp(at, orientation)
+        if shape is not None:
+            over.append(scene.force(at, shape.forces[k]))
+            over += [scene.force(at, known, "force-read") for j, known, _ in read if j == k]
+        # A line of no length at all would not be drawn.
+        spot = np.stack([at, at + 0.1])
+        over += [Mark(f"{kind} {side}", spot) for kind in ("fixture-casing", "fixture")]
+    return under, over
+
+
+# ---- all poses of a session in one scene -------------------------------------------------------
+
+
+def scene_of(outcome: Outcome) -> tuple[Scene, list[Mark]]:
+    """A scene for all poses, with its ground and the measured lines."""
+    config, proposal = outcome.config, outcome.next_pose
+    pulls = [] if outcome.unexplained is None else list(outcome.unexplained.force_per_pose)
     measured = [pose.points for pose in outcome.poses if len(pose.points)]
-    lines = [place.points(points[:: max(1, len(points) // _POINTS)]) for points in measured]
-    return place, place.ground() + [Mark("taken", line) for line in lines]
+    scene: Scene
+    if config.experiment.in_space:
+        held = [held_places(pose) for pose in config.experiment.poses]
+        ends = [] if proposal is None else [np.array([proposal.end])]
+        (scene,) = _rooms(config, [[*measured, *held, *ends]], pulls)
+    else:
+        printed = getattr(config.experiment.measurement, "board", None)
+        scene = Board(config.cable.length, _scale(_PULLING * config.cable.length, pulls))
+        if printed is not None:
+            centers = np.array(list(printed.marker_centers.values()))
+            square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) / 2
+            outlines = centers[:, None] + printed.marker_size * square
+            scene = Board(scene.length, scene.newton, outlines)
+    lines = [scene.points(points[:: max(1, len(points) // _POINTS)]) for points in measured]
+    return scene, scene.ground() + [Mark("taken", line) for line in lines]
 
 
-def _board(outcome: Outcome, pulls: FloatArray) -> Board:
-    length = outcome.config.cable.length
-    largest = float(np.hypot(*pulls.T).max(initial=0.0))
-    printed = getattr(outcome.config.experiment.measurement, "board", None)
-    markers = np.zeros((0, 1, 2))
-    if printed is not None:
-        centers = np.array(list(printed.marker_centers.values()))
-        square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) / 2
-        markers = centers[:, None] + printed.marker_size * square
-    return Board(length, _LONGEST * length / max(largest, 1e-12), markers)
-
-
-def pull_marks(outcome: Outcome, place: Room | Board) -> list[Mark]:
+def pull_marks(outcome: Outcome, scene: Scene) -> list[Mark]:
     """Where the cable is pulled (95 %), and the force in each fit pose."""
     load = outcome.unexplained
     assert load is not None
+    pulled = np.array([*np.linspace(*load.interval, 9), load.position])
+    measured = {pose.name: pose.points for pose in outcome.poses}
+    declared = {pose.name: pose for pose in outcome.config.experiment.poses}
     marks = []
     for name, force in zip(load.poses, load.force_per_pose, strict=True):
-        line = measured_line(outcome, name)
-        if line is None:
+        if not len(measured[name]):
             continue
-        places, points = line
-        pulled = np.array([*np.linspace(*load.interval, 9), load.position])
-        part = place.points(np.column_stack([np.interp(pulled, places, x) for x in points.T]))
-        marks += [Mark("pulled", part[:-1]), Mark("pull", place.force(part[-1], force).points)]
+        start, *end = held_places(declared[name])
+        points = np.concatenate([[start], measured[name], *([place] for place in end)])
+        places = np.cumsum([0.0, *np.hypot.reduce(np.diff(points, axis=0), axis=1)])
+        if end:
+            places *= outcome.config.cable.length / places[-1]
+        part = scene.points(np.column_stack([np.interp(pulled, places, x) for x in points.T]))
+        marks += [Mark("pulled", part[:-1]), scene.force(part[-1], force, "pull")]
     return marks
 
 
-def next_marks(outcome: Outcome, place: Room | Board) -> list[Mark]:
+def next_marks(outcome: Outcome, scene: Scene) -> list[Mark]:
     """The ends of the poses that were taken, and the end to hold next."""
     assert outcome.next_pose is not None
     marks = []
     for pose in outcome.config.experiment.poses:
-        for kind, held in (("start", pose.start), ("end", pose.end)):
-            if held is not None:
-                at = place.points(np.array(held))
-                marks.append(
-                    Mark(f"fixture {kind}", np.concatenate([at, at + 1e-3 * place.length]))
-                )
-    at = place.points(np.array(outcome.next_pose.end))
-    size, axes = _CROSS * place.length, np.eye(at.shape[1])
+        for kind, place in zip(("start", "end"), held_places(pose), strict=False):
+            at = scene.points(place)
+            marks.append(Mark(f"fixture {kind}", np.concatenate([at, at + 1e-3 * scene.length])))
+    at = scene.points(np.array(outcome.next_pose.end))
+    size, axes = _CROSS * scene.length, np.eye(at.shape[1])
     arms = size * np.concatenate([[sign * axis, 0 * axis] for axis in axes for sign in (1, -1)])
     return [
         *marks,

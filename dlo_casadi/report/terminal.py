@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -11,60 +10,79 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from dlo_casadi.config import Config
+from dlo_casadi.equilibrium.cable_shape import CableShape
 from dlo_casadi.errors import counted
-from dlo_casadi.report.canvas import NOISE_ALONE, label_of, millimetres
-from dlo_casadi.report.json_report import all_warnings
-from dlo_casadi.report.text_findings import (
-    CANDIDATE_ORDER,
-    cross_validated,
-    finding_of,
-    p_value_note,
-    stage_rows,
-    timing_rows,
-    verdict_lines,
-)
-from dlo_casadi.report.text_parameters import (
-    describe,
+from dlo_casadi.report.tables import (
+    fitted_rows,
     fixed_rows,
     footnotes,
     nuisance_rows,
+    prediction_rows,
     rest_rows,
-    vector,
+    stage_rows,
+    timing_rows,
+)
+from dlo_casadi.report.words import (
+    CANDIDATE_ORDER,
+    NOISE_ALONE,
+    all_warnings,
+    cross_validated,
+    finding_of,
+    label_of,
+    mesh_text,
+    millimetres,
+    p_value_note,
+    verdict_lines,
 )
 from dlo_casadi.session.outcome import Outcome, ReadingErrors
-from dlo_casadi.session.pose_shape import BranchShape
 
-# Distances [m] that the table of a prediction shows.
-_SHOWN = 5e-6
+# Of the table of a check: the key of a pose's row, how its number is written, and times what.
+_CHECKED: dict[str, tuple[str, str, float]] = {
+    "length": ("length", "{:.3f} m", 1.0),
+    "of declared": ("length_over_declared", "{:.0f} %", 100.0),
+    "off fixtures": ("largest_distance_from_fixture", "{:.1f} mm", 1e3),
+    "seen": ("coverage", "{:.0f} %", 100.0),
+    "confidence": ("confidence", "{:.0f} %", 100.0),
+    "pixel": ("pixel", "{:.2f} mm", 1e3),
+}
+# Columns that are left out where no pose has anything for them.
+_OPTIONAL = ("seen", "confidence", "pixel", "markers")
+
+
+def _table(title: str, words: Sequence[str], numbers: Sequence[str] = ()) -> Table:
+    """A table with columns of words, then of numbers."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    for column in words:
+        table.add_column(column)
+    for column in numbers:
+        table.add_column(column, justify="right")
+    return table
+
+
+# ---- a run -------------------------------------------------------------------------------------
 
 
 def print_summary(console: Console, outcome: Outcome) -> None:
     """Print all that a user should see at the end of a run."""
-    console.print(summary(outcome))
-
-
-def summary(outcome: Outcome) -> RenderableType:
-    """Everything that a user should see at the end of a run."""
-    parts: list[RenderableType] = [
-        "",
-        _heading(outcome),
-        parameter_table(outcome),
-        *(Text("  " + line) for line in footnotes(outcome)),
-        "",
-        error_table(outcome),
-        "",
-        *(Text(line) for line in verdict_lines(outcome)),
-    ]
-    warnings = all_warnings(outcome)
-    if warnings:
-        parts.append("")
-        parts += [Text.assemble(("warning: ", "bold yellow"), text) for text in warnings]
-    parts += ["", timing_table(outcome)]
-    return Group(*parts)
-
-
-def _table(title: str) -> Table:
-    return Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    warnings = [Text.assemble(("warning: ", "bold yellow"), text) for text in all_warnings(outcome)]
+    blank = [Text("")] if warnings else []
+    console.print(
+        Group(
+            "",
+            _heading(outcome),
+            _parameter_table(outcome),
+            *(Text("  " + line) for line in footnotes(outcome)),
+            "",
+            _error_table(outcome),
+            "",
+            *(Text(line) for line in verdict_lines(outcome)),
+            *blank,
+            *warnings,
+            "",
+            _timing_table(outcome),
+        )
+    )
 
 
 def _heading(outcome: Outcome) -> Text:
@@ -72,62 +90,44 @@ def _heading(outcome: Outcome) -> Text:
     noise = f"noise std {millimetres(m.std)} ({m.std_source})"
     if m.correlation_length > 0:
         noise += f", correlated over {millimetres(m.correlation_length)}"
-    declared = m.poses_held_out + len(m.held_out_missing)
-    held_out = f"{m.poses_held_out} held out"
-    if m.held_out_missing:
-        held_out = f"{m.poses_held_out} of {declared} held out"
+    missing = len(m.held_out_missing)
+    declared = f" of {m.poses_held_out + missing}" if missing else ""
     text = (
-        f"{counted(m.poses_fit, 'fit pose')}, {held_out}, {counted(m.points, 'point')}; {noise}; "
-        f"{counted(outcome.discretization.n, outcome.discretization.element)}, "
-        f"mesh error {millimetres(outcome.discretization.error)}"
+        f"{counted(m.poses_fit, 'fit pose')}, {m.poses_held_out}{declared} held out, "
+        f"{counted(m.points, 'point')}; {noise}; {mesh_text(outcome)}"
     )
     return Text.assemble((outcome.config.cable.name, "bold"), ": ", text)
 
 
-# ---- parameters --------------------------------------------------------------------------------
-
-
-def parameter_table(outcome: Outcome) -> Table:
+def _parameter_table(outcome: Outcome) -> Table:
     """Fitted parameters of the last stage with their units, and what was kept fixed."""
-    table = _table(f"Parameters ({label_of(outcome.stages[-1], outcome)})")
+    table = _table(f"Parameters ({label_of(outcome.stages[-1], outcome)})", [])
     for column in ("parameter", "value", "95 % interval", ""):
         table.add_column(column, no_wrap=bool(column))
-    for name, estimate in outcome.stages[-1].parameters.items():
-        table.add_row(name, *describe(estimate))
-    for row in rest_rows(outcome):
-        table.add_row(*row)
-    for row in nuisance_rows(outcome):
+    for row in (*fitted_rows(outcome), *rest_rows(outcome), *nuisance_rows(outcome)):
         table.add_row(*row)
     for row in fixed_rows(outcome):
         table.add_row(*row, style="dim")
     return table
 
 
-# ---- errors ------------------------------------------------------------------------------------
-
-
-def error_table(outcome: Outcome) -> Table:
+def _error_table(outcome: Outcome) -> Table:
     """Errors of the stages: fit, cross-validated, held out, chi-square, beside the noise."""
-    table = _table("Distance of the measured points from the predicted shape, RMS")
-    table.add_column("stage")
     columns = {"fit": "fit", "validated": "cross-validated", "held_out": "held out"}
     columns["chi2"] = "chi2/dof"
     if not cross_validated(outcome):
         del columns["validated"]
-    for name in columns.values():
-        table.add_column(name, justify="right")
+    title = "Distance of the measured points from the predicted shape, RMS"
+    table = _table(title, ["stage"], list(columns.values()))
     for row in stage_rows(outcome, "-"):
         table.add_row(row["label"], *(row[column] for column in columns))
-    last = outcome.stages[-1]
     if outcome.measurement.readings:
-        cells = {
-            "fit": _newtons(last.readings_fit),
-            "held_out": _newtons(last.readings_held_out),
-        }
+        last = outcome.stages[-1]
+        cells = {"fit": _newtons(last.readings_fit), "held_out": _newtons(last.readings_held_out)}
         table.add_row("  forces, moments", *(cells.get(column, "") for column in columns))
     table.add_section()
-    floor = [millimetres(outcome.measurement.noise_distance)] + [""] * (len(columns) - 1)
-    table.add_row(f"{NOISE_ALONE} ({outcome.measurement.std_source})", *floor)
+    floor = millimetres(outcome.measurement.noise_distance)
+    table.add_row(f"{NOISE_ALONE} ({outcome.measurement.std_source})", floor)
     return table
 
 
@@ -137,36 +137,22 @@ def _newtons(errors: ReadingErrors) -> str:
     return ", ".join(f"{value:.2g} {unit}" for value, unit in found if value is not None) or "-"
 
 
-# ---- diagnosis ---------------------------------------------------------------------------------
-
-
 def candidate_table(outcome: Outcome) -> Table:
     """Every effect that was tried, in the order of `CANDIDATE_ORDER`."""
-    table = _table(f"Effects that were tried: {CANDIDATE_ORDER}")
+    numbers = ("score", "p-value", "cross-validated error")
+    table = _table(f"Effects that were tried: {CANDIDATE_ORDER}", ["effect"], numbers)
     table.caption, table.caption_justify = p_value_note(outcome), "left"
-    table.add_column("effect")
-    for column in ("score", "p-value", "cross-validated error"):
-        table.add_column(column, justify="right")
     table.add_column("finding")
     for row in outcome.candidates:
-        table.add_row(
-            row.name,
-            f"{row.score:.1f}",
-            f"{row.p_value:.2g}",
-            millimetres(row.rmse_cross_validated),
-            finding_of(outcome, row)[1],
-        )
+        error = millimetres(row.rmse_cross_validated)
+        finding = finding_of(outcome, row)[1]
+        table.add_row(row.name, f"{row.score:.1f}", f"{row.p_value:.2g}", error, finding)
     return table
 
 
-# ---- timing ------------------------------------------------------------------------------------
-
-
-def timing_table(outcome: Outcome) -> Table:
+def _timing_table(outcome: Outcome) -> Table:
     """Wall-clock time of the parts of the run."""
-    table = _table("Time")
-    table.add_column("part")
-    table.add_column("seconds", justify="right")
+    table = _table("Time", ["part"], ["seconds"])
     table.add_column("")
     *parts, total = timing_rows(outcome)
     for row in parts:
@@ -179,67 +165,38 @@ def timing_table(outcome: Outcome) -> Table:
 # ---- one predicted pose ------------------------------------------------------------------------
 
 
-def prediction_table(shape: dict[str, Any], notes: Iterable[str] = ()) -> RenderableType:
-    """Reactions, energy, stability and shape of one predicted pose.
-
-    Parameters
-    ----------
-    shape : dict
-        As from `PredictedShape.as_dict`.
-    """
-    table = _table(f"{shape['cable']}: predicted shape")
-    table.add_column("quantity")
-    table.add_column("value")
+def prediction_table(shape: CableShape, notes: Iterable[str] = ()) -> RenderableType:
+    """Reactions, energy, stability and shape of one predicted pose."""
+    table = _table(f"{shape.cable.model.cable.name}: predicted shape", ["quantity", "value"])
     for row in prediction_rows(shape):
         table.add_row(*row)
-    points = _table("Points from start to end")
-    count, axes = len(shape["points"]), "xyz"[: len(shape["start"])]
-    for column in ("s", *axes):
-        points.add_column(f"{column} [m]", justify="right")
-    for k, place in enumerate(shape["points"]):
-        if k % max(1, (count - 1) // 10) == 0:
-            s = shape["length"] * k / (count - 1)
-            points.add_row(f"{s:.4f}", *(f"{x:.5f}" for x in place))
+    every = shape.points()
+    axes = "xyz"[: every.shape[1]]
+    points = _table("Points from start to end", [], [f"{column} [m]" for column in ("s", *axes)])
+    for k in range(0, len(every), 10):
+        s = shape.cable.model.cable.length * k / (len(every) - 1)
+        points.add_row(f"{s:.4f}", *(f"{x:.5f}" for x in every[k]))
     return Group(table, points, *(Text(note) for note in notes))
 
 
-def _side(shape: dict[str, Any]) -> str | None:
-    """What tells the side on which a predicted cable hangs."""
-    return BranchShape(0.0, shape["branch"], shape.get("turns")).chosen_by
+# ---- a check -----------------------------------------------------------------------------------
 
 
-def prediction_rows(shape: dict[str, Any]) -> list[tuple[str, str]]:
-    """Quantities of a predicted pose, as from `PredictedShape.as_dict`, and their values."""
-    rows = []
-    for side in ("start", "end"):
-        at = shape[side]
-        if at is None:
-            rows.append((side, "free"))
-            continue
-        rows.append((side, vector(at, "g", "m")))
-        reached = shape["points"][0 if side == "start" else -1]
-        if math.dist(at, reached) > _SHOWN:
-            place = vector(reached, ".5f", "m")
-            rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
-        force, moment = shape[f"force_on_{side}"], shape[f"moment_on_{side}"]
-        rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
-        if any(shape.get(f"{side}_{key}") is not None for key in ("heading", "orientation")):
-            said = (
-                f"{moment:.4g} N m" if isinstance(moment, float) else vector(moment, ".4g", "N m")
-            )
-            rows.append((f"moment of the cable on its {side}", said))
-    rows.append(("energy", f"{shape['energy']:.6g} J"))
-    rows.append(("smallest bend radius", millimetres(shape["min_bend_radius"])))
-    stable = "yes" if shape["stable"] else "NO: the cable would not stay there"
-    rows.append(("stable", stable))
-    other = shape["other_side"]
-    if other is not None:
-        rows.append(("this side", f"`{_side(shape)}`"))
-        near = f"{other['tipping']:.2g} rad (known to {other['tipping_std']:.2g} rad)"
-        text = (
-            f"`{_side(other)}`: {other['energy']:.6g} J, up to "
-            f"{millimetres(other['greatest_distance'])} away; equally low with the clamp turned by "
-            f"{near}"
-        )
-        rows.append(("also stable", text))
-    return rows
+def check_table(config: Config, rows: Sequence[Mapping[str, Any]]) -> Table:
+    """One line for each pose of `check_dict`; columns without anything in them are left out."""
+    keys = {name: key for name, (key, *_) in _CHECKED.items()} | {"markers": "markers"}
+    known = {name for name, key in keys.items() if any(row[key] is not None for row in rows)}
+    shown = [name for name in keys if name in known or name not in _OPTIONAL]
+    title = f"{config.cable.name}: what was found, {config.cable.length:g} m declared"
+    table = _table(title, ["pose", "role"], shown)
+    for row in rows:
+        cells = dict.fromkeys(keys, "-")
+        for name, (key, form, times) in _CHECKED.items():
+            if row[key] is not None:
+                cells[name] = form.format(times * row[key])
+        if row["markers"] is not None:
+            cells["markers"] = " ".join(map(str, row["markers"]))
+        role = "held out" if row["role"] == "held_out" else "fit"
+        style = "red" if row["problem"] else ""
+        table.add_row(row["name"], role, *(cells[name] for name in shown), style=style)
+    return table

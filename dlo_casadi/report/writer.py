@@ -17,10 +17,9 @@ from dlo_casadi.io.points import write_points, write_table
 from dlo_casadi.report.figures import figures_of, write_figures
 from dlo_casadi.report.figures_poses import draw_poses
 from dlo_casadi.report.json_report import report_text
-from dlo_casadi.report.overlay import write_overlays
-from dlo_casadi.report.page import GENERATOR, report_page
-from dlo_casadi.report.page_failure import write_failure_page
+from dlo_casadi.report.page import GENERATOR, report_page, write_failure_page
 from dlo_casadi.report.parameters_text import parameters_text
+from dlo_casadi.report.photographs import write_overlays
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.session.outcome import Outcome

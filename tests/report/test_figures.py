@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,10 +10,15 @@ from matplotlib.image import imread
 
 from dlo_casadi.diagnosis.pull import Pull
 from dlo_casadi.diagnosis.selection import Ranked
-from dlo_casadi.report import figures, figures_poses, overlay
-from dlo_casadi.report.canvas import before_after, label_of, save_figure
-from dlo_casadi.report.drawing import prediction_figure
-from dlo_casadi.report.geometry import magnified
+from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.fitted_cable import FittedCable
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.report import figures, figures_poses
+from dlo_casadi.report.canvas import save_figure
+from dlo_casadi.report.photographs import write_overlays
+from dlo_casadi.report.scene import beside
+from dlo_casadi.report.words import compared
 from dlo_casadi.session.findings import EffectParameter, FoundEffect
 from dlo_casadi.session.outcome import PoseInput
 
@@ -94,11 +100,13 @@ def test_candidates_and_the_unexplained_load_are_drawn(closed, tmp_path):
 
 
 def test_what_is_compared(outcome, closed):
-    before, after = before_after(outcome)
-    assert (before.name, after.name) == ("initial", "batch")
-    before, after = before_after(closed)
-    assert (before.name, after.name) == ("batch", "closed")
-    assert label_of(after, closed) == "with lumped_mass"
+    assert [(kind, stage.name) for kind, _, stage in compared(outcome)] == [
+        ("before", "initial"),
+        ("after", "batch"),
+    ]
+    before, after = compared(closed)
+    assert (before.stage.name, after.stage.name) == ("batch", "closed")
+    assert after.label == "with lumped_mass"
 
 
 def test_nothing_is_drawn_of_what_is_missing(outcome, tmp_path):
@@ -143,7 +151,7 @@ def test_magnified_deviations_are_multiples_of_the_true_ones(outcome):
     pose = outcome.poses[0]
     shape = outcome.stage("initial").shapes[pose.name]
 
-    distance = [np.hypot(*(pose.points - magnified(pose, shape, k)).T) for k in (5, 10)]
+    distance = [np.hypot(*(pose.points - beside(pose, shape, k)).T) for k in (5, 10)]
     assert distance[1] == pytest.approx(2 * distance[0])
     # Normals of 201 drawn points: exact to a thousandth.
     assert distance[0] == pytest.approx(5 * np.abs(shape.residual), rel=1e-3)
@@ -158,7 +166,7 @@ def test_lines_are_drawn_over_the_part_of_a_photograph_with_the_cable(outcome, t
 
     photographed = PoseInput("pose_01", "fit", outcome.poses[0].points, PHOTO, pixels, to_pixels)
     shown = replace(outcome, poses=(photographed,))
-    overlay.write_overlays(tmp_path / "overlays", shown)
+    write_overlays(tmp_path / "overlays", shown)
 
     (height, width), _ = drawn(tmp_path / "overlays" / "pose_01.jpg")
     assert width <= 1200
@@ -169,27 +177,26 @@ def test_lines_are_drawn_over_the_part_of_a_photograph_with_the_cable(outcome, t
 
 def test_a_photograph_that_is_gone_is_left_out(outcome, tmp_path):
     gone = replace(outcome.poses[0], image=tmp_path / "gone.jpg", to_pixels=lambda x: x)
-    overlay.write_overlays(tmp_path / "overlays", replace(outcome, poses=(gone,)))
+    write_overlays(tmp_path / "overlays", replace(outcome, poses=(gone,)))
 
     assert list((tmp_path / "overlays").iterdir()) == []
 
 
-@pytest.mark.parametrize("end", [None, [0.4, -0.1]])
+@pytest.mark.parametrize("end", [None, (0.4, -0.1)])
 def test_a_prediction_is_drawn(tmp_path, end):
     points = np.stack([np.linspace(0, 0.4, 21), -0.25 * np.linspace(0, 1, 21)], axis=1)
-    shape = {
-        "cable": "rope",
-        "points": points.tolist(),
-        "band_90": np.linspace(0.0, 0.01, 21).tolist(),
-        "end": end,
-        "force_on_start": [0.0, -1.0],
-        "force_on_end": [0.0, 0.0],
-        "energy": 1.0,
-        "min_bend_radius": 0.1,
-        "stable": end is None,
-        "other_side": None if end is None else {"points": (-points).tolist()},
-    }
-    save_figure(tmp_path / "shape.png", prediction_figure(shape))
+    force = np.array([0.0, -1.0])
+    shape = SimpleNamespace(
+        cable=FittedCable(CableModel(Cable(0.8, 0.05, 0.01, 0.02, name="rope")), *[None] * 3),
+        pose=Pose((0.0, 0.0), end),
+        equilibrium=SimpleNamespace(
+            lam_start=force, lam=0 * force, energy=1.0, min_bend_radius=0.1, stable=end is None
+        ),
+        points=lambda: points,
+        band=lambda: np.linspace(0.0, 0.01, 21),
+        other_side=end and SimpleNamespace(points=lambda: -points),
+    )
+    save_figure(tmp_path / "shape.png", figures_poses.prediction_figure(shape))
 
     assert drawn(tmp_path / "shape.png")[1] > 0.005
 

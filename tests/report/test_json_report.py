@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dlo_casadi.equilibrium.tipping import Tipping
-from dlo_casadi.report.json_report import all_warnings, finite, report_dict, report_text
-from dlo_casadi.report.page_data import page_data
-from dlo_casadi.report.text_findings import verdict_lines
+from dlo_casadi.report.json_report import finite, report_dict, report_text
+from dlo_casadi.report.page import page_data
+from dlo_casadi.report.words import all_warnings, verdict_lines
 from dlo_casadi.session.outcome import ParameterEstimate, RestCurvatureEstimate, Stage
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 

@@ -15,19 +15,22 @@ from test_figures import CANDIDATES, EFFECT, LOAD, with_readings
 
 from dlo_casadi.diagnosis.next_pose import NextPose, NextReading
 from dlo_casadi.report import canvas, figures
-from dlo_casadi.report.geometry import beside
-from dlo_casadi.report.page import breakable, report_page, units
-from dlo_casadi.report.page_backgrounds import PHOTOGRAPHS, photograph_of
-from dlo_casadi.report.page_data import (
+from dlo_casadi.report.page import (
+    breakable,
     candidate_rows,
     configuration_text,
     meaning,
     page_data,
     parameter_rows,
+    report_page,
     symmetric_interval,
+    units,
 )
 from dlo_casadi.report.page_pictures import pictures
-from dlo_casadi.report.text_findings import stage_rows
+from dlo_casadi.report.photographs import PHOTOGRAPHS, photograph_of
+from dlo_casadi.report.scene import beside
+from dlo_casadi.report.tables import stage_rows
+from dlo_casadi.report.words import millimetres
 from dlo_casadi.session.outcome import ParameterEstimate
 
 HOSTILE = "<img src=x onerror=alert(1)></script>"
@@ -377,7 +380,7 @@ def test_what_is_told_at_the_pointer(outcome):
         for kind in ("choose", "residual-before", "residual-after")
         for k in range(count)
     }
-    error = canvas.millimetres(stage.shapes[pose.name].rmse)
+    error = millimetres(stage.shapes[pose.name].rmse)
     assert titles["residual-after-0"] == f"{pose.name}, RMS distance {error}"
     assert titles["choose-0"].startswith(f"{pose.name}; initial guess ")
     assert titles["choose-0"].endswith(f"; declared model, fitted {error}")

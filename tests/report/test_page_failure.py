@@ -8,8 +8,7 @@ from test_writer import tree
 
 from dlo_casadi.errors import DloError, EstimationError, MeasurementError, OutputError
 from dlo_casadi.report import writer
-from dlo_casadi.report.page import GENERATOR
-from dlo_casadi.report.page_failure import failure_page, hints, write_failure_page
+from dlo_casadi.report.page import GENERATOR, failure_page, hints, write_failure_page
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import run_session
 
@@ -45,6 +44,13 @@ def test_a_run_that_fails_before_the_poses_are_read_shows_the_photographs(photog
     assert "The run failed before the poses were read." in page
     assert page.count("data:image/jpeg;base64,") == 5
     assert "Compare the configuration below" in page
+
+
+def test_a_run_in_space_that_fails_before_the_poses_are_read_has_its_page(in_room):
+    page = failure_page(in_room.config, DloError("too early"))
+
+    assert "The run failed before the poses were read." in page
+    assert page.count('<li class="pose"') == 3
 
 
 def test_centre_lines_are_drawn_with_their_declared_fixtures(outcome):

@@ -17,9 +17,8 @@ from test_page import HOSTILE, diagnosed, hostile
 from test_room import in_room_pulled
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.report.geometry import beside
-from dlo_casadi.report.page import report_page
-from dlo_casadi.report.page_failure import failure_page
+from dlo_casadi.report.page import failure_page, report_page
+from dlo_casadi.report.scene import beside
 
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 pytestmark = pytest.mark.skipif(

@@ -11,11 +11,10 @@ from test_figures import pull
 from test_page import PROPOSAL, diagnosed
 
 from dlo_casadi.report.figures import figures_of, write_figures
-from dlo_casadi.report.figures_poses import draw_poses
+from dlo_casadi.report.figures_poses import draw_poses, outcome_figure
 from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.report.notebook import outcome_figure
 from dlo_casadi.report.page import report_page
-from dlo_casadi.report.room import VIEWS, arrow, rooms, seen, upright
+from dlo_casadi.report.scene import VIEWS, arrow, scenes_of, seen, upright
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.session.fitting import confirmed, minimum_by_ipopt
 
@@ -51,7 +50,7 @@ def test_an_arrow_ends_at_its_tip():
 
 def test_rooms_hold_their_cables_from_wherever_they_are_seen(in_room):
     stage = in_room.stage("batch")
-    standing = rooms(in_room.config, in_room.poses, [stage])
+    standing = scenes_of(in_room.config, in_room.poses, [stage])
     assert len({room.radius for room in standing}) == 1
     for room, pose in zip(standing, in_room.poses, strict=True):
         shape = stage.shapes[pose.name]

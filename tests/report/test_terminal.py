@@ -10,11 +10,11 @@ from test_page import PROPOSAL
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE, Structure
 from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.report.page_data import page_data
+from dlo_casadi.report.page import page_data
 from dlo_casadi.report.page_pictures import pictures
+from dlo_casadi.report.tables import describe, stage_rows, unidentified
 from dlo_casadi.report.terminal import print_summary
-from dlo_casadi.report.text_findings import separation_text, stage_rows, structure_lines
-from dlo_casadi.report.text_parameters import describe, plus_minus, unidentified
+from dlo_casadi.report.words import plus_minus, separation_text, structure_lines
 from dlo_casadi.session.outcome import ParameterEstimate
 from dlo_casadi.session.pose_shape import BranchShape
 

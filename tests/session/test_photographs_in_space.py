@@ -11,8 +11,8 @@ import pytest
 from dlo_casadi.cli import main
 from dlo_casadi.config import Camera, dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import DloError
-from dlo_casadi.report.page_failure import failure_page
-from dlo_casadi.report.page_views import view_pictures
+from dlo_casadi.report.page import failure_page
+from dlo_casadi.report.page_pictures import view_pictures
 from dlo_casadi.session.measure import draw_steps, measured_poses, read_inputs
 from dlo_casadi.session.outcome import Stage
 from dlo_casadi.session.pose_shape import PoseShape

@@ -1,32 +1,66 @@
-"""Photographs with the measured line and the predictions drawn over them."""
+"""Photographs in the report: made smaller for the page, and with all lines drawn over them."""
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from PIL import Image
 
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
-from dlo_casadi.report.canvas import (
-    BLUE,
-    ORANGE,
-    before_after,
-    drawn,
-    label_of,
-    millimetres,
-    styled,
-)
+from dlo_casadi.report.canvas import STAGE_LINES, styled
+from dlo_casadi.report.words import compared, millimetres
 from dlo_casadi.session.outcome import Outcome, PoseInput
 from dlo_casadi.vision import read_image
 
-_LARGEST = (1200, 900)  # px
-_NARROWEST = 640  # px, room for the legend
-_STRIP = 56  # px, for the legend below
+# All photographs of a page together [bytes], before they become text, which takes a third more.
+PHOTOGRAPHS = 3_000_000
+_WIDEST = 1280  # px
+_NARROWEST = 320  # px
+_QUALITIES = (82, 70, 55)
+# Of a drawn photograph [px]: the largest, the narrowest with its legend, the strip of the legend.
+_LARGEST, _LEGEND, _STRIP = (1200, 900), 640, 56
 _DPI = 100
+
+
+def photograph_of(path: Path, budget: int) -> tuple[str, int, int] | None:
+    """Read a photograph as a small JPEG in a data URI, with its true width and height [px].
+
+    Parameters
+    ----------
+    budget : int
+        Largest size [bytes] of the JPEG; quality goes first, then width.
+
+    None where the file cannot be read (any more).
+    """
+    try:
+        pixels = read_image(path)[..., ::-1]
+    except MeasurementError:
+        return None
+    height, width = pixels.shape[:2]
+    whole = Image.fromarray(np.ascontiguousarray(pixels))
+    wide = float(min(_WIDEST, width))
+    while True:
+        size = (round(wide), max(1, round(wide * height / width)))
+        small = (
+            whole if size == whole.size else whole.resize(size, Image.Resampling.LANCZOS, None, 2)
+        )
+        for quality in _QUALITIES:
+            buffer = io.BytesIO()
+            small.save(buffer, "JPEG", quality=quality)
+            if buffer.tell() <= budget:
+                break
+        if buffer.tell() <= budget or wide <= _NARROWEST:
+            break
+        wide = max(_NARROWEST, min(0.8, 0.95 * (budget / buffer.tell()) ** 0.5) * wide)
+    text = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return f"data:image/jpeg;base64,{text}", width, height
 
 
 def write_overlays(folder: Path, outcome: Outcome) -> None:
@@ -39,19 +73,17 @@ def write_overlays(folder: Path, outcome: Outcome) -> None:
                 image = read_image(pose.image)[..., ::-1]
             except MeasurementError:  # gone since it was measured
                 continue
-            draw_overlay(folder / f"{pose.name}.jpg", image, pose, outcome)
+            _draw_overlay(folder / f"{pose.name}.jpg", image, pose, outcome)
 
 
-def draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome: Outcome) -> None:
+def _draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome: Outcome) -> None:
     """Draw the part of a photograph (H, W, 3; red, green, blue) that holds the cable."""
-    before, after = before_after(outcome)
     lines = []
-    for stage, color, style in ((before, ORANGE, "--"), (after, BLUE, "-")):
-        shape = None if stage is None else stage.shapes.get(pose.name)
-        if stage is not None and shape is not None:
-            label = label_of(stage, outcome)
+    for kind, label, stage in compared(outcome):
+        shape = stage.shapes.get(pose.name)
+        if shape is not None:
             label += "" if shape.rmse is None else f", {millimetres(shape.rmse)}"
-            lines.append((np.asarray(pose.to_pixels(shape.curve)), color, style, label))
+            lines.append((np.asarray(pose.to_pixels(shape.curve)), kind, label))
     measured = np.zeros((0, 2)) if pose.pixels is None else pose.pixels
     (left, top), (right, bottom) = _window(image, [measured, *(line[0] for line in lines)])
     zoom = min(_LARGEST[0] / (right - left), _LARGEST[1] / (bottom - top))
@@ -59,23 +91,27 @@ def draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome:
     part = Image.fromarray(image[top:bottom, left:right]).resize(
         (width, height), Image.Resampling.BILINEAR
     )
-    whole = max(width, _NARROWEST)
+    whole = max(width, _LEGEND)
     with styled((whole / _DPI, (height + _STRIP) / _DPI), layout=None) as drawing:
         share = _STRIP / (height + _STRIP)
         axes = drawing.add_axes(((1 - width / whole) / 2, share, width / whole, 1 - share))
         axes.set_axis_off()
         axes.plot(*measured.T, ".", color="white", ms=4.2)
         axes.plot(*measured.T, ".", color="black", ms=2.2, label="measured")
-        for line, color, style, label in lines:
+        for line, kind, label in lines:
             axes.plot(*line.T, color="white", lw=2.6, alpha=0.6)
-            axes.plot(*line.T, color=color, ls=style, lw=1.5, label=label)
+            axes.plot(*line.T, **STAGE_LINES[kind], lw=1.5, label=label)
         axes.set_xlim(left - 0.5, right - 0.5)
         axes.set_ylim(bottom - 0.5, top - 0.5)
         role = "held out" if pose.role == "held_out" else "fit"
         drawing.legend(
             loc="lower center", ncols=3, fontsize=9, frameon=False, title=f"{pose.name} ({role})"
         )
-        over = Image.fromarray(drawn(drawing, _DPI))
+        drawing.set_dpi(_DPI)
+        drawing.patch.set_alpha(0.0)
+        canvas = FigureCanvasAgg(drawing)
+        canvas.draw()
+        over = Image.fromarray(np.asarray(canvas.buffer_rgba()))
     # Matplotlib takes longer to draw a photograph than all that lies over it.
     page = Image.new("RGB", over.size, "white")
     page.paste(part, ((whole - width) // 2, 0))

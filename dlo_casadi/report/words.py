@@ -1,0 +1,310 @@
+"""The report in words: numbers, what stages are called, and all sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from dlo_casadi.diagnosis.next_pose import NextPose, NextReading
+from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.diagnosis.structure import LARGEST_SCORE
+from dlo_casadi.errors import counted
+from dlo_casadi.session.findings import FoundEffect
+from dlo_casadi.session.outcome import Outcome, Stage, StageName
+from dlo_casadi.session.pose_shape import BranchShape, EitherSide
+from dlo_casadi.thresholds import APART, NOTABLE
+
+# By what name tables and charts have the RMS distance that the noise of points gives by itself.
+NOISE_ALONE = "noise alone"
+# The errors of a stage, of which some poses were measured in another equilibrium.
+ON_BRANCH = "on the measured branch"
+# How candidates are ordered; the score alone does not tell how well a refit does.
+CANDIDATE_ORDER = "first those that a refit confirms, by BIC, then other refits, the rest by score"
+# Stages of every report, in this order; `closed` only where an effect was added.
+ALWAYS: tuple[StageName, ...] = ("initial", "stiffness_only", "algorithm1", "batch")
+STAGE_LABELS: dict[StageName, str] = {
+    "initial": "initial guess",
+    "stiffness_only": "stiffness alone",
+    "algorithm1": "Algorithm 1",
+    "batch": "declared model, fitted",
+    "closed": "with added effects",
+}
+# What the residual may depend on, by the name of its normal score.
+DEPENDENCES = {
+    "runs_z": "runs along the cable",
+    "order_z": "the order of the poses",
+    "span_z": "the distance of the ends",
+    "position_z": "the place in the {plane}",
+}
+# Nobody measures a pose more often.
+MOST_REPEATS = 20
+
+
+# ---- numbers -----------------------------------------------------------------------------------
+
+
+def millimetres(value: float | None, nothing: str = "-") -> str:
+    """A length [m] as text in mm, with three digits; a dash for none."""
+    return nothing if value is None else f"{1e3 * value:.3g} mm"
+
+
+def vector(components: Iterable[float], form: str, unit: str) -> str:
+    """Components of a vector in brackets, and their unit."""
+    return f"({', '.join(format(x, form) for x in components)}) {unit}"
+
+
+def plus_minus(value: float, std: float) -> str:
+    """A value with the digits that its standard deviation leaves: two of the latter."""
+    if not std > 0:
+        return f"{value:.4g}"
+    decimals = 1 - math.floor(math.log10(std))
+    if std >= 10 * abs(value) or not 0 <= decimals <= 7:
+        return f"{value:.2g} ± {std:.2g}"
+    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+
+
+# ---- stages ------------------------------------------------------------------------------------
+
+
+class Compared(NamedTuple):
+    """A stage that is compared: "before" or "after", and what to call it."""
+
+    kind: str
+    label: str
+    stage: Stage
+
+
+def compared(outcome: Outcome) -> list[Compared]:
+    """The last stage with predictions as "after", and as "before" the one that it improves on.
+
+    With effects added: the declared model fitted, and the model with the effects. Otherwise: the
+    initial guess, and the declared model fitted.
+    """
+    with_shapes = [stage for stage in outcome.stages if stage.shapes]
+    if not with_shapes:
+        return []
+    after = with_shapes[-1]
+    name: StageName = "batch" if after.name == "closed" else "initial"
+    before = [stage for stage in with_shapes[:-1] if stage.name == name]
+    shown = [("before", stage) for stage in before[:1]] + [("after", after)]
+    return [Compared(kind, label_of(stage, outcome), stage) for kind, stage in shown]
+
+
+def label_of(stage: Stage, outcome: Outcome) -> str:
+    """What to call a stage."""
+    if stage.name == "closed" and outcome.effects:
+        return "with " + " and ".join(effect.name for effect in outcome.effects)
+    return STAGE_LABELS[stage.name]
+
+
+def directions(outcome: Outcome) -> tuple[str, ...]:
+    """Names of the directions across a cable: in a plane there is one, which needs none."""
+    return ("y", "z") if outcome.config.experiment.in_space else ("",)
+
+
+def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
+    """Cross-validated errors [m] of the stages for which the diagnosis has computed them."""
+    if not outcome.effects:
+        known = outcome.cross_validated
+        return {} if known is None else {"batch": known}
+    return {
+        "batch": outcome.effects[0].rmse_cross_validated_before,
+        "closed": outcome.effects[-1].rmse_cross_validated_after,
+    }
+
+
+def predicted_share(outcome: Outcome, stage: Stage) -> str:
+    """How many of the held-out poses a stage has predicted, where it is not all of them."""
+    held_out = outcome.held_out(stage)
+    if not held_out.missing or not stage.shapes:
+        return ""
+    return f" ({held_out.predicted} of {held_out.declared})"
+
+
+def mesh_text(outcome: Outcome) -> str:
+    """Elements of the model, and the error of so many."""
+    mesh = outcome.discretization
+    return f"{counted(mesh.n, mesh.element)}, mesh error {millimetres(mesh.error)}"
+
+
+def branch_text(found: BranchShape) -> str:
+    """Error of a pose in the equilibrium in which it was measured, and how to choose that one."""
+    return f"{ON_BRANCH} {millimetres(found.rmse)} ({found.chosen_by or 'no branch chooses it'})"
+
+
+def all_warnings(outcome: Outcome) -> list[str]:
+    """Warnings of the run, why a stage lacks a number, and what sits on a bound."""
+    lines = list(outcome.warnings)
+    held_out = outcome.measurement.poses_held_out > 0
+    for name in ALWAYS:
+        stage = outcome.stage(name)
+        if stage is None:
+            lines.append(f"stage {name} did not run")
+        elif stage.rmse_fit is None or (held_out and stage.rmse_held_out is None):
+            lines.append(f"stage {name}: {stage.note or 'some poses could not be predicted'}")
+    for key, estimate in outcome.stages[-1].parameters.items() if outcome.stages else ():
+        if estimate.at_bound:
+            value = f"{estimate.value:.4g} {estimate.unit}".strip()
+            lines.append(f"{key} sits on a bound of what physics permits: {value}")
+    return lines
+
+
+# ---- findings ----------------------------------------------------------------------------------
+
+
+def verdict_lines(outcome: Outcome) -> list[str]:
+    """What the diagnosis has led to, in sentences."""
+    if outcome.doubts:
+        head, *others = (f"{text[:1].upper()}{text[1:]}." for text in outcome.doubts)
+        word = "the fit has failed" if outcome.fit.failed else "unexplained"
+        lines = [f"Verdict: {word}. {head}", *(f"  {text}" for text in others)]
+    elif outcome.verdict is not None:
+        lines = [_verdict(outcome)]
+    else:
+        lines = ["Diagnosis: switched off; nothing was looked for in the residual."]
+    lines += [_either_side(name, found) for name, found in outcome.either_side.items()]
+    lines += structure_lines(outcome)
+    for effect in outcome.effects:
+        lines += _effect_lines(effect)
+    load, proposal = outcome.unexplained, outcome.next_pose
+    if load is not None:
+        low, high = load.interval
+        lines.append(
+            f"  Without naming a cause: pulled by {vector(load.force, '.3g', 'N')} on average "
+            f"at {load.position:.3f} m ({low:.3f} to {high:.3f} m) from the start."
+        )
+        experiment = outcome.config.experiment
+        if experiment.boundary.end == "free" and np.dot(load.force, experiment.gravity) < 0:
+            lines.append(
+                "  Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or "
+                "another stiffness may stand behind it."
+            )
+    if proposal is not None:
+        lines.append(
+            f"  To tell {' from '.join(proposal.separates)}: hold the end at "
+            f"{vector(proposal.end, '.3f', 'm')}; {separation_text(proposal)}"
+        )
+        lines.append(f"  {reading_text(proposal.reading)}")
+    return lines
+
+
+def _verdict(outcome: Outcome) -> str:
+    names = " and ".join(effect.name for effect in outcome.effects)
+    if outcome.verdict == "unexplained":
+        after = outcome.structure[1] if outcome.structure else None
+        if names and after and after.p_value >= outcome.config.diagnosis.significance:
+            error = outcome.effects[-1].rmse_cross_validated_after
+            return (
+                f"Verdict: unexplained. With {names} every pose is fitted, but one that is left "
+                f"out is predicted {millimetres(error)} off "
+                f"({NOISE_ALONE}: {millimetres(outcome.measurement.noise_distance)})."
+            )
+        found = f" even with {names}" if names else ""
+        return f"Verdict: unexplained. The residual is not noise{found}."
+    if outcome.effects:
+        return f"Verdict: the declared model lacked {names}; with it the residual is noise."
+    return "Verdict: complete. The declared model explains the shapes down to their noise."
+
+
+def _either_side(name: str, found: EitherSide) -> str:
+    """A held-out pose on both of its sides, and what chooses each."""
+    predicted, other, near = found.predicted, found.other, found.tipping
+    text = f"  {name} (held out): "
+    if near is not None:
+        text += (
+            f"its clamp is {near.angle:.2g} rad (known to {near.std:.2g} rad) from the angle at "
+            "which both ways to hang are equally low; "
+        )
+    return text + (
+        f"`{predicted.chosen_by or 'turns: 0'}` (predicted) {millimetres(predicted.rmse)} off, "
+        f"`{other.chosen_by}` {millimetres(other.rmse)} off."
+    )
+
+
+def structure_lines(outcome: Outcome) -> list[str]:
+    """What the declared model's residual depends on, where it is not noise."""
+    if outcome.structure is None or outcome.verdict == "complete":
+        return []
+    before, _ = outcome.structure
+    plane = "picture" if outcome.measurement.kind == "images" else "plane"
+    found = []
+    for key, text in DEPENDENCES.items():
+        z = getattr(before, key)
+        score = f"z = {z:+.1f}"
+        if key != "runs_z" and abs(z) >= 0.999 * LARGEST_SCORE:  # beyond what its test tells
+            score = "z > 7" if z > 0 else "z < -7"
+        if abs(z) > NOTABLE:
+            found.append(f"{text.format(plane=plane)} ({score})")
+    return [f"  The declared model's residual depends on {', '.join(found)}."] if found else []
+
+
+def _effect_lines(effect: FoundEffect) -> list[str]:
+    values = [
+        f"{name} unbounded"
+        if found.value is None
+        else f"{name} {plus_minus(found.value, found.std or 0.0)} {found.unit}".strip()
+        for name, found in effect.parameters.items()
+    ]
+    line = f"  {effect.name}: {', '.join(values)}"
+    if effect.p_value is not None:
+        # Below the smallest double it is zero.
+        line += f" (p = {effect.p_value:.1g})" if effect.p_value > 0 else " (p < 1e-307)"
+    rivals = " or ".join(effect.indistinguishable_from)
+    return [line, *([f"    These data cannot tell it from {rivals}."] if rivals else [])]
+
+
+def separation_text(proposal: NextPose) -> str:
+    """How far rivals differ in a proposed pose, and how often it has to be measured."""
+    z = proposal.separation
+    text = (
+        f"they differ there by {millimetres(proposal.difference)} RMS, {z:.2g} "
+        "standard deviations of the noise of one whole line: "
+    )
+    repeats = math.ceil(min((APART / max(z, 1e-9)) ** 2, 1e9))
+    if repeats <= 1:
+        return text + "one measurement suffices."
+    if repeats <= MOST_REPEATS:
+        return text + f"measure it {repeats} times."
+    return text + f"even {MOST_REPEATS} measurements would not tell them apart."
+
+
+def reading_text(reading: NextReading) -> str:
+    """What a reading of force or moment in the proposed pose would tell of rivals."""
+    unit, times = "N m" if reading.name.endswith("moment") else "N", reading.times
+    text = (
+        f"A reading of {reading.name} there differs by {reading.difference:.2g} {unit}, "
+        f"{reading.separation:.2g} standard deviations of one: "
+    )
+    if times is None or times > MOST_REPEATS:
+        return text + "it would not tell them apart."
+    return text + ("one suffices." if times == 1 else f"read it {times} times.")
+
+
+def finding_of(outcome: Outcome, row: Ranked) -> tuple[str, str]:
+    """What a candidate has led to, and the sentence: added, tied, or neither (an empty word)."""
+    for effect in outcome.effects:
+        if row.name == effect.name:
+            return "added", "added to the model"
+        if row.name in effect.indistinguishable_from:
+            return "tied", f"cannot be told apart from {effect.name}"
+    if row.reason:
+        return "", row.reason
+    if row.rmse_cross_validated is None:
+        return "", "not refitted"
+    if outcome.verdict == "unexplained":
+        return "", "withdrawn: it leaves the residual unexplained"
+    return "", "withdrawn: not needed beside what was added later"
+
+
+def p_value_note(outcome: Outcome) -> str:
+    """What the p-values of candidates and of added effects are."""
+    note = "p-value: score test in the declared model, corrected for the number of effects tried."
+    if outcome.effects and outcome.measurement.std_source == "estimated":
+        note += (
+            " The p of an added effect is the larger of that before it was added and that under "
+            "the noise left once it is in the model."
+        )
+    return note
