@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -33,7 +33,7 @@ from dlo_casadi.model.cable_model import (
 )
 from dlo_casadi.rod.element import Cell, Law, Section, Segment
 from dlo_casadi.rod.ends import EndConditions
-from dlo_casadi.rod.in_frame import Forces, SegmentInFrame
+from dlo_casadi.rod.in_frame import SegmentInFrame
 
 # Models whose expressions and functions are kept: a diagnosis compares some thirty at a time.
 MODELS = 64
@@ -48,8 +48,7 @@ class _SegmentTerms:
     ratio: ca.SX
 
 
-@dataclass(frozen=True)
-class SegmentNumbers:
+class SegmentNumbers(NamedTuple):
     """What a segment depends on beside its nodes and multipliers."""
 
     p: ca.SX
@@ -356,14 +355,13 @@ class Lagrangian:
         weights[:spread, 0] = -1.0
         weights[spread + dead :, 1:] = -np.eye(self.model.n_springs)
         loads = self.segment_forces(numbers.p, numbers.place, numbers.deviation)
-        own = numbers.p, numbers.rest, numbers.place, numbers.deviation, numbers.shares
 
         def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
             local = ca.vertcat(ca.DM(self.node.identity), phi)
-            return ca.SX(self.segment_in_frame(local, inner, forces, *own))
+            return ca.SX(self.segment_in_frame(local, inner, forces, *numbers))
 
         total = ca.SX(loads) + pulls @ ca.DM(weights.T)
-        return SegmentInFrame(self.kind, energy, x, Forces(total, weights))
+        return SegmentInFrame(self.kind, energy, x, total, weights)
 
     @cached_property
     def segment_forces(self) -> ca.Function:

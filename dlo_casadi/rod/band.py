@@ -83,6 +83,20 @@ class _Level:
     left: FloatArray  # (m, odd, b, b): rows of the node before, columns of the odd node
     right: FloatArray  # (m, odd or one less, b, b): rows of the odd node, columns of the next
 
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Number of odd nodes, and of those that have a next one."""
+        return self.left.shape[1], self.right.shape[1]
+
+    def reduced(self, diagonal: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Diagonal and couplings of the even nodes without the odd ones."""
+        even, (odd, inner) = diagonal[:, 0::2].copy(), self.counts
+        to_left = _product(self.left, self.inverse)
+        even[:, :odd] -= _product(to_left, _transposed(self.left))
+        to_right = _product(_transposed(self.right), self.inverse[:, :inner])
+        even[:, 1 : inner + 1] -= _product(to_right, self.right)
+        return even, -_product(to_left[:, :inner], self.right)
+
 
 @dataclass(frozen=True)
 class BandMatrix:
@@ -102,35 +116,32 @@ class BandMatrix:
     border: FloatArray
     corner: FloatArray
 
+    @property
+    def _parts(self) -> tuple[FloatArray, ...]:
+        return self.diagonal, self.upper, self.border, self.corner
+
     def subset(self, index: NDArray[np.intp] | BoolArray) -> BandMatrix:
         """Matrices of some of the poses."""
-        return BandMatrix(
-            self.diagonal[index], self.upper[index], self.border[index], self.corner[index]
-        )
+        return BandMatrix(*(part[index] for part in self._parts))
 
     def replaced(self, index: NDArray[np.intp], other: BandMatrix) -> BandMatrix:
         """Matrices of all poses, those of some taken from `other`."""
-        parts = []
-        for mine, new in (
-            (self.diagonal, other.diagonal),
-            (self.upper, other.upper),
-            (self.border, other.border),
-            (self.corner, other.corner),
-        ):
-            part = mine.copy()
+        parts = [part.copy() for part in self._parts]
+        for part, new in zip(parts, other._parts, strict=True):
             part[index] = new
-            parts.append(part)
         return BandMatrix(*parts)
 
     def with_border(self, columns: FloatArray) -> BandMatrix:
         """Return the matrices with more conditions, columns (m, n, b, k'), in the border."""
-        m, _, _, k = self.border.shape
-        more = columns.shape[3]
-        corner = np.zeros((m, k + more, k + more))
-        corner[:, :k, :k] = self.corner
-        return BandMatrix(
-            self.diagonal, self.upper, np.concatenate([self.border, columns], axis=3), corner
-        )
+        more = (0, columns.shape[3])
+        border = np.concatenate([self.border, columns], axis=3)
+        return replace(self, border=border, corner=np.pad(self.corner, [(0, 0), more, more]))
+
+    @property
+    def columns(self) -> FloatArray:
+        """The border as matrices (m, n b, k)."""
+        m, n, b, k = self.border.shape
+        return self.border.reshape((m, n * b, k))
 
     @cached_property
     def scale(self) -> FloatArray:
@@ -153,9 +164,8 @@ class BandMatrix:
         if not self.corner.shape[1]:
             return Vector(x, vector.y)
         x += self.border @ vector.y[:, None]
-        m, n, b, k = self.border.shape
-        flat = self.border.reshape((m, n * b, k))
-        across = _transposed(flat) @ vector.x.reshape((m, n * b, -1))
+        m, rows, _ = self.columns.shape
+        across = _transposed(self.columns) @ vector.x.reshape((m, rows, -1))
         return Vector(x, across + self.corner @ vector.y)
 
     def dense(self) -> FloatArray:
@@ -168,8 +178,8 @@ class BandMatrix:
             if i + 1 < n:
                 full[:, here, after] = self.upper[:, i]
                 full[:, after, here] = _transposed(self.upper[:, i])
-        full[:, : n * b, n * b :] = self.border.reshape((m, n * b, k))
-        full[:, n * b :, : n * b] = _transposed(full[:, : n * b, n * b :])
+        full[:, : n * b, n * b :] = self.columns
+        full[:, n * b :, : n * b] = _transposed(self.columns)
         full[:, n * b :, n * b :] = self.corner
         return full
 
@@ -192,64 +202,45 @@ class BandFactor:
 
     def __init__(self, matrix: BandMatrix) -> None:
         self.matrix = matrix
-        self._least = LEAST_PIVOT * matrix.scale[:, None, None, None]
+        self._least = LEAST_PIVOT * matrix.scale[:, None, None]
         self._levels: list[_Level] = []
         self._eigenvalues: list[FloatArray] = []
         diagonal, upper = matrix.diagonal, matrix.upper
         while diagonal.shape[1] > 1:
-            level = self._eliminate(diagonal[:, 1::2], upper)
-            diagonal, upper = self._reduced(diagonal, level)
+            level = _Level(self._inverse(diagonal[:, 1::2]), upper[:, 0::2], upper[:, 1::2])
+            self._levels.append(level)
+            diagonal, upper = level.reduced(diagonal)
         self._top = self._inverse(diagonal)
         # Border columns eliminated once: their solution serves every right-hand side.
         self._arm = self._nodes(matrix.border)
-        m, n, b, k = matrix.border.shape
-        flat = matrix.border.reshape((m, n * b, k))
-        self.schur = matrix.corner - _transposed(flat) @ self._arm.reshape((m, n * b, k))
+        arm = self._arm.reshape(matrix.columns.shape)
+        self.schur = matrix.corner - _transposed(matrix.columns) @ arm
 
     def _inverse(self, pivots: FloatArray) -> FloatArray:
         """Inverses of pivots (m, h, b, b); those that are all but singular are moved a little."""
-        b = pivots.shape[-1]
-        if b == 1:
-            self._eigenvalues.append(pivots)
-            small = np.abs(pivots) < self._least
-            return 1 / np.where(small, np.where(pivots < 0, -1, 1) * self._least, pivots)
-        values, vectors = np.linalg.eigh(pivots)
+        single = pivots.shape[-1] == 1
+        values, vectors = (pivots[..., 0], None) if single else np.linalg.eigh(pivots)
         self._eigenvalues.append(values)
-        least = self._least[..., 0]
-        small = np.abs(values) < least
-        values = np.where(small, np.where(values < 0, -1, 1) * least, values)
+        values = np.where(
+            np.abs(values) < self._least, np.where(values < 0, -1, 1) * self._least, values
+        )
+        if vectors is None:
+            return 1 / values[..., None]
         return np.asarray((vectors / values[..., None, :]) @ _transposed(vectors))
-
-    def _eliminate(self, pivots: FloatArray, upper: FloatArray) -> _Level:
-        level = _Level(self._inverse(pivots), upper[:, 0::2], upper[:, 1::2])
-        self._levels.append(level)
-        return level
-
-    @staticmethod
-    def _reduced(diagonal: FloatArray, level: _Level) -> tuple[FloatArray, FloatArray]:
-        """Diagonal and couplings of the even nodes without the odd ones."""
-        even = diagonal[:, 0::2].copy()
-        odd, inner = level.left.shape[1], level.right.shape[1]
-        to_left = _product(level.left, level.inverse)
-        even[:, :odd] -= _product(to_left, _transposed(level.left))
-        to_right = _product(_transposed(level.right), level.inverse[:, :inner])
-        even[:, 1 : inner + 1] -= _product(to_right, level.right)
-        return even, -_product(to_left[:, :inner], level.right)
 
     def _nodes(self, f: FloatArray) -> FloatArray:
         """Solve A x = f for columns (m, n, b, q)."""
         halves: list[tuple[FloatArray, FloatArray]] = []
         for level in self._levels:
-            even, odd = f[:, 0::2].copy(), f[:, 1::2]
-            count, inner = level.left.shape[1], level.right.shape[1]
-            taken = _product(level.inverse, odd)
+            even, (count, inner) = f[:, 0::2].copy(), level.counts
+            taken = _product(level.inverse, f[:, 1::2])
             even[:, :count] -= _product(level.left, taken)
             even[:, 1 : inner + 1] -= _product(_transposed(level.right), taken[:, :inner])
             halves.append((taken, even))
             f = even
         x = _product(self._top, f)
         for level, (taken, even) in zip(self._levels[::-1], halves[::-1], strict=True):
-            count, inner = level.left.shape[1], level.right.shape[1]
+            count, inner = level.counts
             pull = _product(_transposed(level.left), x[:, :count])
             pull[:, :inner] += _product(level.right, x[:, 1 : inner + 1])
             out = np.empty((*even.shape[:1], even.shape[1] + count, *even.shape[2:]))
@@ -259,11 +250,10 @@ class BandFactor:
 
     def _once(self, right: Vector) -> Vector:
         x = self._nodes(right.x)
-        m, n, b, k = self.matrix.border.shape
+        m, rows, k = self.matrix.columns.shape
         if not k:
             return Vector(x, right.y)
-        flat = self.matrix.border.reshape((m, n * b, k))
-        gap = right.y - _transposed(flat) @ x.reshape((m, n * b, -1))
+        gap = right.y - _transposed(self.matrix.columns) @ x.reshape((m, rows, -1))
         values, vectors = self._conditions
         dependent = np.abs(values) < ZERO_PIVOT
         inverse = np.where(dependent, 0.0, 1 / np.where(dependent, 1.0, values))

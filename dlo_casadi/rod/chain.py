@@ -15,9 +15,7 @@ from dlo_casadi.rod.elements import Arc, BowedHelix, Helix, Link, Quadratic
 FloatArray = NDArray[np.floating]
 
 ELEMENTS: dict[str, Element] = {element.name: element for element in (Quadratic(), Arc(), Link())}
-ELEMENTS_IN_SPACE: dict[str, Element] = {
-    element.name: element for element in (BowedHelix(), Helix())
-}
+ELEMENTS_IN_SPACE: dict[str, Element] = {kind.name: kind for kind in (BowedHelix(), Helix())}
 DEFAULT_ELEMENT = "quadratic"
 
 
@@ -47,20 +45,15 @@ class Chain:
     def __post_init__(self) -> None:
         if self.n < 2:
             raise DloError(f"a chain needs at least 2 elements, got n = {self.n}")
-        if self.element not in self._elements:
+        known = tuple(ELEMENTS_IN_SPACE if self.in_space else ELEMENTS)
+        if self.element not in known:
             where = "in space" if self.in_space else "in a plane"
-            raise DloError(
-                f"element {self.element!r} is not known {where}; use one of {tuple(self._elements)}"
-            )
+            raise DloError(f"element {self.element!r} is not known {where}; use one of {known}")
 
     @property
     def kind(self) -> Element:
         """What the chain is made of."""
-        return self._elements[self.element]
-
-    @property
-    def _elements(self) -> dict[str, Element]:
-        return ELEMENTS_IN_SPACE if self.in_space else ELEMENTS
+        return (ELEMENTS_IN_SPACE if self.in_space else ELEMENTS)[self.element]
 
     @property
     def h(self) -> float:
@@ -120,15 +113,13 @@ class Chain:
         for e, j in enumerate(self.layout.bends):
             if count < 3:
                 cells[j] = [e, 0, count - 1]
-                weights[j, 0] = [1.0, 0.0, 0.0]
-                weights[j, 1] = [0.0, -1.0, 1.0]
+                weights[j, :2] = [[1.0, 0.0, 0.0], [0.0, -1.0, 1.0]]
                 continue
             middle = min(max(e, 1), count - 2)
             cells[j] = [middle - 1, middle, middle + 1]
             weights[j, 0, e - middle + 1] = 1.0
             weights[j, 2] = [0.5, -1.0, 0.5]
-            weights[j, 1] = [-0.5, 0.0, 0.5]
-            weights[j, 1] += 2 * (e - middle) * weights[j, 2]
+            weights[j, 1] = [-0.5, 0.0, 0.5] + 2 * (e - middle) * weights[j, 2]
         return cells, weights
 
     def rest_inside(self, means: FloatArray) -> FloatArray:

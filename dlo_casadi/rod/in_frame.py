@@ -22,7 +22,7 @@ Mathematical Introduction to Robotic Manipulation, 1994.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -39,14 +39,6 @@ Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
 # Keeps a quotient of two squares of an angle at a straight element finite.
 _TINY = 1e-30
-
-
-@dataclass(frozen=True)
-class Forces:
-    """Forces (3, m) [N] on a segment in world axes: `weights` (m, q) times q multipliers (3,)."""
-
-    total: ca.SX
-    weights: FloatArray
 
 
 @dataclass(frozen=True)
@@ -84,15 +76,11 @@ class SegmentDerivatives:
     def about(self, first: ca.SX, last: ca.SX) -> SegmentDerivatives:
         """The same by rotations about other axes: matrices (3, 3) that lead to them."""
         (g, h), (aa, ab, bb), (al, bl) = self.slopes, self.bends, self.mixed
-        return SegmentDerivatives(
-            self.value,
-            self.turn,
-            self.phi,
-            (first @ g, last @ h),
-            self.by_lam,
-            (first @ aa @ first.T, first @ ab @ last.T, last @ bb @ last.T),
-            (first @ al, last @ bl),
-            self.lam_lam,
+        return replace(
+            self,
+            slopes=(first @ g, last @ h),
+            bends=(first @ aa @ first.T, first @ ab @ last.T, last @ bb @ last.T),
+            mixed=(first @ al, last @ bl),
         )
 
     @property
@@ -120,15 +108,22 @@ class SegmentInFrame:
         Whose minimum over the inner unknowns is the segment's Lagrangian.
     x : (8,)
         Frames of both nodes.
-    forces : Forces
+    forces : (3, m) [N]
+        On the segment in world axes.
+    weights : (m, q)
+        Of q multipliers (3,) in the forces.
     """
 
-    def __init__(self, kind: Element, energy: Energy, x: ca.SX, forces: Forces) -> None:
-        self._forces = forces
-        self._moved = _kinematics(kind, x)
-        self._body = self._moved.turn.T @ forces.total
+    def __init__(
+        self, kind: Element, energy: Energy, x: ca.SX, forces: ca.SX, weights: FloatArray
+    ) -> None:
+        self._forces, self._moved = forces, _Kinematics(kind, x)
+        self.node_turns = self._moved.node_turns
+        self._body = self._moved.turn.T @ forces
+        self._to_lam = ca.kron(ca.DM(weights), ca.DM.eye(3))
+        self._to_world = ca.kron(ca.DM.eye(weights.shape[1]), self._moved.turn)
         phi, inner = ca.SX.sym("phi", 3), ca.SX.sym("inner", kind.n_inner)
-        c = ca.SX.sym("force", *forces.total.shape)
+        c = ca.SX.sym("force", *forces.shape)
         self._symbols = [phi, inner, c]
         self._value = energy(phi, inner, c)
         self._by_frame = ca.gradient(self._value, ca.vertcat(phi, ca.vec(c)))
@@ -144,11 +139,6 @@ class SegmentInFrame:
         """At the segment's own rotation vector and forces, the inner unknowns at their minimum."""
         return list(ca.substitute(expressions, self._symbols, self._there))
 
-    @property
-    def node_turns(self) -> tuple[ca.SX, ca.SX]:
-        """Matrices from the axes of the middle frame to those of the first and the last node."""
-        return self._moved.node_turns
-
     def derivatives(self) -> SegmentDerivatives:
         """Value, gradient and Hessian, by rotations about the axes of the middle frame."""
         phi, inner, c = self._symbols
@@ -160,8 +150,7 @@ class SegmentInFrame:
         value, slope, by_force, bend, mixed, twice = self._at(
             [self._value, slope, by_force, bend, mixed, twice]
         )
-        turn, body, weights = self._moved.turn, self._body, self._forces.weights
-        to_lam = ca.kron(ca.DM(weights), ca.DM.eye(3))
+        body, to_lam, to_world = self._body, self._to_lam, self._to_world
         by_force = ca.reshape(by_force, body.shape)
         pairs = list(zip(ca.horzsplit(by_force), ca.horzsplit(body), strict=True))
         # A turn mu of the frame turns the forces by -mu: c + c x mu + (c x mu) x mu / 2.
@@ -172,7 +161,7 @@ class SegmentInFrame:
         mu_mu = (form + form.T) / 2 - ca.trace(form) * ca.SX.eye(3) + turned.T @ twice @ turned
         mu_phi = turned.T @ force_phi
         force_lam = twice @ to_lam
-        by_each = ca.vertsplit(to_lam.T @ ca.vec(by_force), 3) if weights.shape[1] else []
+        by_each = ca.vertsplit(to_lam.T @ ca.vec(by_force), 3) if to_lam.shape[1] else []
         mu_lam = ca.horzcat(ca.SX(3, 0), *(ca.skew(a) for a in by_each)) + turned.T @ force_lam
         lam_phi, lam_lam = to_lam.T @ force_phi, to_lam.T @ force_lam
         phi_phi = bend[:3, :3]
@@ -195,13 +184,12 @@ class SegmentInFrame:
         ee = lever.T @ half + across + across.T + k @ phi_phi @ k
         second_se, second_ee = _second_order(self._moved, by_mu, slope)
         se, ee = se + second_se, ee + second_ee
-        to_world = ca.kron(ca.DM.eye(weights.shape[1]), turn)
         s_lam = mu_lam @ to_world.T
         e_lam = (lam_phi @ k + mu_lam.T @ lever).T @ to_world.T
         mean, skew = mu_mu / 4 + ee, (se + se.T) / 2
         return SegmentDerivatives(
             value,
-            turn,
+            self._moved.turn,
             self._moved.phi,
             (g_s / 2 - g_e, g_s / 2 + g_e),
             to_world @ ca.vertcat(ca.SX(0, 1), *by_each),
@@ -217,10 +205,8 @@ class SegmentInFrame:
         """
         _, inner, c = self._symbols
         flat = ca.vec(c)
-        pulls = self._moved.turn.T
-        moved = ca.kron(ca.DM.eye(c.shape[1]), pulls) @ ca.jacobian(
-            ca.vec(self._forces.total), numbers
-        )
+        turned = ca.kron(ca.DM.eye(c.shape[1]), self._moved.turn.T)
+        moved = turned @ ca.jacobian(ca.vec(self._forces), numbers)
         rows = ca.vertcat(self._by_frame, self._by_inner)
         blocks = [ca.jacobian(rows, symbols) for symbols in (numbers, flat, inner)]
         direct, by_force, by_inner = self._at(blocks)
@@ -232,60 +218,43 @@ class SegmentInFrame:
         body = self._body
         by_mu = ca.SX.zeros(3, numbers.numel())
         for j in range(c.shape[1]):
-            rows_of = slice(3 * j, 3 * j + 3)
-            by_mu += ca.skew(slope[3 + 3 * j : 6 + 3 * j]) @ moved[rows_of, :]
-            by_mu -= ca.skew(body[:, j]) @ change[3 + 3 * j : 6 + 3 * j, :]
+            own = slice(3 + 3 * j, 6 + 3 * j)
+            by_mu += ca.skew(slope[own]) @ moved[3 * j : 3 * j + 3, :]
+            by_mu -= ca.skew(body[:, j]) @ change[own, :]
         g_s, g_e = self._to_nodes(by_mu, change[:3, :])
-        weights = self._forces.weights
-        to_lam = ca.kron(ca.DM(weights), ca.DM.eye(3))
-        to_world = ca.kron(ca.DM.eye(weights.shape[1]), self._moved.turn)
-        return g_s / 2 - g_e, g_s / 2 + g_e, to_world @ to_lam.T @ change[3:held, :]
+        by_lam = self._to_world @ self._to_lam.T @ change[3:held, :]
+        return g_s / 2 - g_e, g_s / 2 + g_e, by_lam
 
     def _to_nodes(self, by_mu: ca.SX, by_phi: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Slopes by the mean and the difference of the nodes' rotations."""
         return by_mu, self._moved.lever.T @ by_mu + self._moved.stretch @ by_phi
 
 
-@dataclass(frozen=True)
 class _Kinematics:
     """What moves with the nodes of a segment, and how.
 
     `phi` (3,) [rad]; `turn` (3, 3): R; `node_turns`: from it to the nodes' axes; `z` (3,);
     `stretch` (3, 3): K; `along`: 1 / |phi|^2; `second`: a, b, of the second order of psi, see
-    `_second_order`.
+    `_second_order`; `lever` (3, 3): derivative of mu by epsilon.
     """
 
-    phi: ca.SX
-    turn: ca.SX
-    node_turns: tuple[ca.SX, ca.SX]
-    z: ca.SX
-    stretch: ca.SX
-    along: ca.SX
-    second: tuple[ca.SX, ca.SX]
-
-    @property
-    def lever(self) -> ca.SX:
-        """Derivative (3, 3) of mu by epsilon."""
-        return -ca.skew(self.z) / 2
-
-
-def _kinematics(kind: Element, x: ca.SX) -> _Kinematics:
-    first, last = x[:4], x[4:]
-    local = kind.local(first, last)
-    middle, phi = local[:4], local[4:]
-    *vector, w = quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(last))
-    v, square = ca.vertcat(*vector), ca.sumsqr(phi)
-    kappa = (ca.dot(phi, v) + 2 * _TINY) / (2 * (ca.sumsqr(v) + _TINY))
-    along = 1 / (square + _TINY)
-    k = (1 - kappa) * along
-    stretch = kappa * ca.SX.eye(3) + k * (phi @ phi.T)
-    a = (4 * kappa**2 * k - 1 / (1 + w)) / (8 * kappa)
-    b = (1 / (1 + w) + 4 * w * kappa**2 * k) / (4 * kappa)
-    half = ca.vertcat(*quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(middle)))
-    ahead = _rotation(half)
-    return _Kinematics(
-        phi, _rotation(middle), (ahead, ahead.T), v / (1 + w), stretch, along, (a, b)
-    )
+    def __init__(self, kind: Element, x: ca.SX) -> None:
+        first, last = x[:4], x[4:]
+        local, back = kind.local(first, last), conjugate(ca.vertsplit(first))
+        middle, phi = local[:4], local[4:]
+        *vector, w = quaternion_product(back, ca.vertsplit(last))
+        v, square = ca.vertcat(*vector), ca.sumsqr(phi)
+        kappa = (ca.dot(phi, v) + 2 * _TINY) / (2 * (ca.sumsqr(v) + _TINY))
+        self.along = 1 / (square + _TINY)
+        k = (1 - kappa) * self.along
+        self.stretch = kappa * ca.SX.eye(3) + k * (phi @ phi.T)
+        a = (4 * kappa**2 * k - 1 / (1 + w)) / (8 * kappa)
+        b = (1 / (1 + w) + 4 * w * kappa**2 * k) / (4 * kappa)
+        self.second = a, b
+        ahead = _rotation(ca.vertcat(*quaternion_product(back, ca.vertsplit(middle))))
+        self.phi, self.turn, self.node_turns = phi, _rotation(middle), (ahead, ahead.T)
+        self.z = v / (1 + w)
+        self.lever = -ca.skew(self.z) / 2
 
 
 def _rotation(q: ca.SX) -> ca.SX:
