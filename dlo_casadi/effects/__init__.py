@@ -1,6 +1,7 @@
 """Effects: the explicit list of what a configuration or the diagnosis may name."""
 
-from dlo_casadi.effects.axial_stretch import AxialStretch as AxialStretch
+from dlo_casadi.effects.across_gravity import GravityTilt as GravityTilt
+from dlo_casadi.effects.across_gravity import SideLoad as SideLoad
 from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy as BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening as BendingSoftening
 from dlo_casadi.effects.cable import Cable as Cable
@@ -25,22 +26,21 @@ from dlo_casadi.effects.effect import Viewpoint as Viewpoint
 from dlo_casadi.effects.end_offset import EndOffset as EndOffset
 from dlo_casadi.effects.end_spring import EndSpring as EndSpring
 from dlo_casadi.effects.end_spring import StartSpring as StartSpring
-from dlo_casadi.effects.gravity_tilt import GravityTilt as GravityTilt
 from dlo_casadi.effects.image_distortion import ImageDistortion as ImageDistortion
 from dlo_casadi.effects.image_scale import ImageScale as ImageScale
-from dlo_casadi.effects.length_error import LengthError as LengthError
+from dlo_casadi.effects.length import AxialStretch as AxialStretch
+from dlo_casadi.effects.length import LengthError as LengthError
 from dlo_casadi.effects.lumped_mass import LumpedMass as LumpedMass
 from dlo_casadi.effects.mass_error import MassError as MassError
-from dlo_casadi.effects.plastic_set import PlasticSet as PlasticSet
 from dlo_casadi.effects.point_force import PointForce as PointForce
 from dlo_casadi.effects.point_force import UnknownPull as UnknownPull
-from dlo_casadi.effects.rest_curvature_drift import RestCurvatureDrift as RestCurvatureDrift
+from dlo_casadi.effects.rest_shape import PlasticSet as PlasticSet
+from dlo_casadi.effects.rest_shape import RestCurvatureDrift as RestCurvatureDrift
 from dlo_casadi.effects.sensor_bias import SensorBias as SensorBias
 from dlo_casadi.effects.setup import Setup as Setup
-from dlo_casadi.effects.side_load import SideLoad as SideLoad
 from dlo_casadi.effects.standoff_error import StandoffError as StandoffError
-from dlo_casadi.effects.stiff_section import StiffSection as StiffSection
-from dlo_casadi.effects.stiffness_gradient import StiffnessGradient as StiffnessGradient
+from dlo_casadi.effects.stiffness import StiffnessGradient as StiffnessGradient
+from dlo_casadi.effects.stiffness import StiffSection as StiffSection
 from dlo_casadi.effects.tether import Tether as Tether
 
 EFFECTS: dict[str, type[Effect]] = {

@@ -38,19 +38,16 @@ class BendingAnisotropy(SectionLaw):
     name = "bending_anisotropy"
     dimensions = (3,)
     isotropic = False
+    declared = (
+        Parameter("ratio", nominal=1.0, scale=0.2, lower=1 / LARGEST, upper=LARGEST),
+        Parameter("angle", "rad", scale=0.3, lower=-pi / 2, upper=pi / 2),
+    )
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Where a clamp or a rest curvature tells how the section is turned."""
         told = "clamped" in (setup.start, setup.end) or setup.curved
         return super().applies(setup) and told
-
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
-        """Declare ratio and angle."""
-        return (
-            Parameter("ratio", nominal=1.0, scale=0.2, lower=1 / LARGEST, upper=LARGEST),
-            Parameter("angle", "rad", scale=0.3, lower=-pi / 2, upper=pi / 2),
-        )
 
     def bending(self, stiffness: ca.SX, params: Params) -> ca.SX:
         """Stiffness about y and z."""
@@ -81,13 +78,7 @@ class _LinearAnisotropy(SectionLaw):
 
     name = "linear_anisotropy"
     isotropic = False
-
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
-        """Declare a and b."""
-        return (
-            Parameter("difference", scale=0.1, lower=-1.0, upper=1.0),
-            Parameter("coupling", scale=0.1, lower=-1.0, upper=1.0),
-        )
+    declared = Parameter.symmetric(("difference", "coupling"), "", 0.1, 1.0)
 
     def bending(self, stiffness: ca.SX, params: Params) -> ca.SX:
         """Stiffness about y and z."""

@@ -107,6 +107,9 @@ class Effect:
     # Whether there is such an effect on a cable in a plane, 2, and on one in space, 3.
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
 
+    # Parameters that are alike for every cable, see `parameters`.
+    declared: ClassVar[tuple[Parameter, ...]] = ()
+
     label: str = ""
 
     def __post_init__(self) -> None:
@@ -115,7 +118,9 @@ class Effect:
 
     def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
         """Parameters with units, bounds and the nominal value at which the effect vanishes."""
-        raise TypeError(f"{type(self).__name__} declares no parameters")
+        if not self.declared:
+            raise TypeError(f"{type(self).__name__} declares no parameters")
+        return self.declared
 
     def per_pose(self, cable: Cable) -> tuple[str, ...]:
         """Unknowns of each pose that it uses beside its parameters, of `deviation_names`."""
@@ -264,33 +269,6 @@ class Load(Effect):
     def springs(self, params: Params) -> tuple[SpringAt, ...]:
         """Springs from single places of the cable."""
         return ()
-
-
-@dataclass(frozen=True)
-class LoadAcrossGravity(Load):
-    """A load with as many components as there are directions across gravity: one, in space two.
-
-    Parameters
-    ----------
-    vertical : "x", "y" or "z", optional
-        The world's axis that gravity is most along, in space; z where nobody tells. Components
-        are named after the two others.
-    """
-
-    vertical: str = ""
-
-    @classmethod
-    def made_for(cls, setup: Setup) -> Self:
-        """With the axis that gravity is most along."""
-        if len(setup.gravity) == 2:
-            return cls()
-        return cls(vertical="xyz"[int(np.argmax(np.abs(setup.gravity)))])
-
-    def components(self, name: str, cable: Cable) -> tuple[str, ...]:
-        """Names of a parameter's components: in a plane it is a single number."""
-        if len(cable.axes) == 2:
-            return (name,)
-        return tuple(f"{name}_{axis}" for axis in "xyz" if axis != (self.vertical or "z"))
 
 
 class PointLoad(Load):

@@ -27,10 +27,7 @@ class MassError(Load):
     """
 
     name = "mass_error"
-
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
-        """Declare the factor."""
-        return (Parameter("factor", nominal=1.0, scale=0.1, lower=0.2, upper=5.0),)
+    declared = (Parameter("factor", nominal=1.0, scale=0.1, lower=0.2, upper=5.0),)
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:

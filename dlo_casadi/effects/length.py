@@ -1,4 +1,4 @@
-"""A cable that is longer or shorter than declared."""
+"""A cable that is longer or shorter than declared, or that stretches."""
 
 from __future__ import annotations
 
@@ -32,3 +32,25 @@ class LengthError(Kinematics):
     def stretch(self, cable: Cable, params: Params) -> ca.SX:
         """Return true over declared length."""
         return 1 + params["length_difference"] / cable.length
+
+
+class AxialStretch(Kinematics):
+    """Axial strain N / EA under the tension N(s).
+
+        V = int N^2 / (2 EA) ds                                         [J]
+
+    Estimated as `compliance` = 1/EA, which vanishes at 0, where the cable is inextensible.
+
+    Parameters
+    ----------
+    compliance : scalar [1/N], >= 0
+    """
+
+    name = "axial_stretch"
+    inverses: ClassVar = {"compliance": ("axial_stiffness", "N")}
+    extensible = True
+    declared = (Parameter("compliance", "1/N", scale=1e-3, lower=0.0, upper=1.0),)
+
+    def compliance(self, params: Params) -> ca.SX:
+        """Return 1/EA [1/N]."""
+        return params["compliance"]

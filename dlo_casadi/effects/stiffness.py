@@ -1,4 +1,4 @@
-"""A stretch of cable that is stiffer than the rest."""
+"""A stiffness that changes along the cable: evenly, or within a stretch of it."""
 
 from __future__ import annotations
 
@@ -13,6 +13,25 @@ from dlo_casadi.rod.element import Cell
 
 # Lengths of sections that are tried, as shares of the cable's length.
 SECTIONS = (0.08, 0.2)
+
+
+class StiffnessGradient(SectionLaw):
+    """A taper: the stiffness grows linearly from start to end.
+
+        EI(s) = EI (1 + slope (2 s / L - 1)),   in space GJ(s) alike
+
+    Parameters
+    ----------
+    slope : scalar, in (-1, 1)
+        Vanishes at 0; the stiffness stays positive everywhere.
+    """
+
+    name = "stiffness_gradient"
+    declared = Parameter.symmetric(("slope",), "", 0.2, 0.95)
+
+    def along(self, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+        """Mean of the linear stiffness over the cell."""
+        return 1 + params["slope"] * (cell.middle * 2 / cable.length - 1)
 
 
 class StiffSection(SectionLaw):

@@ -1,4 +1,4 @@
-"""A cable that takes a set where it is bent sharply."""
+"""A cable that takes a set: with every bend, or where it is bent sharply."""
 
 from __future__ import annotations
 
@@ -13,6 +13,27 @@ from dlo_casadi.effects.setup import Setup
 _ROUNDING = 0.01
 # Yield curvatures that are tried, as shares of the largest bend.
 YIELDS = (0.15, 0.3, 0.45, 0.6, 0.75)
+
+
+class RestCurvatureDrift(StateEffect):
+    """After each pose the rest curvature has moved towards the curvature held.
+
+        kappa_0 <- kappa_0 + rate (kappa - kappa_0)
+
+    In space so has the rest twist.
+
+    Parameters
+    ----------
+    rate : scalar, in [0, 1)
+        Share of the bend that a pose leaves behind; vanishes at 0.
+    """
+
+    name = "rest_curvature_drift"
+    declared = (Parameter("rate", scale=0.05, lower=0.0, upper=0.95),)
+
+    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Rest strain after the pose [1/m]."""
+        return rest + params["rate"] * (strain - rest)
 
 
 class PlasticSet(StateEffect):

@@ -1,0 +1,107 @@
+"""What acts across gravity: a uniform load, and gravity turned against the measurement's frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.effect import Load, Params
+from dlo_casadi.effects.setup import Setup
+from dlo_casadi.rod.node import rotated, rotation
+
+
+@dataclass(frozen=True)
+class LoadAcrossGravity(Load):
+    """A load with as many components as there are directions across gravity: one, in space two.
+
+    Parameters
+    ----------
+    vertical : "x", "y" or "z", optional
+        The world's axis that gravity is most along, in space; z where nobody tells. Components
+        are named after the two others.
+    """
+
+    vertical: str = ""
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """With the axis that gravity is most along."""
+        if len(setup.gravity) == 2:
+            return cls()
+        return cls(vertical="xyz"[int(np.argmax(np.abs(setup.gravity)))])
+
+    def components(self, name: str, cable: Cable) -> tuple[str, ...]:
+        """Names of a parameter's components: in a plane it is a single number."""
+        if len(cable.axes) == 2:
+            return (name,)
+        return tuple(f"{name}_{axis}" for axis in "xyz" if axis != (self.vertical or "z"))
+
+
+class SideLoad(LoadAcrossGravity):
+    """A force per length across gravity: a draught, a fan, a tilted camera.
+
+        V = - int (q . r(s)) ds,   q = sum_i force_per_length_i e_i     [J]
+
+    In a plane e is +x. In space e_x, e_y are the unit vectors across gravity that are nearest to
+    the world's axes x and y, if gravity is most along z; they are named alike where it is not.
+
+    Parameters
+    ----------
+    force_per_length; in space force_per_length_x, force_per_length_y : scalar [N/m]
+        Vanish at 0; at most half the cable's weight on Earth.
+    """
+
+    name = "side_load"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the force per length."""
+        weight = 9.81 * cable.mass / cable.length
+        names = self.components("force_per_length", cable)
+        return Parameter.symmetric(names, "N/m", 0.1 * weight, 0.5 * weight)
+
+    def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX:
+        """Force on the part beyond s."""
+        names = self.components("force_per_length", cable)
+        if len(names) == 1:
+            return params[names[0]] * (cable.length - s) * ca.vertcat(1, 0)
+        # Of a cable without weight the world's axes themselves.
+        down = gravity / ca.sqrt(ca.sumsqr(gravity) + 1e-12)
+        total = ca.SX.zeros(3)
+        for name in names:
+            axis = ca.DM([float(name.endswith(x)) for x in cable.axes])
+            across = axis - ca.dot(axis, down) * down
+            total += params[name] * across / ca.norm_2(across)
+        return total * (cable.length - s)
+
+
+class GravityTilt(LoadAcrossGravity):
+    """The board or the robot does not stand plumb: gravity is turned for every weight.
+
+        g' = R(angle) g
+
+    In space R is that of a rotation vector with two components: about the world's axes that
+    gravity is not most along.
+
+    Parameters
+    ----------
+    angle; in space angle_x, angle_y (or x, z; y, z) : scalar [rad]
+        Counter-clockwise; vanish at 0; at most half a radian.
+    """
+
+    name = "gravity_tilt"
+
+    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        """Declare the angles."""
+        return Parameter.symmetric(self.components("angle", cable), "rad", 0.05, 0.5)
+
+    def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
+        """Turn gravity counter-clockwise."""
+        if "angle" in params:
+            c, s = ca.cos(params["angle"]), ca.sin(params["angle"])
+            return ca.vertcat(c * gravity[0] - s * gravity[1], s * gravity[0] + c * gravity[1])
+        turn = ca.vertcat(*(params.get(f"angle_{axis}", ca.SX(0)) for axis in "xyz"))
+        return rotated(rotation(turn), gravity)
