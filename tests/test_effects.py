@@ -63,7 +63,12 @@ CASES = [
     for name, kind in sorted(EFFECTS.items())
     if {"plane": 2, "space": 3}[where] in kind.dimensions
 ]
-EVERYWHERE = pytest.mark.parametrize(("name", "where", "element"), CASES)
+
+
+@pytest.fixture(scope="module", params=CASES, ids="-".join)
+def case(request) -> tuple[str, str, str]:
+    """Each effect, wherever it applies: all tests of one follow each other, its model made once."""
+    return request.param
 
 
 @cache
@@ -151,12 +156,11 @@ def test_declaration(name):
     assert len({q.name for q in declared}) == len(declared)
 
 
-@EVERYWHERE
 @pytest.mark.parametrize("headings", ["straight", "random"])
 @pytest.mark.parametrize("values", ["nominal", "off"])
-def test_gradients_and_hessians_are_finite(name, where, element, headings, values):
+def test_gradients_and_hessians_are_finite(case, headings, values):
     """No sqrt(0), atan2(0, 0) or 0/0 in the Lagrangian, its Hessian, or the derivatives by p."""
-    model = with_effect(name, where, element)
+    model = with_effect(*case)
     p = own_parameters(model, values)
     shapes, given = posed(model, p, headings)
     blocks = outputs(model, p, headings)
@@ -167,10 +171,9 @@ def test_gradients_and_hessians_are_finite(name, where, element, headings, value
         assert np.all(np.isfinite(block)), what
 
 
-@EVERYWHERE
-def test_no_effect_at_nominal_values(name, where, element):
+def test_no_effect_at_nominal_values(case):
     """Balance, Hessian, measured curve and state are those of the model without the effect."""
-    model, bare = with_effect(name, where, element), plain(name, where, element)
+    model, bare = with_effect(*case), plain(*case)
     with_it, without = outputs(model, model.nominal), outputs(bare, bare.nominal)
     if model.n_springs:
         with_it["gradient"] = with_it["gradient"][:, : without["gradient"].shape[1]]
@@ -180,9 +183,8 @@ def test_no_effect_at_nominal_values(name, where, element):
         np.testing.assert_allclose(block, without[what], rtol=1e-11, atol=1e-11, err_msg=what)
 
 
-@EVERYWHERE
-def test_every_effect_does_something(name, where, element):
-    model, bare = with_effect(name, where, element), plain(name, where, element)
+def test_every_effect_does_something(case):
+    model, bare = with_effect(*case), plain(*case)
     with_it = outputs(model, own_parameters(model, "off"))
     without = outputs(bare, bare.nominal)
     missing = with_it["gradient"].shape[1] - without["gradient"].shape[1]
@@ -191,10 +193,9 @@ def test_every_effect_does_something(name, where, element):
     assert max(np.abs(with_it[what] - without[what]).max() for what in felt) > 1e-4
 
 
-@EVERYWHERE
-def test_derivatives_by_parameters_against_finite_differences(name, where, element):
+def test_derivatives_by_parameters_against_finite_differences(case):
     """Of the balance, the measured curve and the state."""
-    model = with_effect(name, where, element)
+    model = with_effect(*case)
     a, (shapes, given) = assembly_of(model), posed(model, own_parameters(model, "off"))
     along = directions(a, 1, "p")
     d = np.array([1e-5 * (q.nominal if q.log else q.scale) for q in model.parameters])
