@@ -13,8 +13,7 @@ import pytest
 from rich.console import Console
 
 from dlo_casadi.cli import main
-from dlo_casadi.cli import session as session_command
-from dlo_casadi.cli.predict import plain_numbers
+from dlo_casadi.cli.options import plain_numbers
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import dump_yaml, read_yaml
 
@@ -74,7 +73,7 @@ def test_fit_prints_tables_and_progress_apart(run):
 def test_what_may_take_long_is_told_first(config, monkeypatch, capsys):
     many = config.with_name("many.yaml")
     many.write_text(config.read_text().replace("n: 20", "n: 300"))
-    monkeypatch.setattr(session_command, "run_session", lambda *_: 1 / 0)
+    monkeypatch.setattr("dlo_casadi.session.run_session", lambda *_: 1 / 0)
 
     assert main(["fit", str(many), "--output", str(many.with_name("out"))]) == 1
     assert "warning: model.n: 300 elements take minutes" in capsys.readouterr().err
@@ -159,7 +158,7 @@ def test_a_folder_for_a_configuration_names_those_in_it(tmp_path, capsys):
 
 
 def test_fit_checks_the_output_before_it_works(config, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(session_command, "run_session", lambda *_: pytest.fail("started"))
+    monkeypatch.setattr("dlo_casadi.session.run_session", lambda *_: pytest.fail("started"))
     (tmp_path / "file").touch()
 
     assert main(["fit", str(config), "--output", str(tmp_path / "file"), "--quiet"]) == 2
@@ -170,7 +169,7 @@ def test_an_interrupted_fit_keeps_the_earlier_results(config, tmp_path, capsys, 
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(session_command, "run_session", interrupted)
+    monkeypatch.setattr("dlo_casadi.session.run_session", interrupted)
     (tmp_path / "report.json").write_text('{"schema": "dlo-report/1"}')
 
     assert main(["fit", str(config), "--output", str(tmp_path)]) == 130
@@ -209,7 +208,7 @@ def test_a_bug_is_told_apart_from_bad_input(config, tmp_path, capsys, monkeypatc
     def broken(*_):
         raise ZeroDivisionError("oops")
 
-    monkeypatch.setattr(session_command, "run_session", broken)
+    monkeypatch.setattr("dlo_casadi.session.run_session", broken)
 
     assert main(["fit", str(config), "--output", str(tmp_path / "out")]) == 1
     error = capsys.readouterr().err
@@ -236,7 +235,7 @@ def test_unknown_arguments_are_bad_input(capsys):
 
 @pytest.mark.parametrize(
     ("text", "number"),
-    [("-1e-1", "-0.1"), ("-5.", "-5.0"), ("-.5", "-0.5"), ("-2E3", "-2000.0"), ("--end", "--end")],
+    [("-1e-1", "-0.1"), ("-5.", "-5"), ("-.5", "-0.5"), ("-2E3", "-2000"), ("--end", "--end")],
 )
 def test_negative_numbers_are_no_options(text, number):
     assert plain_numbers([text]) == [number]

@@ -17,7 +17,6 @@ from rich.console import Console
 
 import dlo_casadi
 from dlo_casadi.cli import COMMANDS, main, watch
-from dlo_casadi.cli import session as session_command
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.config.schema import config_schema, schema_text
 from dlo_casadi.errors import ConfigError
@@ -263,7 +262,7 @@ def test_diagnose_searches_although_the_configuration_does_not(tmp_path, monkeyp
         asked.append(config.diagnosis.enabled)
         raise ConfigError("enough")
 
-    monkeypatch.setattr(session_command, "run_session", run)
+    monkeypatch.setattr("dlo_casadi.session.run_session", run)
     config = tmp_path / "rope.yaml"
     text = (BENCH / "short_clean/session.yaml").read_text() + "diagnosis: {enabled: false}\n"
     config.write_text(text.replace("file: ", f"file: {BENCH}/short_clean/"))

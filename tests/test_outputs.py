@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from dlo_casadi.cli import main
-from dlo_casadi.cli import session as session_command
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 
 BENCH = Path(__file__).parent / "data" / "bench" / "short_clean"
@@ -184,7 +183,7 @@ def test_output_that_cannot_be_printed_is_told(word):
 def test_a_name_longer_than_the_system_permits_is_told_at_once(
     command, session, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr(session_command, "run_session", lambda *_: pytest.fail("started"))
+    monkeypatch.setattr("dlo_casadi.session.run_session", lambda *_: pytest.fail("started"))
     words = command.format(long=tmp_path / ("a" * 300), session=session).split()
     assert main(words) == 2
     assert "Traceback" not in capsys.readouterr().err

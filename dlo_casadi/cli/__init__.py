@@ -1,4 +1,4 @@
-"""The command `dlo`: one module per subcommand; the only package that prints or exits.
+"""The command `dlo`: a function per subcommand; the only package that prints or exits.
 
 Exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted.
 """
@@ -10,24 +10,23 @@ import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
-from types import ModuleType
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK, guarded
 
-# Subcommand -> what it does. Its module of the same name is imported only when it is called.
+# Subcommand -> its module, which is imported only when it is called, and what it does.
 COMMANDS = {
-    "new": "write a commented configuration to start from",
-    "check": "check a configuration and its photographs in seconds, without fitting",
-    "calibrate": "find the camera of a session from its own photographs of the board",
-    "fit": "fit a cable to its photographs or centre-lines and report what was found",
-    "fit-many": "fit many sessions, on many cores or machines, into one table",
-    "diagnose": "fit, and print the search for missing effects in full",
-    "predict": "predict the shape of a fitted cable from where its ends are held",
-    "shape-table": "predict the shapes of a fitted cable in very many poses",
-    "generate-solver": "write the C solver of a fitted cable for planners to embed",
-    "schema": "print the JSON schema of a configuration, for editors",
-    "reproduce": "compare with the paper's results (needs a checkout)",
-    "benchmark": "time the C solver beside other solvers (needs a checkout)",
+    "new": ("new", "write a commented configuration to start from"),
+    "check": ("check", "check a configuration and its photographs in seconds, without fitting"),
+    "calibrate": ("check", "find the camera of a session from its own photographs of the board"),
+    "fit": ("fit", "fit a cable to its photographs or centre-lines and report what was found"),
+    "fit-many": ("fit", "fit many sessions, on many cores or machines, into one table"),
+    "diagnose": ("fit", "fit, and print the search for missing effects in full"),
+    "predict": ("fitted", "predict the shape of a fitted cable from where its ends are held"),
+    "shape-table": ("fitted", "predict the shapes of a fitted cable in very many poses"),
+    "generate-solver": ("fitted", "write the C solver of a fitted cable for planners to embed"),
+    "schema": ("new", "print the JSON schema of a configuration, for editors"),
+    "reproduce": ("checkout", "compare with the paper's results (needs a checkout)"),
+    "benchmark": ("checkout", "time the C solver beside other solvers (needs a checkout)"),
 }
 
 EXAMPLES = """\
@@ -64,7 +63,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: list[str]) -> int:
     if arguments and arguments[0] in COMMANDS:
-        code: int = _module(arguments[0]).main(arguments[1:])
+        for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+            os.environ.setdefault(variable, "1")  # the matrices are small: threads would only cost
+        module = import_module(f"dlo_casadi.cli.{COMMANDS[arguments[0]][0]}")
+        code: int = getattr(module, arguments[0].replace("-", "_"))(arguments[1:])
         return code
     if arguments[:1] in (["-h"], ["--help"]):
         print(_overview())
@@ -85,15 +87,9 @@ def _run(arguments: list[str]) -> int:
     return BAD_INPUT
 
 
-def _module(name: str) -> ModuleType:
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")  # the matrices are small: threads would only cost
-    return import_module(f"dlo_casadi.cli.{name.replace('-', '_')}")
-
-
 def _overview() -> str:
     width = max(map(len, COMMANDS))
-    listed = "\n".join(f"  {name:{width}}  {text}" for name, text in COMMANDS.items())
+    listed = "\n".join(f"  {name:{width}}  {text}" for name, (_, text) in COMMANDS.items())
     return (
         "usage: dlo SUBCOMMAND ...\n\n"
         "Elastic models of cables in the plane and in space: fit, diagnose, predict, embed.\n\n"

@@ -1,52 +1,62 @@
-"""`dlo check`: a configuration and its files, without fitting."""
+"""`dlo check`, `dlo calibrate`: what a configuration and its files hold, without fitting."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK
-from dlo_casadi.cli.options import add_config, command, configuration, console, parsed, print_json
+from dlo_casadi.cli.options import (
+    CONFIG,
+    WARNING,
+    command,
+    configuration,
+    console,
+    option,
+    print_json,
+    say,
+)
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.report.json_report import check_dict
 from dlo_casadi.report.terminal import check_table
-from dlo_casadi.session.measure import calibrated, draw_steps, read_inputs
+from dlo_casadi.session.measure import (
+    calibrate_session,
+    calibrated,
+    draw_steps,
+    read_inputs,
+    summary,
+)
 from dlo_casadi.session.plausibility import find_suspicions
 from dlo_casadi.vision import encoded
 
-EXAMPLES = """\
+
+@command(
+    """\
+Check a configuration and its photographs or centre-lines in seconds, without fitting:
+what the camera finds in each pose, and whether units, axes, ends and files agree.
+
 dlo check configs/cable.yaml
 dlo check rope.yaml --show look/                 pictures of each step of the camera
-dlo check rope.yaml --json"""
-
-
-def main(argv: Sequence[str]) -> int:
-    """Run `dlo check CONFIG [--show DIR] [...]`."""
-    parser = command(
-        "check",
-        "Check a configuration and its photographs or centre-lines in seconds, without fitting:\n"
-        "what the camera finds in each pose, and whether units, axes, ends and files agree.",
-        EXAMPLES,
-        "2 is also a mistake that was found",
-    )
-    add_config(parser)
-    parser.add_argument(
+dlo check rope.yaml --json""",
+    CONFIG,
+    option(
         "--show",
         type=Path,
         metavar="DIR",
         help="write pictures of each photograph there: rectified work-plane, contrast, strands, "
         "and the line with its direction",
-    )
-    chosen = parsed(parser, argv)
-
+    ),
+    codes="2 is also a mistake that was found",
+)
+def check(chosen: argparse.Namespace) -> int:
+    """Run `dlo check CONFIG [--show DIR] [...]`."""
     config = configuration(chosen.config)
-    with Watch(Console(stderr=True), chosen.quiet) as watch:
+    with Watch(quiet=chosen.quiet) as watch:
         config = calibrated(
             config, lambda name, k, m: watch.step(f"calibrate {name}".strip(), k, m)
         )
@@ -55,25 +65,24 @@ def main(argv: Sequence[str]) -> int:
         watch.step("compare with what is declared", 0, 1)
         result = check_dict(config, inputs, find_suspicions(config, inputs))
         watch.step("compare with what is declared", 1, 1)
+    code = OK if result["ok"] else BAD_INPUT
     if chosen.json:
         print_json({**result, "pictures": [str(path) for path in pictures]})
-        return OK if result["ok"] else BAD_INPUT
-    page = console(quiet=chosen.quiet)
+        return code
+    page = console(chosen.quiet)
     page.print(check_table(config, result["poses"]))
     for row in result["poses"]:
         for advice in row["advice"]:
-            page.print(f"{row['name']}: {advice}", soft_wrap=True, markup=False)
+            say(page, f"{row['name']}: {advice}")
     for warning in result["warnings"]:
-        page.print(f"[bold yellow]warning:[/] {escape(warning)}", soft_wrap=True)
+        say(page, warning, WARNING)
     for path in sorted({path.parent for path in pictures}):
-        page.print(f"Pictures: {path}", soft_wrap=True, markup=False)
-    errors = Console(stderr=True, highlight=False, soft_wrap=True)
+        say(page, f"Pictures: {path}")
     for mistake in result["mistakes"]:
-        errors.print(f"[bold red]mistake:[/] {escape(mistake)}")
+        say(Console(stderr=True, highlight=False), mistake, "[bold red]mistake:[/] ")
     if result["ok"]:
-        page.print("Nothing contradicts the configuration.")
-        return OK
-    return BAD_INPUT
+        say(page, "Nothing contradicts the configuration.")
+    return code
 
 
 def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
@@ -94,3 +103,44 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
             write_file(written[-1], encoded(picture, ".jpg"))
     watch.step("draw the steps", len(poses), len(poses))
     return written
+
+
+@command(
+    """\
+Find matrix and lens of the camera from a session's own photographs of the board
+(Zhang's method), tell how well they are known and how to do better. Nothing is written.
+
+dlo calibrate rope.yaml
+dlo calibrate rope.yaml --json""",
+    CONFIG,
+    json="print JSON instead of text",
+)
+def calibrate(chosen: argparse.Namespace) -> None:
+    """Run `dlo calibrate CONFIG [...]`."""
+    config = configuration(chosen.config)
+    with Watch(quiet=chosen.quiet) as watch:
+        found = calibrate_session(config, lambda name, k, m: watch.step(f"read {name}", k, m))
+    matrix, lens = found.camera.matrix.tolist(), found.camera.distortion.tolist()
+    if chosen.json:
+        names = ("fx", "fy", "cx", "cy")
+        print_json(
+            {
+                "matrix": matrix,
+                "distortion": lens,
+                "matrix_std": dict(zip(names, found.matrix_std.tolist(), strict=True)),
+                "reprojection_error_px": found.reprojection_error,
+                "errors_px": dict(found.errors),
+                "problems": dict(found.problems),
+                "advice": list(found.advice),
+            }
+        )
+        return
+    page = console(chosen.quiet)
+    say(page, f"{summary(found)}. For the configuration:")
+    say(page, f"    camera:\n      matrix: {[[round(x, 3) for x in row] for row in matrix]}")
+    say(page, f"      distortion: {[round(x, 6) for x in lens]}")
+    worst = sorted(found.errors, key=lambda name: -found.errors[name])[:3]
+    told = ", ".join(f"{name} {found.errors[name]:.2f} px" for name in worst)
+    say(page, f"largest errors: {told}")
+    for text in (*found.problems.values(), *found.advice):
+        say(page, text, WARNING)

@@ -1,36 +1,55 @@
-"""Scripts that are no part of the installed package: run from a checkout."""
+"""`dlo reproduce`, `dlo benchmark`: scripts of a checkout, no part of the installed package."""
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import dlo_casadi
-from dlo_casadi.cli.options import command
+from dlo_casadi.cli.options import command, option
 from dlo_casadi.errors import DloError
 
-EXAMPLES = """\
-dlo {name}
-dlo {name} -- --help                         options of the script, which follow --"""
+OPTION = option("option", nargs="*", help="passed on to the script")
+CODES = "others are the script's own"
 
 
-def run_script(name: str, description: str, script: str, argv: Sequence[str]) -> int:
-    """Run `dlo NAME [-- OPTION ...]`: a script of the checkout that the package belongs to.
+@command(
+    """\
+Compare with the paper of Quartaro et al.; runs scripts/reproduce_paper.py of a checkout.
 
-    Raises
-    ------
-    DloError
-        If the package was installed without its checkout.
-    """
-    parser = command(name, description, EXAMPLES.format(name=name), "others are the script's own")
-    parser.add_argument("option", nargs="*", help="passed on to the script")
-    chosen = parser.parse_args(argv)
-    path = Path(dlo_casadi.__file__).parents[1] / "scripts" / script
+dlo reproduce
+dlo reproduce -- --help                         options of the script, which follow --""",
+    OPTION,
+    codes=CODES,
+    json=None,
+)
+def reproduce(chosen: argparse.Namespace) -> int:
+    """Run `dlo reproduce [-- OPTION ...]`."""
+    return _run_script("reproduce_paper.py", chosen)
+
+
+@command(
+    """\
+Time the C solver beside other solvers: runs scripts/benchmark.py of the checkout.
+
+dlo benchmark
+dlo benchmark -- --help                         options of the script, which follow --""",
+    OPTION,
+    codes=CODES,
+    json=None,
+)
+def benchmark(chosen: argparse.Namespace) -> int:
+    """Run `dlo benchmark [-- OPTION ...]`."""
+    return _run_script("benchmark.py", chosen)
+
+
+def _run_script(name: str, chosen: argparse.Namespace) -> int:
+    path = Path(dlo_casadi.__file__).parents[1] / "scripts" / name
     if not path.is_file():
         raise DloError(
-            f"{script} is not part of the installed package; it needs a checkout: clone the "
+            f"{name} is not part of the installed package; it needs a checkout: clone the "
             "repository, install it with `pip install -e .` and call dlo from there."
         )
     return subprocess.run([sys.executable, str(path), *chosen.option], check=False).returncode

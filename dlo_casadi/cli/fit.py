@@ -1,74 +1,196 @@
-"""`dlo fit`: from a configuration to results."""
+"""`dlo fit`, `dlo diagnose`, `dlo fit-many`: from configurations to results."""
 
 from __future__ import annotations
 
 import argparse
 import os
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from dlo_casadi.cli.guard import OK
+from dlo_casadi.cli.guard import BAD_INPUT, OK
 from dlo_casadi.cli.options import (
-    add_config,
-    add_jobs,
+    CONFIG,
+    NO_DIAGNOSIS,
+    SCHEDULER,
     command,
     configuration,
-    parsed,
+    console,
+    jobs,
+    option,
+    print_json,
+    say,
     session_jobs,
 )
 from dlo_casadi.config import Config
+from dlo_casadi.errors import counted
+from dlo_casadi.io.files import make_folder
+from dlo_casadi.runtime.executors import ended_first
 from dlo_casadi.runtime.parallel import begin, open_executor
 
-EXAMPLES = """\
+# Of report.json, what a diagnosis prints.
+DIAGNOSIS = ("config", "verdict", "effects", "candidates", "unexplained", "next_pose", "warnings")
+
+
+@command(
+    """\
+Fit a cable to its photographs or centre-lines and report what was found.
+
 dlo fit configs/cable.yaml                       writes results/cable/
 dlo fit rope.yaml --output results/monday        to a folder of your choice
 dlo fit rope.yaml --no-diagnosis                 only the declared model: much faster
 dlo fit rope.yaml --jobs 1                       in one process: slower, and lighter
-dlo fit rope.yaml --quiet --json > rope.json     report.json to a program"""
-
-
-def main(argv: Sequence[str]) -> int:
-    """Run `dlo fit CONFIG [...]`."""
-    parser = command(
-        "fit",
-        "Fit a cable to its photographs or centre-lines and report what was found.",
-        EXAMPLES,
-        "on 2 and 130 earlier results are kept",
-    )
-    add_config(parser)
-    parser.add_argument(
+dlo fit rope.yaml --quiet --json > rope.json     report.json to a program""",
+    CONFIG,
+    option(
         "--output",
         type=Path,
         metavar="DIR",
         help="folder of the results; default results/<config name>/",
-    )
-    add_jobs(parser, session_jobs())
-    parser.add_argument(
-        "--no-diagnosis", action="store_true", help="do not search for missing effects"
-    )
-    chosen = parsed(parser, argv, "print report.json instead of tables")
-
+    ),
+    jobs(session_jobs()),
+    NO_DIAGNOSIS,
+    codes="on 2 and 130 earlier results are kept",
+    json="print report.json instead of tables",
+)
+def fit(chosen: argparse.Namespace) -> None:
+    """Run `dlo fit CONFIG [...]`."""
     config = configuration(chosen.config)
     if chosen.no_diagnosis:
-        diagnosis = config.diagnosis.model_copy(update={"enabled": False})
-        config = replace(config, diagnosis=diagnosis)
-    output = chosen.output or Path("results") / config.name
-    fit_session(chosen, config, output)
-    return OK
+        config = _with_diagnosis(config, False)
+    _fit_and_show(chosen, config, chosen.output or Path("results") / config.name)
 
 
-def fit_session(
-    chosen: argparse.Namespace, config: Config, output: Path | None, **shown: Any
+@command(
+    """\
+Fit a cable and search for what the declared model lacks, whether or not the
+configuration asks for it; print every effect that was tried, ranked.
+
+dlo diagnose configs/cable.yaml                  prints; writes nothing
+dlo diagnose rope.yaml --output results/rope     writes the results of a fit, too
+dlo diagnose rope.yaml --quiet --json            effects, candidates, verdict and next pose""",
+    CONFIG,
+    option("--output", type=Path, metavar="DIR", help="write the results there"),
+    jobs(session_jobs()),
+)
+def diagnose(chosen: argparse.Namespace) -> None:
+    """Run `dlo diagnose CONFIG [...]`."""
+    config = _with_diagnosis(configuration(chosen.config), True)
+    _fit_and_show(chosen, config, chosen.output, DIAGNOSIS)
+
+
+def _with_diagnosis(config: Config, enabled: bool) -> Config:
+    return replace(config, diagnosis=config.diagnosis.model_copy(update={"enabled": enabled}))
+
+
+def _fit_and_show(
+    chosen: argparse.Namespace, config: Config, output: Path | None, keys: Sequence[str] = ()
 ) -> None:
-    """Fit and show one session, see `fit_and_show`: here, and in `--jobs` - 1 processes.
+    """Fit a session here and in `--jobs` - 1 processes; write to `output`, if given; print.
 
-    The first of them is begun at once.
+    Of `keys`, if given, `--json` prints these of report.json alone, and text lists all effects that
+    were tried.
     """
     libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
     with open_executor(chosen.jobs, here=True, libraries=libraries) as executor:
         begin(executor, os.getpid)
-        from dlo_casadi.cli.session import fit_and_show  # beside the other process's imports
+        # These imports take as long as those of the other process, beside which they are made.
+        from dlo_casadi.cli.watch import Watch
+        from dlo_casadi.report.json_report import report_dict
+        from dlo_casadi.report.terminal import candidate_table, print_summary
+        from dlo_casadi.report.writer import ResultsFolder
+        from dlo_casadi.session import run_session
 
-        fit_and_show(chosen, config, output, executor, **shown)
+        results = nullcontext() if output is None else ResultsFolder(output, config)
+        with results as folder, Watch(quiet=chosen.quiet) as watch, ended_first(executor):
+            watch.warn(config.warnings)
+            outcome = run_session(config, watch, executor)
+            if folder is not None:
+                watch.step("write the results", 0, 1)
+                folder.write(outcome, executor)
+                watch.step("write the results", 1, 1)
+    if chosen.json:
+        report = report_dict(outcome)
+        print_json({key: report[key] for key in keys or report})
+        return
+    page = console(chosen.quiet)
+    print_summary(page, outcome)
+    if keys:
+        page.print(candidate_table(outcome))
+    if output is not None:
+        say(page, f"Results: {output}")
+
+
+@command(
+    """\
+Fit many sessions: a table (table.parquet) with one row each, a page (index.html) that
+shows the odd ones first, and the results of each. The same command goes on after an
+interruption; what is finished and unchanged is not repeated.
+
+dlo fit-many cables/                                  all configurations in it and below
+dlo fit-many 'cables/*/session.yaml' --jobs 8         on eight cores
+dlo fit-many cables/ --scheduler tcp://10.0.0.5:8786  on a Dask cluster
+dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast""",
+    option("where", metavar="FOLDER", help="folder, or a pattern in quotes"),
+    jobs(),
+    SCHEDULER,
+    option(
+        "--output", type=Path, metavar="DIR", help="default results/fleet-<name of the folder>/"
+    ),
+    NO_DIAGNOSIS,
+    option("--no-reports", action="store_true", help="no folder of results for each session"),
+    option("--retry-failed", action="store_true", help="try sessions again that have failed"),
+    codes="2 is also a session without results: it is a row with its message, the others are done",
+    json="print the rows as JSON",
+)
+def fit_many(chosen: argparse.Namespace) -> int:
+    """Run `dlo fit-many FOLDER [...]`."""
+    from dlo_casadi.cli.watch import Counter
+    from dlo_casadi.fleet.discover import find_sessions
+    from dlo_casadi.fleet.overview import judge
+    from dlo_casadi.fleet.run import Options, fit_fleet
+
+    base, sessions = find_sessions(chosen.where)
+    output = chosen.output or Path("results") / f"fleet-{base.name}"
+    logs = output / "logs"
+    make_folder(logs)
+    counter = Counter(quiet=chosen.quiet, noun="session")
+
+    def begin(taken_over: int, left: int) -> None:
+        before = f", finished of them {taken_over}" if taken_over else ""
+        counter.message(f"{counted(len(sessions), 'session')}{before}; results in {output}")
+
+    try:
+        with counter, open_executor(chosen.jobs, chosen.scheduler, logs) as executor:
+            result = fit_fleet(
+                sessions,
+                output,
+                executor,
+                Options(diagnosis=not chosen.no_diagnosis, reports=not chosen.no_reports),
+                retry_failed=chosen.retry_failed,
+                begin=begin,
+                progress=counter.show,
+            )
+    except KeyboardInterrupt:
+        counter.message("What is finished is kept: the same command goes on.")
+        raise
+    code = BAD_INPUT if result.failed else OK
+    if chosen.json:
+        print_json(list(result.rows))
+        return code
+    page = console(chosen.quiet)
+    odd = [item for item in judge(result.rows) if item.reasons]
+    for item in odd[:10]:
+        heading = str(item.row["message"]).partition("\n")[0]
+        say(
+            page, f"{item.row['session']}: {', '.join(item.reasons)}{': ' * bool(heading)}{heading}"
+        )
+    if len(odd) > 10:
+        say(page, f"and {len(odd) - 10} more")
+    say(
+        page,
+        f"{counted(len(result.rows), 'session')}, {len(result.failed)} without results: "
+        f"{output / 'index.html'}, {output / 'table.parquet'}",
+    )
+    return code

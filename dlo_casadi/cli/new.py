@@ -1,46 +1,42 @@
-"""`dlo new`: a configuration to start from."""
+"""`dlo new`, `dlo schema`: a configuration to start from, and what editors know of it."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from dlo_casadi.cli.guard import OK
-from dlo_casadi.cli.options import command, parsed, print_json
+from dlo_casadi.cli.options import command, one_of, option, print_json
 from dlo_casadi.config.schema import schema_text
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
 
-EXAMPLES = """\
-dlo new rope.yaml
-dlo new rope.yaml --photographs photographs/
-dlo new rope.yaml --centerlines measured/
-dlo new loom.yaml --space --centerlines markers/"""
-
 _PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run `dlo new FILE [--space] [--photographs DIR | --centerlines DIR]`."""
-    parser = command(
-        "new",
-        "Write a commented configuration to start from: one pose for each file that is found,\n"
-        "and FILL_IN wherever only you know the value. Nothing is asked, nothing replaced.",
-        EXAMPLES,
-    )
-    parser.add_argument("file", type=Path, help="the configuration to write, such as rope.yaml")
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument("--photographs", type=Path, metavar="DIR", help="folder of photographs")
-    source.add_argument("--centerlines", type=Path, metavar="DIR", help="folder of CSV files")
-    parser.add_argument(
-        "--space", action="store_true", help="a cable that leaves the plane, held by grippers"
-    )
-    chosen = parsed(parser, argv, "print what was written as JSON")
+@command(
+    """\
+Write a commented configuration to start from: one pose for each file that is found,
+and FILL_IN wherever only you know the value. Nothing is asked, nothing replaced.
 
+dlo new rope.yaml
+dlo new rope.yaml --photographs photographs/
+dlo new rope.yaml --centerlines measured/
+dlo new loom.yaml --space --centerlines markers/""",
+    option("file", type=Path, help="the configuration to write, such as rope.yaml"),
+    one_of(
+        option("--photographs", type=Path, metavar="DIR", help="folder of photographs"),
+        option("--centerlines", type=Path, metavar="DIR", help="folder of CSV files"),
+    ),
+    option("--space", action="store_true", help="a cable that leaves the plane, held by grippers"),
+    json="print what was written as JSON",
+)
+def new(chosen: argparse.Namespace) -> None:
+    """Run `dlo new FILE [--space] [--photographs DIR | --centerlines DIR]`."""
     target: Path = chosen.file
     if target.suffix not in (".yaml", ".yml"):
         raise DloError(f"{target}: the name of a configuration ends in .yaml")
@@ -54,9 +50,9 @@ def main(argv: Sequence[str]) -> int:
         files = _listed(chosen.photographs, _PHOTOGRAPHS, "photograph", target.parent)
     elif chosen.centerlines is not None:
         files = _listed(chosen.centerlines, (".csv",), "CSV file", target.parent)
-    kind: Literal["images", "centerlines"] = "images"
-    if chosen.centerlines is not None:
-        kind = "centerlines"
+    kind: Literal["images", "centerlines"] = (
+        "images" if chosen.centerlines is None else "centerlines"
+    )
     text = template(target.stem, files, kind, chosen.space)
     schema = target.with_name("schema.json")
     written = [target]
@@ -71,9 +67,7 @@ def main(argv: Sequence[str]) -> int:
     elif not chosen.quiet:
         left = text.count("FILL_IN") - 1  # one is in a comment
         places = f"{counted(left, 'place')} to fill in, each marked FILL_IN"
-        print(f"{target}: {counted(len(files), 'pose')}, {places}")
-        print(f"then: dlo check {target}")
-    return OK
+        print(f"{target}: {counted(len(files), 'pose')}, {places}\nthen: dlo check {target}")
 
 
 def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list[str]:
@@ -86,8 +80,22 @@ def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list
         ) from None
     if not found:
         raise DloError(f"{folder} holds no {what} ({', '.join(endings)})")
-    found.sort(key=lambda path: [int(t) if t.isdigit() else t for t in _PARTS.split(path.name)])
-    return [Path(os.path.relpath(path, base)).as_posix() for path in found]
+
+    def parts(path: Path) -> list[int | str]:
+        return [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", path.name)]
+
+    return [Path(os.path.relpath(path, base)).as_posix() for path in sorted(found, key=parts)]
 
 
-_PARTS = re.compile(r"(\d+)")
+@command(
+    """\
+Print the JSON schema of a configuration, for editors.
+
+dlo schema > schema.json
+    then `# yaml-language-server: $schema=schema.json` as the first line of a configuration
+    gives completion, help and checks in editors with the YAML language server""",
+    json=None,
+)
+def schema(chosen: argparse.Namespace) -> None:
+    """Run `dlo schema`."""
+    print(schema_text(), end="")

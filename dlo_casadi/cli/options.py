@@ -1,4 +1,4 @@
-"""What the subcommands share: the look of their help, and where they print."""
+"""What the subcommands share: their options, the look of their help, and where they print."""
 
 from __future__ import annotations
 
@@ -6,61 +6,50 @@ import argparse
 import json
 import multiprocessing
 import os
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from decimal import Decimal
+from functools import wraps
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
+from dlo_casadi.cli.guard import OK
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
 
+# Begins the line of a warning, see `say`.
+WARNING = "[bold yellow]warning:[/] "
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
-
-def command(name: str, description: str, examples: str, codes: str = "") -> argparse.ArgumentParser:
-    """Parser of a subcommand, with examples and exit codes below its help.
-
-    Parameters
-    ----------
-    examples : str
-        One command a line.
-    codes : str
-        What the exit codes mean here, if it is more than in every command.
-    """
-    listed = "\n".join(f"  {line}" for line in examples.splitlines())
-    return argparse.ArgumentParser(
-        prog=f"dlo {name}",
-        description=description,
-        epilog=f"examples:\n{listed}\n\n{EXIT_CODES}{'; ' * bool(codes)}{codes}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+# Adds itself to a parser or a group.
+Option = Callable[[Any], object]
 
 
-def add_config(parser: argparse.ArgumentParser) -> None:
-    """Add the configuration."""
-    parser.add_argument("config", type=Path, help="configuration, such as configs/cable.yaml")
+def option(*names: str, **settings: Any) -> Option:
+    """An argument of `argparse`."""
+    return lambda parser: parser.add_argument(*names, **settings)
 
 
-def add_parameters(parser: argparse.ArgumentParser) -> None:
-    """Add the file of a fitted cable."""
-    parser.add_argument("parameters", type=Path, help="parameters.yaml of a fit, or its folder")
+def one_of(*options: Option, required: bool = False) -> Option:
+    """Options of which at most one may be given."""
+
+    def add(parser: Any) -> None:
+        group = parser.add_mutually_exclusive_group(required=required)
+        for item in options:
+            item(group)
+
+    return add
 
 
-def parsed(
-    parser: argparse.ArgumentParser, argv: Sequence[str], json: str = "print JSON instead of tables"
-) -> argparse.Namespace:
-    """Add `--quiet` and `--json`, of which `json` is the help, and parse."""
-    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    parser.add_argument("--json", action="store_true", help=json)
-    return parser.parse_args(argv)
-
-
-def add_jobs(parser: argparse.ArgumentParser, default: int = 1) -> None:
-    """Add `--jobs`."""
+def jobs(default: int = 1) -> Option:
+    """`--jobs`."""
     text = "number of processes; default %(default)s"
-    parser.add_argument("--jobs", type=_positive, default=default, metavar="N", help=text)
+    return option("--jobs", type=_positive, default=default, metavar="N", help=text)
 
 
 def _positive(text: str) -> int:
@@ -79,6 +68,63 @@ def session_jobs() -> int:
     return min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
 
 
+CONFIG = option("config", type=Path, help="configuration, such as configs/cable.yaml")
+PARAMETERS = option("parameters", type=Path, help="parameters.yaml of a fit, or its folder")
+SCHEDULER = option("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead")
+NO_DIAGNOSIS = option(
+    "--no-diagnosis", action="store_true", help="do not search for missing effects"
+)
+
+
+def command(
+    text: str,
+    *options: Option,
+    codes: str = "",
+    json: str | None = "print JSON instead of tables",
+) -> Callable[[Callable[[argparse.Namespace], int | None]], Callable[[Sequence[str]], int]]:
+    """Make a subcommand of the function of the same name: of its arguments, with its exit code.
+
+    Parameters
+    ----------
+    text : str
+        What it does; after an empty line examples, one command a line.
+    options : Option
+        In the order in which the help lists them.
+    codes : str
+        What the exit codes mean here, if it is more than in every command.
+    json : str or None
+        Help of `--json`, which comes with `--quiet`; without both if None.
+    """
+    description, _, examples = text.partition("\n\n")
+    if json is not None:
+        quiet = option("--quiet", action="store_true", help="print nothing but errors")
+        options = (*options, quiet, option("--json", action="store_true", help=json))
+
+    def decorate(work: Callable[[argparse.Namespace], int | None]) -> Callable[..., int]:
+        @wraps(work)
+        def run(argv: Sequence[str]) -> int:
+            parser = argparse.ArgumentParser(
+                prog=f"dlo {work.__name__.replace('_', '-')}",
+                description=description,
+                epilog=f"examples:\n{indent(examples, '  ')}\n\n{EXIT_CODES}"
+                f"{'; ' * bool(codes)}{codes}",
+                formatter_class=argparse.RawDescriptionHelpFormatter,
+            )
+            for item in options:
+                item(parser)
+            return work(parser.parse_args(plain_numbers(argv))) or OK
+
+        return run
+
+    return decorate
+
+
+def plain_numbers(argv: Sequence[str]) -> list[str]:
+    """Write -1e-2 as -0.01: argparse takes the former for an option."""
+    number = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+    return [f"{Decimal(text):f}" if number.fullmatch(text) else text for text in argv]
+
+
 def configuration(path: Path) -> Config:
     """Load a configuration; of a folder, say which configurations it holds."""
     if os.path.isdir(path):
@@ -93,6 +139,11 @@ def console(quiet: bool = False) -> Console:
     """Where results go; a file or a pipe has room for a whole table."""
     width = None if sys.stdout.isatty() else 120
     return Console(quiet=quiet, highlight=False, width=width)
+
+
+def say(page: Console, text: str, mark: str = "") -> None:
+    """Print a line as it is, however long, after a mark with markup."""
+    page.print(f"{mark}{escape(text)}", soft_wrap=True)
 
 
 def print_json(data: Any) -> None:

@@ -1,1 +1,21 @@
-"""Many sessions: one row each in a table, and a page that shows the odd ones first."""
+"""Many sessions or poses: tables that an interrupted run goes on with, and a page of sessions."""
+
+from typing import Any
+
+from dlo_casadi.errors import DloError
+
+
+def parquet_library() -> tuple[Any, Any]:
+    """The library that writes Parquet.
+
+    Raises
+    ------
+    DloError
+        If it is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise DloError("tables need pyarrow.\n  Try: pip install 'dlo-casadi[table]'") from None
+    return pyarrow, pyarrow.parquet

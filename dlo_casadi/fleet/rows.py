@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from dlo_casadi import __version__
-from dlo_casadi.errors import DloError
+from dlo_casadi.fleet import parquet_library
 from dlo_casadi.io.files import write_file
 from dlo_casadi.session.outcome import StageName
 from dlo_casadi.session.run import TIMED
@@ -158,22 +158,6 @@ def write_table(output: Path, rows: Iterable[Row]) -> None:
     ordered = sorted(rows, key=lambda row: str(row["session"]))
     table = pyarrow.Table.from_pylist(ordered, schema=arrow_schema())
     write_file(output / TABLE, lambda stream: parquet.write_table(table, stream))
-
-
-def parquet_library() -> tuple[Any, Any]:
-    """The library that writes Parquet.
-
-    Raises
-    ------
-    DloError
-        If it is not installed.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise DloError("tables need pyarrow.\n  Try: pip install 'dlo-casadi[table]'") from None
-    return pyarrow, pyarrow.parquet
 
 
 def arrow_schema() -> pyarrow.Schema:

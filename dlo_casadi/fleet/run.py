@@ -11,12 +11,12 @@ from pathlib import Path
 
 from dlo_casadi.config import load_config
 from dlo_casadi.errors import DloError, OutputError
+from dlo_casadi.fleet import parquet_library
 from dlo_casadi.fleet.discover import Session, digest_of
 from dlo_casadi.fleet.overview import overview_html
 from dlo_casadi.fleet.rows import (
     Row,
     empty_row,
-    parquet_library,
     read_row,
     row_of,
     write_row,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.errors import DloError
+from dlo_casadi.fleet import parquet_library
 
 FloatArray = NDArray[np.floating]
 
@@ -27,14 +28,14 @@ class Grid:
 
     Parameters
     ----------
-    x, y : (float, float, int) [m, m, -]
-        First, last and number of places.
+    x, y : (float, float, float) [m, m, -]
+        First, last and number of places, a whole one.
     fixed : dict
         Start [m] and headings [rad] of all poses, by COLUMNS.
     """
 
-    x: tuple[float, float, int]
-    y: tuple[float, float, int]
+    x: tuple[float, float, float]
+    y: tuple[float, float, float]
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -46,6 +47,10 @@ class Grid:
                 )
 
     @property
+    def _axes(self) -> list[tuple[float, float, int]]:
+        return [(first, last, int(number)) for first, last, number in (self.x, self.y)]
+
+    @property
     def count(self) -> int:
         """How many there are."""
         return int(self.x[2]) * int(self.y[2])
@@ -53,11 +58,12 @@ class Grid:
     @property
     def identity(self) -> Mapping[str, Any]:
         """What decides them, as plain data."""
-        return {"grid_x": list(self.x), "grid_y": list(self.y), "fixed": dict(self.fixed)}
+        x, y = self._axes
+        return {"grid_x": x, "grid_y": y, "fixed": dict(self.fixed)}
 
     def chunks(self, size: int) -> Iterator[FloatArray]:
         """Arrays (size, 6); the last may be shorter."""
-        x, y = np.linspace(*self.x), np.linspace(*self.y)
+        x, y = (np.linspace(*axis) for axis in self._axes)
         for begin in range(0, self.count, size):
             index = np.arange(begin, min(begin + size, self.count))
             poses = _fixed(len(index), self.fixed)
@@ -119,6 +125,7 @@ class PoseList:
 
     @property
     def _data(self) -> Any:
+        parquet_library()
         from pyarrow import csv, dataset, float64
 
         types = csv.ConvertOptions(column_types=dict.fromkeys(HEADER, float64()))

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from dlo_casadi.config import load_config
-from dlo_casadi.fleet.rows import parquet_library
+from dlo_casadi.fleet import parquet_library
 from dlo_casadi.report.parameters_text import parameters_text
 from dlo_casadi.session import run_session
 

@@ -18,7 +18,7 @@ pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-cas
 import pyarrow.parquet as pq
 from tiny_sessions import QUICK, without_times, write_fleet
 
-from dlo_casadi.cli import fit_many, main
+from dlo_casadi.cli import fit, main
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet.discover import find_sessions
 from dlo_casadi.fleet.overview import judge, overview_html, robust_z
@@ -86,7 +86,7 @@ def test_a_run_opens_one_pool_of_workers(tmp_path, monkeypatch, capsys):
         opened.append(options)
         return open_executor(*options)
 
-    monkeypatch.setattr(fit_many, "open_executor", opens)
+    monkeypatch.setattr(fit, "open_executor", opens)
     assert main(["fit-many", str(tmp_path), "--output", str(tmp_path / "out"), "--quiet"]) == 2
     assert len(opened) == 1
 

@@ -18,7 +18,6 @@ from test_figures import EFFECT
 import dlo_casadi as dlo
 from dlo_casadi import api
 from dlo_casadi.cli import main
-from dlo_casadi.cli import session as session_command
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.report import writer
 from dlo_casadi.report.terminal import candidate_table
@@ -99,7 +98,7 @@ def written(outcome, tmp_path_factory):
     command = ["fit", str(outcome.config.path), "--json", "--quiet", "--output", str(folder)]
     printed = StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
-        patch.setattr(session_command, "run_session", lambda *_: outcome)
+        patch.setattr("dlo_casadi.session.run_session", lambda *_: outcome)
         assert main(command) == 0
     return folder, printed.getvalue()
 

@@ -1,0 +1,264 @@
+"""`dlo predict`, `dlo shape-table`, `dlo generate-solver`: what a fitted cable is used for."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from dlo_casadi.cli.options import (
+    PARAMETERS,
+    SCHEDULER,
+    command,
+    console,
+    jobs,
+    one_of,
+    option,
+    print_json,
+    say,
+)
+from dlo_casadi.cli.watch import Counter
+from dlo_casadi.codegen import generate
+from dlo_casadi.codegen.shapes import pose_size
+from dlo_casadi.equilibrium.fitted_cable import FittedCable
+from dlo_casadi.errors import DloError
+from dlo_casadi.fleet import shape_table as tables
+from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
+from dlo_casadi.fleet.shape_table import Plan
+from dlo_casadi.io.parameters import load_parameters
+from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.runtime.parallel import open_executor
+
+DRAWN = (".png", ".pdf", ".svg", ".jpg")
+BRANCH = option("--branch", choices=("ccw", "cw"), help="which way the cable turns")
+MESH = (
+    option("--elements", type=int, help="number of elements, instead of the fit's"),
+    option(
+        "--element",
+        choices=ELEMENTS,
+        help="instead of the fit's; arcs are several times faster than quadratic elements",
+    ),
+)
+# What `dlo predict` hands on.
+HELD = (
+    *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
+    *("turns", "branch"),
+)
+
+
+@command(
+    """\
+Predict the shape of a fitted cable from where its ends are held.
+
+dlo predict results/cable --end 0.3 -0.1
+dlo predict results/cable --end 0.3 -0.1 --figure shape.png
+dlo predict results/cable --start 0.1 0 --end 0.3 -0.1 --branch cw --json
+dlo predict results/wire --end -0.12 0 --start-heading 0 --end-heading -6.2832
+dlo predict results/loom --end 0.6 0.1 0.3 --end-orientation 0 0 0 1 --turns 1""",
+    PARAMETERS,
+    *(
+        option(
+            f"--{side}",
+            nargs="+",
+            type=float,
+            metavar="X",
+            help=f"where the {side} is held, X Y or in space X Y Z [m]{remark}",
+        )
+        for side, remark in (("end", "; not for a free end"), ("start", ""))
+    ),
+    option("--start-heading", type=float, metavar="R", help="clamped start [rad]"),
+    option("--end-heading", type=float, metavar="R", help="clamped end [rad]"),
+    *(
+        option(
+            f"--{side}-orientation",
+            nargs=4,
+            type=float,
+            metavar=("QX", "QY", "QZ", "QW"),
+            help=f"frame of the clamp at the {side} in space, x forward along the cable",
+        )
+        for side in ("start", "end")
+    ),
+    option("--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"),
+    BRANCH,
+    option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),
+    codes="2 is also a pose without an equilibrium",
+)
+def predict(chosen: argparse.Namespace) -> None:
+    """Run `dlo predict PARAMETERS --end X Y [Z] [...]`."""
+    from dlo_casadi import api
+    from dlo_casadi.report.canvas import save_figure
+    from dlo_casadi.report.figures_poses import prediction_figure
+    from dlo_casadi.report.terminal import prediction_table
+
+    figure = chosen.figure
+    if figure is not None and figure.suffix.lower() not in DRAWN:
+        raise DloError(f"--figure {figure}: the name must end in {', '.join(DRAWN)}")
+    shape = api.predict(chosen.parameters, **{name: getattr(chosen, name) for name in HELD})
+    if figure is not None:
+        save_figure(figure, prediction_figure(shape))
+    if chosen.json:
+        print_json(shape.as_dict())
+        return
+    # What a reader of the prediction should know of the file it came from.
+    notes = []
+    if shape.cable.metadata.edited:
+        notes.append("note: the model in this file was changed after it had been fitted")
+    if shape.cable.metadata.identifiable is False:
+        notes.append(
+            "note: the shapes did not determine the bending stiffness; the shape is more certain "
+            "than forces and energy"
+        )
+    page = console(chosen.quiet)
+    page.print(prediction_table(shape, notes))
+    if figure is not None:
+        say(page, f"Figure: {figure}")
+
+
+@command(
+    """\
+Predict the shapes of a fitted cable over a grid or a list of end poses with the
+compiled solver. The same command goes on after an interruption. Poses without a shape
+say why in the column `status`.
+
+dlo shape-table results/cable --grid -0.8 0.8 200 -0.8 0.8 200 --output shapes.parquet
+dlo shape-table results/cable --list ends.csv --output shapes.parquet --jobs 4
+dlo shape-table results/wire --grid -0.2 0 50 0 0.1 50 --end-heading -6.28 --output wire.parquet""",
+    PARAMETERS,
+    one_of(
+        option(
+            "--grid",
+            nargs=6,
+            type=float,
+            metavar=("X0", "X1", "NX", "Y0", "Y1", "NY"),
+            help="end positions [m], x fastest",
+        ),
+        option(
+            "--list", type=Path, metavar="FILE", help="CSV or Parquet with end_x_m, end_y_m, ..."
+        ),
+        required=True,
+    ),
+    option("--output", type=Path, required=True, metavar="FILE", help=".parquet"),
+    option("--start", nargs=2, type=float, metavar=("X", "Y"), help="of all poses [m]"),
+    option("--start-heading", type=float, metavar="R", help="of all poses [rad]"),
+    option("--end-heading", type=float, metavar="R", help="of all poses [rad]"),
+    BRANCH,
+    *MESH,
+    jobs(),
+    SCHEDULER,
+    option("--restart", action="store_true", help="replace what lies there"),
+    json="print the counts as JSON",
+)
+def shape_table(chosen: argparse.Namespace) -> None:
+    """Run `dlo shape-table PARAMETERS --grid|--list ... --output FILE [...]`."""
+    if chosen.output.suffix.lower() != ".parquet":
+        raise DloError(
+            f"--output {chosen.output}: the table is a Parquet file.\n"
+            f"  Try: --output {chosen.output.with_suffix('.parquet')}"
+        )
+    cable = load_parameters(chosen.parameters)
+    if pose_size(cable.model) != len(COLUMNS):
+        raise DloError(
+            f"{cable.model.cable.name!r} is in space: tables hold shapes in a plane.\n"
+            "  Try: dlo predict, or dlo generate-solver for many shapes"
+        )
+    model, p, rest, metadata = with_mesh(cable, chosen)
+    fixed, needed = _ends(cable, chosen)
+    poses: Grid | PoseList
+    if chosen.grid is None:
+        poses = PoseList(chosen.list, needed, fixed)
+    else:
+        poses = _grid(cable, chosen.grid, fixed, needed)
+    output = chosen.output.resolve()
+    plan = Plan(model, p, rest, chosen.branch, output.with_name(f"{output.name}.parts"))
+    counter = Counter(quiet=chosen.quiet, noun="pose", size=plan.chunk, count=poses.count)
+    with counter, open_executor(chosen.jobs, chosen.scheduler) as executor:
+        counts = tables.shape_table(
+            plan,
+            poses,
+            output,
+            executor,
+            metadata={"parameters_model_hash": metadata.model_hash, "config": metadata.config},
+            restart=chosen.restart,
+            progress=counter.show,
+        )
+    if chosen.json:
+        print_json({"output": str(output), "solver_hash": plan.digest, "poses": counts})
+    else:
+        said = ", ".join(f"{n} {status.replace('_', ' ')}" for status, n in counts.items())
+        say(console(chosen.quiet), f"{output}: {said or 'complete already'}")
+
+
+def _ends(
+    cable: FittedCable, chosen: argparse.Namespace
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """What all poses share, and the columns that a list must have beside it."""
+    model, shared = cable.model, cable.metadata.fixtures
+    x, y = chosen.start or shared.get("start") or (0.0, 0.0)
+    fixed = {"start_x": float(x), "start_y": float(y)}
+    needed = [] if model.end == "free" else ["end_x_m", "end_y_m"]
+    for side in ("start", "end"):
+        held, name = getattr(model, side), f"{side}_heading"
+        heading = getattr(chosen, name)
+        if held != "clamped":
+            if heading is not None:
+                raise DloError(f"--{side}-heading: the {side} of this cable is {held}")
+            continue
+        heading = shared.get(name) if heading is None else heading
+        if heading is None:
+            needed.append(f"{name}_rad")
+        else:
+            fixed[name] = float(heading)
+    return fixed, tuple(needed)
+
+
+def _grid(
+    cable: FittedCable, numbers: Sequence[float], fixed: dict[str, float], needed: Sequence[str]
+) -> Grid:
+    """The grid, if all that it does not say is known."""
+    if cable.model.end == "free":
+        raise DloError("--grid: the end of this cable is free, it has no place; use --list")
+    headings = [name.removesuffix("_rad") for name in needed if name.endswith("_rad")]
+    if headings:
+        raise DloError(
+            "--grid: this cable is clamped, and the session's poses do not share "
+            f"{' and '.join(headings)}.\n  Try: --start-heading, --end-heading [rad]"
+        )
+    x0, x1, nx, y0, y1, ny = numbers
+    return Grid((x0, x1, nx), (y0, y1, ny), fixed)
+
+
+@command(
+    """\
+Write the C solver of a fitted cable for planners to embed: <prefix>_solver.h,
+<prefix>_solver.c, <prefix>_solver.hpp for C++, CMakeLists.txt, <prefix>_solver.pc.in and example.c.
+
+dlo generate-solver results/cable/parameters.yaml --output solver
+dlo generate-solver results/cable --output solver --prefix rope --elements 40""",
+    PARAMETERS,
+    option("--output", type=Path, required=True, help="folder for the C files"),
+    option("--prefix", default="dlo", help="begins all public names (dlo)"),
+    *MESH,
+    json="print files and hash as JSON",
+)
+def generate_solver(chosen: argparse.Namespace) -> None:
+    """Run `dlo generate-solver PARAMETERS --output DIR [...]`."""
+    model, p, rest, _ = with_mesh(load_parameters(chosen.parameters), chosen)
+    solver = generate(model, p, rest, chosen.prefix)
+    written = solver.write(chosen.output)
+    if chosen.json:
+        print_json({"files": [str(path) for path in written], "solver_hash": solver.hash})
+    elif not chosen.quiet:
+        print(*written, f"model hash {solver.hash}", sep="\n")
+
+
+def with_mesh(cable: FittedCable, chosen: argparse.Namespace) -> FittedCable:
+    """The cable on the mesh that is chosen with the options `MESH`."""
+    if not (chosen.elements or chosen.element):
+        return cable
+    if cable.model.has_state:
+        raise DloError(
+            f"{cable.model.cable.name!r} has a rest shape that changed from pose to pose, which is "
+            "known on the fit's elements alone: leave out --elements and --element"
+        )
+    model = cable.model.with_mesh(chosen.elements or cable.model.n, chosen.element)
+    return cable._replace(model=model, rest=model.rest_basis @ cable.metadata.coefficients)
