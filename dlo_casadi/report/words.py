@@ -12,8 +12,7 @@ from dlo_casadi.diagnosis.next_pose import NextPose, NextReading
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted
-from dlo_casadi.session.findings import FoundEffect
-from dlo_casadi.session.outcome import Outcome, Stage, StageName
+from dlo_casadi.session.outcome import FoundEffect, Outcome, Stage, StageName
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 from dlo_casadi.thresholds import APART, NOTABLE
 

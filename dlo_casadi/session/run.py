@@ -25,7 +25,6 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess, one_thread
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.findings import found_effects
 from dlo_casadi.session.fitting import (
     confirmed,
     declared_model,
@@ -44,6 +43,7 @@ from dlo_casadi.session.outcome import (
     PoseInput,
     Repeatability,
     Stage,
+    found_effects,
 )
 from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.remarks import (

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
-from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
 from dlo_casadi.equilibrium.tipping import sides_of, tipping_of
@@ -25,7 +24,7 @@ from dlo_casadi.estimation.prediction import (
 from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.estimation.stiffness import StiffnessFit
-from dlo_casadi.model.cable_model import END_ROLL, CableModel
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
 from dlo_casadi.paper.algorithm1 import Algorithm1Result
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -52,29 +51,21 @@ def pose_shape(
     other: MeasuredBranch | None,
 ) -> PoseShape:
     """One predicted pose beside its measured points."""
-    curve = prediction.curve
-    places = np.linspace(0.0, curve.length, _CURVE_POINTS)
-    eq: Equilibrium = prediction.equilibrium
-    s: FloatArray = np.zeros(0)
-    gap: FloatArray = np.zeros((0, curve.d))
-    rmse = branch = None
-    if item.readable:
-        rmse = _rmse(prediction, item)
+    curve, eq = prediction.curve, prediction.equilibrium
+    s, gap = np.zeros(0), np.zeros((0, curve.d))
     if item.has_line:
         s = item.traced.nearest(curve)
         gap = item.traced.points - curve.at(s)
-    if item.readable and other is not None:
-        branch = _branch_shape(other, item)
     return PoseShape(
-        curve.at(places),
-        rmse,
+        curve.at(np.linspace(0.0, curve.length, _CURVE_POINTS)),
+        _rmse(prediction, item) if item.readable else None,
         s,
         gap,
         _across(prediction, s, gap),
         eq.energy,
         eq.stable,
         np.stack([eq.lam_start, eq.lam]),
-        branch,
+        _branch_shape(other, item) if item.readable and other is not None else None,
         readings=item.readings_beside(prediction.seen),
     )
 
@@ -88,26 +79,121 @@ def _branch_shape(found: MeasuredBranch, item: MeasuredPose) -> BranchShape:
     return BranchShape(_rmse(found.prediction, item), found.branch, found.turns)
 
 
+def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArray:
+    """Components across the cable, see `PoseShape.residual`, of gaps (K, d) [m] at s (K,) [m]."""
+    curve, start = prediction.curve, prediction.equilibrium.x[:1]
+    if curve.d == 2:
+        return np.asarray(np.einsum("knd,kd->kn", curve.normals(s), gap)[:, 0])
+    normals = curve.normals(np.concatenate([[0.0], s]))
+    y = Frame.to_world(start, np.array([[0.0, 1.0, 0.0]]))[0]
+    toward, beside = normals[0] @ y
+    turned = np.array([[toward, beside], [-beside, toward]]) / np.hypot(toward, beside)
+    return np.asarray(np.einsum("ij,kjd,kd->ki", turned, normals[1:], gap))
+
+
 @dataclass(frozen=True)
-class _Fitted:
-    """What is known of a fitted model, to say of its predictions what they let expect."""
+class _Model:
+    """A model with its parameters; of a fit also how well they are known, to say what to expect.
+
+    `nodes` are those of the fitted poses, `noise` [m] is that of a point beside other hangings.
+    """
 
     model: CableModel
     p: FloatArray
-    uncertainty: Uncertainty
-    noise: float
+    rest: FloatArray
+    uncertainty: Uncertainty | None = None
+    nodes: Mapping[str, FloatArray] | None = None
+    noise: float = 0.0
 
-    def told(
+    def stage(
+        self,
+        name: StageName,
+        measured: Sequence[MeasuredPose],
+        parameters: dict[str, ParameterEstimate],
+        rest_curvature: RestCurvatureEstimate,
+        chi2_per_dof: float | None = None,
+        note: str = "",
+    ) -> Stage:
+        """Predictions of all poses, and their errors."""
+        poses = [item.pose for item in measured]
+        predictions = predict_poses(self.model, self.p, self.rest, poses)
+        others = measured_branches(self.model, self.p, self.rest, measured, predictions, self.nodes)
+        shapes: dict[str, PoseShape] = {}
+        for j, (item, known, other) in enumerate(zip(measured, predictions, others, strict=True)):
+            side = None
+            if other is not None and other.other_side and not item.held_out:
+                # A fit has used on which side the cable of its poses hangs.
+                side = _branch_shape(other, item)
+                predictions[j], others[j] = known, other = other.prediction, None
+            if known is not None:
+                shape = replace(pose_shape(known, item, other), measured_side=side)
+                shapes[item.pose.name] = self._told(item, known, other, shape)
+        lost = [item for item in measured if item.pose.name not in shapes]
+        if lost:
+            names = ", ".join(item.pose.name for item in lost)
+            note = (note + f" No equilibrium for {names}.").strip()
+        on_branch = [
+            prediction if other is None else other.prediction
+            for prediction, other in zip(predictions, others, strict=True)
+        ]
+        return Stage(
+            name,
+            rms_distance(predictions, measured, held_out=False),
+            rms_distance(predictions, measured, held_out=True),
+            chi2_per_dof,
+            parameters,
+            rest_curvature,
+            shapes,
+            note,
+            rms_distance(on_branch, measured, held_out=False),
+            rms_distance(on_branch, measured, held_out=True),
+            tuple(item.pose.name for item in lost if item.held_out and item.readable),
+            _reading_errors(measured, shapes, held_out=False),
+            _reading_errors(measured, shapes, held_out=True),
+        )
+
+    def _told(
         self, item: MeasuredPose, known: Prediction, other: MeasuredBranch | None, shape: PoseShape
     ) -> PoseShape:
-        """A predicted pose with all that the uncertainty tells of it."""
-        either = self._either_side(item, known, other)
-        undecided = other is not None and self._undecided(item, known, other)
-        shape = self._expected(item, known, shape)
-        return replace(shape, either_side=either, undecided=undecided)
+        """A predicted pose with all that the uncertainty tells of it and of its next hanging."""
+        if self.uncertainty is None:
+            return shape
+        places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
+        curve, moved = displacements(
+            self.model,
+            self.p,
+            known.rest,
+            item.pose,
+            known.equilibrium,
+            self.uncertainty,
+            np.concatenate([places, shape.s]),
+        )
+        expected = missed = np.zeros(0)
+        if len(shape.s):
+            line = item.traced
+
+            def distances(moved: FloatArray) -> FloatArray:
+                """Lengths (K,) [m] of displacements (K, d, q) as the sensor compares points."""
+                rows = line.components(curve, shape.s, moved)[line.on_points]
+                return np.asarray(np.sqrt(np.bincount(line.point_of, (rows**2).sum(axis=1))))
+
+            missed = distances(shape.gap[..., None])
+            expected = np.hypot(distances(moved[len(places) :]), self.noise * line.noise_distances)
+        return replace(
+            shape,
+            either_side=self._either_side(item, known, other, self.uncertainty),
+            undecided=other is not None and self._undecided(item, known, other, self.uncertainty),
+            spread=spread_across(curve, places, moved[: len(places)]).squeeze(),
+            expected=expected,
+            missed=missed,
+        )
 
     def _either_side(
-        self, item: MeasuredPose, known: Prediction, measured: MeasuredBranch | None
+        self,
+        item: MeasuredPose,
+        known: Prediction,
+        measured: MeasuredBranch | None,
+        uncertainty: Uncertainty,
     ) -> EitherSide | None:
         """A held-out pose on both sides, see `EitherSide`; None where there is but one."""
         if not (item.held_out and item.readable):
@@ -130,43 +216,22 @@ class _Fitted:
             BranchShape(_rmse(one, item), way.branch, way.turns or None)
             for one, way in zip((known, other), ways, strict=True)
         ]
-        tipping = tipping_of(self.model, self.p, known.rest, item.pose, *pair, self.uncertainty)
+        tipping = tipping_of(self.model, self.p, known.rest, item.pose, *pair, uncertainty)
         return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
 
-    def _expected(self, item: MeasuredPose, known: Prediction, shape: PoseShape) -> PoseShape:
-        """A predicted pose with what the next hanging of it lets expect."""
-        places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
-        both = np.concatenate([places, shape.s])
-        eq = known.equilibrium
-        curve, moved = displacements(
-            self.model, self.p, known.rest, item.pose, eq, self.uncertainty, both
-        )
-        spread = spread_across(curve, places, moved[: len(places)])
-        expected: FloatArray = np.zeros(0)
-        missed = expected
-        if len(shape.s):
-            line = item.traced
-
-            def distances(moved: FloatArray) -> FloatArray:
-                """Lengths (K,) [m] of displacements (K, d, q) as the sensor compares points."""
-                rows = line.components(curve, shape.s, moved)[line.on_points]
-                return np.asarray(np.sqrt(np.bincount(line.point_of, (rows**2).sum(axis=1))))
-
-            missed = distances(shape.gap[..., None])
-            expected = np.hypot(distances(moved[len(places) :]), self.noise * line.noise_distances)
-        return replace(shape, spread=spread.squeeze(), expected=expected, missed=missed)
-
-    def _undecided(self, item: MeasuredPose, known: Prediction, other: MeasuredBranch) -> bool:
+    def _undecided(
+        self, item: MeasuredPose, known: Prediction, other: MeasuredBranch, known_to: Uncertainty
+    ) -> bool:
         """Whether the uncertain parameters leave open in which equilibrium a pose is."""
-        std = np.sqrt(np.maximum(np.diag(self.uncertainty.covariance), 1e-300))
-        by_p, by_rest = self.uncertainty.unknowns_in(self.model)
+        std = np.sqrt(np.maximum(np.diag(known_to.covariance), 1e-300))
+        by_p, by_rest = known_to.unknowns_in(self.model)
         gap = EnergyGap.between(
             self.model,
             item.pose,
             (other.prediction.equilibrium, known.equilibrium),
             (self.p, known.rest),
             (by_p * std, by_rest * std),
-            self.uncertainty.covariance / np.outer(std, std),
+            known_to.covariance / np.outer(std, std),
         )
         return gap.value < UNSEEN * gap.std
 
@@ -175,91 +240,14 @@ def _reading_errors(
     measured: Sequence[MeasuredPose], shapes: Mapping[str, PoseShape], held_out: bool
 ) -> ReadingErrors:
     """Errors of the readings of one role; none where one of its poses has no prediction."""
-    poses = [item for item in measured if item.held_out is held_out and item.reactions]
-    if any(item.pose.name not in shapes for item in poses):
+    names = [x.pose.name for x in measured if x.held_out is held_out and x.reactions]
+    if not shapes.keys() >= set(names):
         return ReadingErrors()
-
-    def rms(kind: str) -> float | None:
-        squares = [
-            float(((known - model) ** 2).sum())
-            for item in poses
-            for name, (known, model) in shapes[item.pose.name].readings.items()
-            if name.endswith(kind)
-        ]
-        return float(np.sqrt(np.mean(squares))) if squares else None
-
-    return ReadingErrors(rms("force"), rms("moment"))
-
-
-def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArray:
-    """Components across the cable, see `PoseShape.residual`, of gaps (K, d) [m] at s (K,) [m]."""
-    curve, start = prediction.curve, prediction.equilibrium.x[:1]
-    if curve.d == 2:
-        return np.asarray(np.einsum("knd,kd->kn", curve.normals(s), gap)[:, 0])
-    normals = curve.normals(np.concatenate([[0.0], s]))
-    y = Frame.to_world(start, np.array([[0.0, 1.0, 0.0]]))[0]
-    toward, beside = normals[0] @ y
-    turned = np.array([[toward, beside], [-beside, toward]]) / np.hypot(toward, beside)
-    return np.asarray(np.einsum("ij,kjd,kd->ki", turned, normals[1:], gap))
-
-
-def _stage(
-    name: StageName,
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    measured: Sequence[MeasuredPose],
-    parameters: dict[str, ParameterEstimate],
-    rest_curvature: RestCurvatureEstimate,
-    chi2_per_dof: float | None = None,
-    note: str = "",
-    uncertainty: Uncertainty | None = None,
-    fitted: Mapping[str, FloatArray] | None = None,
-    noise: float = 0.0,
-) -> Stage:
-    predictions = predict_poses(model, p, rest, [item.pose for item in measured])
-    others = measured_branches(model, p, rest, measured, predictions, fitted)
-    sides: dict[str, BranchShape] = {}
-    for j, (item, other) in enumerate(zip(measured, others, strict=True)):
-        if other is not None and other.other_side and not item.held_out:
-            # A fit has used on which side the cable of its poses hangs.
-            predictions[j], others[j] = other.prediction, None
-            sides[item.pose.name] = _branch_shape(other, item)
-    shapes = {
-        item.pose.name: replace(
-            pose_shape(prediction, item, other), measured_side=sides.get(item.pose.name)
-        )
-        for prediction, item, other in zip(predictions, measured, others, strict=True)
-        if prediction is not None
-    }
-    if uncertainty is not None:
-        fit = _Fitted(model, p, uncertainty, noise)
-        for item, known, other in zip(measured, predictions, others, strict=True):
-            if known is not None:
-                shapes[item.pose.name] = fit.told(item, known, other, shapes[item.pose.name])
-    lost = [item for item in measured if item.pose.name not in shapes]
-    if lost:
-        names = ", ".join(item.pose.name for item in lost)
-        note = (note + f" No equilibrium for {names}.").strip()
-    on_branch = [
-        prediction if other is None else other.prediction
-        for prediction, other in zip(predictions, others, strict=True)
-    ]
-    return Stage(
-        name,
-        rms_distance(predictions, measured, held_out=False),
-        rms_distance(predictions, measured, held_out=True),
-        chi2_per_dof,
-        parameters,
-        rest_curvature,
-        shapes,
-        note,
-        rms_distance(on_branch, measured, held_out=False),
-        rms_distance(on_branch, measured, held_out=True),
-        tuple(item.pose.name for item in lost if item.held_out and item.readable),
-        _reading_errors(measured, shapes, held_out=False),
-        _reading_errors(measured, shapes, held_out=True),
-    )
+    squares: dict[str, list[float]] = {"force": [], "moment": []}
+    for name in names:
+        for reading, (known, model) in shapes[name].readings.items():
+            squares[reading.split("_")[1]].append(float(((known - model) ** 2).sum()))
+    return ReadingErrors(*(float(np.sqrt(np.mean(x))) if x else None for x in squares.values()))
 
 
 def _no_rest(model: CableModel) -> RestCurvatureEstimate:
@@ -274,8 +262,8 @@ def initial_stage(model: CableModel, measured: Sequence[MeasuredPose]) -> Stage:
         model.names[k]: ParameterEstimate(float(model.nominal[k]), 0.0, "N m^2")
         for k in model.stiffness_indices
     }
-    rest = np.zeros(model.chain.n_rests)
-    return _stage("initial", model, model.nominal, rest, measured, stiffness, _no_rest(model))
+    straight = _Model(model, model.nominal, np.zeros(model.chain.n_rests))
+    return straight.stage("initial", measured, stiffness, _no_rest(model))
 
 
 def stiffness_stage(
@@ -285,14 +273,14 @@ def stiffness_stage(
     p = model.nominal.copy()
     p[model.stiffness_indices] *= found.EI / p[0]
     half = NORMAL_95 * found.log_std
-    known = 2 * half < np.log(IDENTIFIABLE)
-    interval = tuple(float(found.EI * np.exp(x)) if known else None for x in (-half, half))
+    known = bool(2 * half < np.log(IDENTIFIABLE))
+    low, high = (float(found.EI * np.exp(x)) if known else None for x in (-half, half))
     spread = found.EI * min(found.log_std, 1e3)
-    stiffness = ParameterEstimate(
-        found.EI, spread, "N m^2", (interval[0], interval[1]), bool(known)
+    stiffness = ParameterEstimate(found.EI, spread, "N m^2", (low, high), known)
+    straight = _Model(model, p, np.zeros(model.chain.n_rests))
+    return straight.stage(
+        "stiffness_only", measured, {BENDING_STIFFNESS: stiffness}, _no_rest(model)
     )
-    rest, parameters = np.zeros(model.chain.n_rests), {"bending_stiffness": stiffness}
-    return _stage("stiffness_only", model, p, rest, measured, parameters, _no_rest(model))
 
 
 def algorithm1_stage(
@@ -306,15 +294,11 @@ def algorithm1_stage(
         return Stage("algorithm1", None, None, None, {}, _no_rest(model), {}, note)
     h = model.cable.length / (len(result.theta_0) + 1)
     s = (np.arange(len(result.theta_0)) + 1) * h
-    value = np.asarray(result.theta_0) / h
-    return _stage(
+    return _Model(result.model, result.p, result.rest).stage(
         "algorithm1",
-        result.model,
-        result.p,
-        result.rest,
         measured,
-        {"bending_stiffness": ParameterEstimate(result.EI, 0.0, "N m^2")},
-        RestCurvatureEstimate(s, value, np.zeros_like(s)),
+        {BENDING_STIFFNESS: ParameterEstimate(result.EI, 0.0, "N m^2")},
+        RestCurvatureEstimate(s, np.asarray(result.theta_0) / h, np.zeros_like(s)),
         note=result.message,
     )
 
@@ -335,18 +319,14 @@ def fit_stage(
     reported : sequence of str
         Qualified names of the parameters that are effects, not nuisances.
     """
-    return _stage(
+    nodes = {fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used}
+    noise = fit.noise.of_points.beside_hangings
+    return _Model(fit.model, fit.p, fit.rest, uncertainty_of(fit), nodes, noise).stage(
         name,
-        fit.model,
-        fit.p,
-        fit.rest,
         measured,
         fitted_parameters(fit, intervals, reported),
         rest_curvature_of(fit),
         fit.chi2_of_points,
-        uncertainty=uncertainty_of(fit),
-        fitted={fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used},
-        noise=fit.noise.of_points.beside_hangings,
     )
 
 

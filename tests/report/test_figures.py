@@ -19,8 +19,7 @@ from dlo_casadi.report.canvas import save_figure
 from dlo_casadi.report.photographs import write_overlays
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.words import compared
-from dlo_casadi.session.findings import EffectParameter, FoundEffect
-from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.outcome import EffectParameter, FoundEffect, PoseInput
 
 PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"
 CANDIDATES = tuple(
