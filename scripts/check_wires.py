@@ -20,7 +20,7 @@ import numpy as np
 
 from dlo_casadi.config import load_config
 from dlo_casadi.session import run_session
-from dlo_casadi.session.measure import read_poses
+from dlo_casadi.session.measure import measured_poses, read_inputs
 
 ROOT = Path(__file__).resolve().parent.parent
 WIRES = ["white_wire", "black_wire"]
@@ -47,7 +47,7 @@ def main() -> None:
         parser.error(f"no {', '.join(sorted(lost))}: try {', '.join(WIRES)}")
     for name in names:
         config = load_config(ROOT / "configs" / f"{name}.yaml")
-        _, measured = read_poses(config, lambda *_: None)
+        measured = measured_poses(config, read_inputs(config, lambda *_: None))
         table, inside = [], []
         for k in range(len(measured)):
             poses = tuple(

@@ -19,7 +19,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.io.parameters import load_parameters, parameters_hash
 from dlo_casadi.report.parameters_text import fit_dict, shared_fixtures
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.measure import read_poses
+from dlo_casadi.session.measure import measured_poses, read_inputs
 
 BENCH = Path(__file__).parent / "data" / "bench"
 ROOT = Path(__file__).parents[1]
@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 def results(path, folder, n=20):
     """A folder of results of a quick fit that holds parameters.yaml alone."""
     config = load_config(path)
-    _, measured = read_poses(config, lambda *_: None)
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
     declared = declared_model(config)
     model = declared.model.with_mesh(n)
     fit = fit_model(model, measured[:4], declared.tolerances, 3e-4, decades=(0,))

@@ -328,3 +328,8 @@ def stretched(session: Session) -> tuple[Suspicion, ...]:
 
 def _at(point: FloatArray, form: str = ".3f") -> str:
     return f"({', '.join(format(value, form) for value in point)})"
+
+
+# Of these only the first one that finds anything is told; and those that are told beside others.
+ENDS = (wrong_units, counted_from_the_end, wrong_frame, out_of_step, single_poses)
+POINTS = (repeated, stretched)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
 from dlo_casadi.estimation.variances import first_reading_noise, refine
-from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel, Tolerances
 from dlo_casadi.paper.algorithm1 import Algorithm1Result, applies, run_algorithm1
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import SIMPLER, Stage
@@ -30,7 +31,17 @@ from dlo_casadi.session.stages import algorithm1_stage, initial_stage, stiffness
 
 # Elements of the declared model's mesh; refined from the data.
 MESH = 40
+# The search over decades of stiffness runs on this mesh; in space, where an element takes 17
+# times the operations, on half of it.
+FIRST_MESH = 20
 REST_COEFFICIENTS = 13
+# Markers that are nearer to each other than this share of the cable are at one place.
+SAME_PLACE = 0.02
+# Share of the objective by which IPOPT's minimum may lie higher and be the same: it stops once the
+# points' places along the cable move by a thousandth of the noise. 1.5e-7 is the most of ten fits.
+SAME_MINIMUM = 1e-6
+# Huber's constant: points beyond it count with their distance instead of its square.
+HUBER = 1.5
 
 
 @dataclass(frozen=True)
@@ -139,18 +150,6 @@ def straight(model: CableModel) -> CableModel:
     return replace(model, cable=replace(model.cable, straight=True), effects=(), priors={})
 
 
-# The search over decades of stiffness runs on this mesh; in space, where an element takes 17
-# times the operations, on half of it.
-FIRST_MESH, FIRST_MESH_IN_SPACE = 20, 10
-# Markers that are nearer to each other than this share of the cable are at one place.
-SAME_PLACE = 0.02
-# Share of the objective by which IPOPT's minimum may lie higher and be the same: it stops once the
-# points' places along the cable move by a thousandth of the noise. 1.5e-7 is the most of ten fits.
-SAME_MINIMUM = 1e-6
-# Huber's constant: points beyond it count with their distance instead of its square.
-HUBER = 1.5
-
-
 def fit_declared(
     config: Config, declared: Declared, measured: Sequence[MeasuredPose], n: int | None = None
 ) -> tuple[Fit, float]:
@@ -181,7 +180,7 @@ def fit_declared(
 
 def first_mesh(model: CableModel) -> int:
     """Number of elements on which stiffnesses and shapes are searched for."""
-    return FIRST_MESH_IN_SPACE if model.in_space else FIRST_MESH
+    return FIRST_MESH // len(model.node.curvatures)
 
 
 def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) -> int:
@@ -201,21 +200,22 @@ def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) ->
     return max(min(count, 2), count - (model.start, model.end).count("clamped"))
 
 
-@dataclass(frozen=True)
-class Minimum:
-    """Minimum of the batch NLP as IPOPT has found it, None where it fails, and its time [s]."""
+class Minimum(NamedTuple):
+    """Minimum of the batch NLP as IPOPT has found it, and its time [s].
 
-    point: Point | None
-    seconds: float
+    None where it fails; it is not `searched` for in space, where third derivatives of all elements
+    would cost IPOPT minutes a run.
+    """
+
+    point: Point | None = None
+    seconds: float = 0.0
+    searched: bool = True
 
 
 def minimum_by_ipopt(fit: Fit) -> Minimum:
-    """Minimum of the batch NLP, from the Gauss-Newton fit's; none is looked for in space.
-
-    Third derivatives of all elements would cost IPOPT minutes a run there.
-    """
+    """Minimum of the batch NLP, from the Gauss-Newton fit's; none is looked for in space."""
     if fit.model.in_space:
-        return Minimum(None, 0.0)
+        return Minimum(searched=False)
     began = time.perf_counter()
     try:
         point = solve_batch(fit.problem, fit.point).point
@@ -232,7 +232,7 @@ def confirmed(fit: Fit, found: Minimum) -> Fit:
     higher, the fit stays as it is.
     """
     point, own = found.point, fit.point.objective
-    if fit.model.in_space:
+    if not found.searched:
         return fit
     if point is None:
         return replace(fit, converged=False)
@@ -335,22 +335,20 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
     stages : sequence of Stage
         The simpler ones, and at last the fit's own.
     """
-    best, own = fit, stages[-1]
-    for stage in stages[:-1]:
+    *others, own = stages
+    best = fit
+    for stage in others:
         if stage.name in SIMPLER:
-            better = not fit.converged or predicts_better(stage, own)
-            found = _from_simpler(fit, stage.parameters["bending_stiffness"].value, better)
+            better = not fit.converged or _off(stage) < _off(own)
+            found = _from_simpler(fit, stage.parameters[BENDING_STIFFNESS].value, better)
             best = max(best, found, key=lambda item: item.log_evidence)
     return best
 
 
-def predicts_better(stage: Stage, other: Stage) -> bool:
-    """Whether a stage comes nearer to the fit poses, each on the branch where it was measured."""
-    errors = [
-        np.inf if item.rmse_fit_measured_branch is None else item.rmse_fit_measured_branch
-        for item in (stage, other)
-    ]
-    return bool(errors[0] < errors[1])
+def _off(stage: Stage) -> float:
+    """Error [m] of the fit poses, each on the branch where it was measured."""
+    error = stage.rmse_fit_measured_branch
+    return np.inf if error is None else error
 
 
 def _from_simpler(fit: Fit, stiffness: float, better: bool) -> Fit:

@@ -28,25 +28,6 @@ READERS = 2
 MOST_POINTS = 240
 
 
-def read_poses(
-    config: Config, step: Callable[[str, int, int], None]
-) -> tuple[tuple[PoseInput, ...], tuple[MeasuredPose, ...]]:
-    """Read all poses in the order in which they were taken.
-
-    Raises
-    ------
-    MeasurementError
-        If no fit pose can be read; its text lists the reasons.
-
-    See Also
-    --------
-    read_inputs : the first half, which raises nothing.
-    measured_poses : the second half.
-    """
-    inputs = read_inputs(config, step)
-    return inputs, measured_poses(config, inputs)
-
-
 def read_inputs(config: Config, step: Callable[[str, int, int], None]) -> tuple[PoseInput, ...]:
     """Read all poses; one that cannot be read keeps its name and says why.
 
@@ -157,21 +138,13 @@ def _read_csv(config: Config, pose: DeclaredPose) -> PoseInput:
 
 def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
     """Photographs of a cable in space; those that cannot be used are told of."""
-    measurement = config.experiment.measurement
-    assert measurement.kind == "images"
-    assert measurement.camera is not None  # found before, see `calibrated`
     images, problems = {}, []
     for name, path in pose.photographs.items():
         try:
             images[name] = vision.read_image(path)
         except MeasurementError as error:
             problems.append(f"{name}: {error.message}")
-    views = vision.measure_views(
-        images,
-        board_of(measurement),
-        _camera(measurement.camera),
-        _held(config, pose),
-    )
+    views = vision.measure_views(images, *_equipment(config), _held(config, pose))
     problems += views.problems.values()
     if not views.curves:
         raise MeasurementError(" ".join([*problems, *views.messages]))
@@ -233,10 +206,10 @@ def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
     VisionError
         If none of its photographs can be read.
     """
-    if _reader(config, pose) is _read_csv:
+    reader = _reader(config, pose)
+    if reader is _read_csv:
         return {}
-    measurement, cable = config.experiment.measurement, _held(config, pose)
-    assert measurement.kind == "images"
+    cable = _held(config, pose)
     drawn: dict[str, np.ndarray] = {}
     unread = None
     for name, path in pose.photographs.items():
@@ -247,10 +220,8 @@ def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
             continue
         workings = vision.Workings()
         with suppress(MeasurementError):  # the pictures show how far it came; the table says why
-            if config.experiment.in_space:
-                assert measurement.camera is not None
-                camera = _camera(measurement.camera)
-                viewpoint = vision.locate_camera(image, board_of(measurement), camera)
+            if reader is _read_views:
+                viewpoint = vision.locate_camera(image, *_equipment(config))
                 vision.see_cable(image, viewpoint, cable, workings)
             else:
                 vision.extract_centerline(image, view_of(config, image), cable, workings)
@@ -287,12 +258,18 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
     """Where the photograph's pixels lie on the cable's plane."""
     measurement = config.experiment.measurement
     assert measurement.kind == "images"
-    if measurement.reference is not None:
-        pixels = np.array(measurement.reference.pixels)
-        _check_reference(pixels, image.shape)
-        return vision.from_reference(pixels, measurement.reference.points, image.shape)
-    camera = None if measurement.camera is None else _camera(measurement.camera)
-    return vision.locate_board(image, board_of(measurement), camera)
+    if measurement.reference is None:
+        camera = None if measurement.camera is None else _camera(measurement.camera)
+        return vision.locate_board(image, board_of(measurement), camera)
+    pixels, (height, width) = np.array(measurement.reference.pixels), image.shape[:2]
+    for u, v in pixels:
+        if not (0 <= u < width and 0 <= v < height):
+            raise MeasurementError(
+                f"the reference point ({u:g}, {v:g}) px lies outside of the picture of {width} x "
+                f"{height} px. Try: was the picture turned by 90 degrees or made smaller since "
+                "the pixels were read?"
+            )
+    return vision.from_reference(pixels, measurement.reference.points, image.shape)
 
 
 def board_of(measurement: Images) -> vision.Board:
@@ -308,16 +285,12 @@ def _camera(declared: DeclaredCamera) -> vision.Camera:
     return vision.Camera(np.array(declared.matrix), np.array(declared.distortion))
 
 
-def _check_reference(pixels: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Raise if a reference point lies outside of the photograph."""
-    height, width = shape[:2]
-    for u, v in pixels:
-        if not (0 <= u < width and 0 <= v < height):
-            raise MeasurementError(
-                f"the reference point ({u:g}, {v:g}) px lies outside of the picture of {width} x "
-                f"{height} px. Try: was the picture turned by 90 degrees or made smaller since "
-                "the pixels were read?"
-            )
+def _equipment(config: Config) -> tuple[vision.Board, vision.Camera]:
+    """Board and camera of photographs of a cable in space; `calibrated` has found the camera."""
+    measurement = config.experiment.measurement
+    assert measurement.kind == "images"
+    assert measurement.camera is not None
+    return board_of(measurement), _camera(measurement.camera)
 
 
 # Relative standard deviation of the focal length from which on a session's own photographs tell
@@ -326,15 +299,17 @@ def _check_reference(pixels: np.ndarray, shape: tuple[int, ...]) -> None:
 _UNKNOWN = 0.02
 
 
-def needs_camera(config: Config) -> bool:
-    """Whether photographs are to be measured that cannot be without a camera, and none is given.
+def needs_camera(config: Config) -> str:
+    """Why photographs cannot be measured without a camera where none is given; empty if they can.
 
     In a plane the board's own plane can; a standoff from it cannot.
     """
     measurement = config.experiment.measurement
     if measurement.kind != "images" or measurement.board is None or measurement.camera is not None:
-        return False
-    return config.experiment.in_space or measurement.board.standoff != 0.0
+        return ""
+    if config.experiment.in_space:
+        return "in space"
+    return "with a standoff from the board" if measurement.board.standoff else ""
 
 
 def calibrated(config: Config, step: Callable[[str, int, int], None]) -> Config:
@@ -350,14 +325,14 @@ def calibrated(config: Config, step: Callable[[str, int, int], None]) -> Config:
     MeasurementError
         If they do not show it.
     """
-    if not needs_camera(config):
+    why = needs_camera(config)
+    if not why:
         return config
     try:
         found = calibrate_session(config, step)
         if found.focal_uncertainty > _UNKNOWN:
             raise MeasurementError("; ".join(found.advice))
     except MeasurementError as error:
-        why = "in space" if config.experiment.in_space else "with a standoff from the board"
         raise MeasurementError(
             f"measurement.camera is missing, photographs of a cable {why} need it, and they "
             f"do not show it themselves: {error.message}"
@@ -366,11 +341,10 @@ def calibrated(config: Config, step: Callable[[str, int, int], None]) -> Config:
     camera = DeclaredCamera.model_validate(
         {"matrix": matrix, "distortion": tuple(found.camera.distortion.tolist())}
     )
-    experiment = config.experiment
-    measurement = experiment.measurement.model_copy(update={"camera": camera})
+    measurement = config.experiment.measurement.model_copy(update={"camera": camera})
     return replace(
         config,
-        experiment=experiment.model_copy(update={"measurement": measurement}),
+        experiment=config.experiment.model_copy(update={"measurement": measurement}),
         warnings=(*config.warnings, f"no camera is declared: {summary(found)}", *found.advice),
     )
 

@@ -23,15 +23,7 @@ from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.clamps import Compared, misread, wrong_directions
-from dlo_casadi.session.ends import (
-    counted_from_the_end,
-    out_of_step,
-    repeated,
-    single_poses,
-    stretched,
-    wrong_frame,
-    wrong_units,
-)
+from dlo_casadi.session.ends import ENDS, POINTS
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hypotheses import (
     Hypothesis,
@@ -426,7 +418,7 @@ def _angle(pull: FloatArray | None, way: FloatArray) -> float:
 # only one. What a group finds certain is the last; poses that it doubts are left out of the next.
 Question = Callable[[Session], tuple[Suspicion, ...]]
 QUESTIONS: tuple[tuple[tuple[Question, ...], ...], ...] = (
-    ((wrong_units, counted_from_the_end, wrong_frame, out_of_step, single_poses),),
-    ((repeated,), (stretched,), (wrong_directions,)),
+    (ENDS,),
+    (*((ask,) for ask in POINTS), (wrong_directions,)),
     ((wrong_readings,), (ends_exchanged, hangs_elsewhere)),
 )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib.metadata import version
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from dlo_casadi.runtime.executors import InProcess, one_thread
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import (
+    Minimum,
     confirmed,
     declared_model,
     first_mesh,
@@ -64,49 +65,38 @@ class Progress(Protocol):
     def step(self, name: str, done: int, total: int) -> None:
         """`done` of `total` parts of the named work are finished."""
 
-    def message(self, text: str) -> None:
-        """Something worth a line."""
 
-
-@dataclass
 class Silent:
     """Progress that nobody watches."""
-
-    lines: list[str] = field(default_factory=list)
 
     def step(self, name: str, done: int, total: int) -> None:
         """Ignore."""
 
-    def message(self, text: str) -> None:
-        """Keep the line."""
-        self.lines.append(text)
+
+TIMED = ("vision", "algorithm1", "batch", "diagnosis")
 
 
 class Clock:
-    """Wall-clock time per part of the run; parts that run beside one another both count."""
+    """Wall-clock time [s] per part of the run; parts that run beside one another both count."""
 
     def __init__(self) -> None:
-        self._begin = time.perf_counter()
-        self.parts: dict[str, float] = {}
-        self._last = self._begin
+        self._begin = self._last = time.perf_counter()
+        self.parts = dict.fromkeys(TIMED, 0.0)
 
     def lap(self, name: str) -> None:
         """Add the time since the last lap to the named part."""
         now = time.perf_counter()
-        self.parts[name] = self.parts.get(name, 0.0) + now - self._last
+        self.add(name, now - self._last)
         self._last = now
 
     def add(self, name: str, seconds: float) -> None:
-        """Add the time [s] that a named part has taken beside others."""
-        self.parts[name] = self.parts.get(name, 0.0) + seconds
+        """Add the time [s] that a named part has taken beside others; only some are told."""
+        if name in self.parts:
+            self.parts[name] += seconds
 
     def total(self) -> dict[str, float]:
         """All parts and the total [s]."""
-        parts = {key: self.parts.get(key, 0.0) for key in TIMED}
-        return {**parts, "total": time.perf_counter() - self._begin}
-
-
-TIMED = ("vision", "algorithm1", "batch", "diagnosis")
+        return {**self.parts, "total": time.perf_counter() - self._begin}
 
 
 def run_session(
@@ -154,7 +144,9 @@ def fit_session(
     measured = measured_poses(config, inputs)
     clock.lap("vision")
     warnings = [*config.warnings, *reading_warnings(inputs, config.skipped), *odd]
-    declared = declared_model(config, _center(inputs), _pixel(inputs))
+    center = _center(inputs)
+    pixels = [item.pixel for item in inputs if item.pixel is not None]
+    declared = declared_model(config, center, float(np.median(pixels)) if pixels else None)
 
     progress.step("fit the declared model", 0, 1)
     n, refined = config.model.n or first_mesh(declared.model), None
@@ -178,34 +170,35 @@ def fit_session(
     simpler, stages = compared()
     if fit.model.n != n:
         stages = simpler.stages(measured, fit.model.n)
-    found = confirming()
     clock.add("algorithm1", simpler.seconds)
-    clock.add("batch", found.seconds)
-    best = confirmed(fit, found)
-    if best.point is not fit.point:
-        own = staged(best)
+    best = _confirmed(fit, confirming, clock)
+    own = own if best.point is fit.point else staged(best)
     fit = not_worse(best, [*stages, own])
     if not config.diagnosis.enabled:
         fit = as_measured(fit)
-    if fit is not best:
-        own = staged(fit)
+    stages = [*stages, own if fit is best else staged(fit)]
     progress.step("compare with simpler fits", 1, 1)
     clock.lap("fit")
-    outcome = Outcome(
-        config=config,
-        poses=tuple(inputs),
-        measurement=_summary(config, inputs, measured, fit),
-        stages=(*stages, own),
-        discretization=Discretization(fit.model.n, fit.model.element, error),
-        repeatability=Repeatability.of(fit),
-        timing=clock.total(),
-        fit=fit,
-        warnings=tuple(warnings),
-        versions=versions(),
+    found: dict[str, Any] = {}
+    if config.diagnosis.enabled:
+        fit, error, found = close_the_loop(
+            config, fit, stages, measured, reported, center, clock, progress, executor
+        )
+    return judged(
+        Outcome(
+            config=config,
+            poses=tuple(inputs),
+            measurement=_summary(config, inputs, measured, fit),
+            stages=tuple(stages),
+            discretization=Discretization(fit.model.n, fit.model.element, error),
+            repeatability=Repeatability.of(fit),
+            timing=clock.total(),
+            fit=fit,
+            warnings=tuple(warnings),
+            versions=versions(),
+            **found,
+        )
     )
-    if not config.diagnosis.enabled:
-        return judged(outcome)
-    return close_the_loop(outcome, measured, reported, _center(inputs), clock, progress, executor)
 
 
 def judged(outcome: Outcome) -> Outcome:
@@ -226,44 +219,56 @@ def judged(outcome: Outcome) -> Outcome:
 
 
 def close_the_loop(
-    outcome: Outcome,
+    config: Config,
+    declared: Fit,
+    stages: list[Stage],
     measured: Sequence[MeasuredPose],
     reported: Sequence[str],
     center: tuple[float, float] | None,
     clock: Clock,
     progress: Progress,
     executor: Executor,
-) -> Outcome:
+) -> tuple[Fit, float, dict[str, Any]]:
     """Diagnose the declared model's residual and add what is missing.
 
     Parameters
     ----------
+    declared : Fit
+        Of the declared model.
+    stages : list of Stage
+        Its stage, the last one, gets its intervals; another one follows where effects are added.
     reported : sequence of str
         Parameters of effects that the configuration declares.
+
+    Returns
+    -------
+    fit : Fit
+    error : float [m]
+        Of its mesh.
+    found : dict
+        What an `Outcome` holds of the diagnosis, by its fields.
     """
-    options = outcome.config.diagnosis
-    searched = outcome.fit
-    if searched.model.n > SEARCH_MESH and not outcome.config.model.n:
-        searched = refine_mesh(searched, SEARCH_MESH)
+    options, kept_mesh = config.diagnosis, config.model.n is not None
+    fine = declared.model.n > SEARCH_MESH and not kept_mesh
     diagnosis = diagnose(
-        searched,
+        refine_mesh(declared, SEARCH_MESH) if fine else declared,
         center=center,
         exclude=options.exclude,
         significance=options.significance,
         max_effects=options.max_effects,
         step=progress.step,
         executor=executor,
-        finest=None if outcome.config.model.n else SEARCH_MESH,
+        finest=None if kept_mesh else SEARCH_MESH,
     )
-    fit, stages = diagnosis.after, list(outcome.stages)
-    if outcome.config.model.n:
+    fit = diagnosis.after
+    if kept_mesh:
         error = mesh_error(fit)
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     confirming = begin(executor, minimum_by_ipopt, fit) if diagnosis.added else None
     next_pose = separating_pose(diagnosis) if diagnosis.added else None
     if diagnosis.added or diagnosis.unexplained:
-        parameters = fitted_parameters(outcome.fit, profile_intervals(outcome.fit), reported)
+        parameters = fitted_parameters(declared, profile_intervals(declared), reported)
         stages[-1] = replace(stages[-1], parameters=parameters)
     else:
         # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
@@ -273,35 +278,33 @@ def close_the_loop(
         labels = {item.candidate.effect.label for item in diagnosis.added}
         names = [*reported, *_parameters_of(labels, fit.model)]
         own = fit_stage("closed", fit, measured, profile_intervals(fit), names)
-        found = confirming()
-        clock.add("batch", found.seconds)
-        best = as_measured(confirmed(fit, found))
+        best = as_measured(_confirmed(fit, confirming, clock))
         if best.point is not fit.point:
             own = fit_stage("closed", best, measured, profile_intervals(best), names)
         fit = best
         stages.append(own)
-    mesh = Discretization(fit.model.n, fit.model.element, error)
     diagnosis = replace(diagnosis, after=fit)
     validated = diagnosis.validation_after
+    told = validated.complete and not diagnosis.added
     clock.lap("diagnosis")
-    closed = replace(
-        outcome,
-        fit=fit,
-        measurement=_summary(outcome.config, outcome.poses, measured, fit),
-        stages=tuple(stages),
-        discretization=mesh,
-        repeatability=Repeatability.of(fit),
-        timing=clock.total(),
-        verdict=diagnosis.verdict,
-        effects=found_effects(diagnosis),
-        candidates=diagnosis.ranked,
-        unexplained=diagnosis.pull,
-        next_pose=next_pose,
-        structure=(diagnosis.structure_before, diagnosis.structure_after),
-        cross_validated=validated.rmse if validated.complete and not diagnosis.added else None,
-        hidden_weight=diagnosis.weight,
-    )
-    return judged(closed)
+    found = {
+        "verdict": diagnosis.verdict,
+        "effects": found_effects(diagnosis),
+        "candidates": diagnosis.ranked,
+        "unexplained": diagnosis.pull,
+        "next_pose": next_pose,
+        "structure": (diagnosis.structure_before, diagnosis.structure_after),
+        "cross_validated": validated.rmse if told else None,
+        "hidden_weight": diagnosis.weight,
+    }
+    return fit, error, found
+
+
+def _confirmed(fit: Fit, confirming: Callable[[], Minimum], clock: Clock) -> Fit:
+    """A fit held against the minimum that IPOPT has found meanwhile."""
+    found = confirming()
+    clock.add("batch", found.seconds)
+    return confirmed(fit, found)
 
 
 def versions() -> dict[str, str]:
@@ -312,15 +315,8 @@ def versions() -> dict[str, str]:
 
 def _center(inputs: Sequence[PoseInput]) -> tuple[float, float] | None:
     centers = [item.center for item in inputs if item.center is not None]
-    if not centers:
-        return None
-    x, y = np.mean(centers, axis=0).tolist()
-    return x, y
-
-
-def _pixel(inputs: Sequence[PoseInput]) -> float | None:
-    sizes = [item.pixel for item in inputs if item.pixel is not None]
-    return float(np.median(sizes)) if sizes else None
+    x, y = np.mean(centers or [(np.nan, np.nan)], axis=0).tolist()
+    return (x, y) if centers else None
 
 
 def _parameters_of(labels: set[str], model: CableModel) -> list[str]:

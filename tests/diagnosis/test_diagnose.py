@@ -23,7 +23,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.measure import read_poses
+from dlo_casadi.session.measure import measured_poses, read_inputs
 
 BENCH = Path(__file__).resolve().parents[1] / "data" / "bench"
 
@@ -32,7 +32,7 @@ BENCH = Path(__file__).resolve().parents[1] / "data" / "bench"
 def session():
     """Declared model and measured poses of a clamped, free cable that softens."""
     config = load_config(BENCH / "overhang" / "session.yaml")
-    _, measured = read_poses(config, lambda *_: None)
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
     return declared_model(config), measured
 
 
@@ -96,7 +96,7 @@ def test_without_the_cause_nothing_false_is_claimed(fit):
 )
 def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
     config = load_config(BENCH / name / "session.yaml")
-    _, measured = read_poses(config, lambda *_: None)
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
     declared = declared_model(config)
     model = declared.model.with_mesh(20)
     start = fit_of((declared, measured), std=config.experiment.measurement.std)
@@ -118,7 +118,7 @@ def test_effects_that_do_not_predict_a_pose_left_out_are_no_explanation(monkeypa
     monkeypatch.setattr(module, "estimate_pull", lambda *_: None)  # half a minute, not needed
     tried = {"stiffness_gradient", "gravity_tilt"}
     config = load_config(BENCH / "stretch" / "session.yaml")
-    _, measured = read_poses(config, lambda *_: None)
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
     fit = fit_of((declared_model(config), measured), std=config.experiment.measurement.std)
     found = diagnose(fit, exclude=tuple(set(EFFECTS) - tried))
     assert found.verdict == "unexplained"

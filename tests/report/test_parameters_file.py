@@ -20,7 +20,7 @@ from dlo_casadi.io.parameters import load_parameters, parameters_hash
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.report.parameters_text import final_rest, fit_dict, parameters_text
 from dlo_casadi.session.fitting import declared_model, minimum_by_ipopt
-from dlo_casadi.session.measure import read_poses
+from dlo_casadi.session.measure import measured_poses, read_inputs
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def file(outcome, tmp_path_factory):
 def fitted(name, *effects, n=20):
     """A quick fit of a bench session with more effects than declared."""
     config = load_config(BENCH / name / "session.yaml")
-    _, measured = read_poses(config, lambda *_: None)
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
     declared = declared_model(config)
     model = declared.model.with_mesh(n)
     for effect in effects:
@@ -43,7 +43,7 @@ def fitted(name, *effects, n=20):
 
 def test_a_cable_in_space_is_rebuilt_exactly(outcome, tmp_path):
     config = load_config(CONFIGS / "markers_in_space.yaml")
-    _, measured = read_poses(config, lambda *_: None)
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
     declared = declared_model(config)
     model = declared.model.with_mesh(8)
     fit = fit_model(model, measured[:3], declared.tolerances, 3e-4, decades=(0,))

@@ -34,11 +34,11 @@ def poses_of(model):
     return [Pose((0.0, 0.0, 0.0), end, **held, name=str(end)) for end in ends]
 
 
-def hangings(model, p, poses, scatter, marked, rng):
-    """Measured poses whose ends are off by a scatter (d,) [m] each."""
+def hangings(model, p, poses, scatter, marked, rng, near=None):
+    """Measured poses whose ends are off by a scatter (d,) [m] each, near known equilibria."""
     ends = [pose.end + scatter * rng.normal(size=len(scatter)) for pose in poses]
     there = [replace(pose, end=tuple(end)) for pose, end in zip(poses, ends, strict=True)]
-    found = predict_poses(model, p, np.zeros(model.chain.n_rests), there)
+    found = predict_poses(model, p, np.zeros(model.chain.n_rests), there, near)
     s = S if marked else None
     return [
         MeasuredPose.of_points(
@@ -61,12 +61,13 @@ def test_expected_distances_are_those_of_drawn_hangings(model, marked):
     stage = fit_stage("batch", fit, fit.problem.history, {})
     expected = np.array([stage.shapes[pose.name].expected for pose in poses])
     scatter = np.array([uncertainty_of(fit).scatter[f"end_{axis}"] for axis in "xyz"[:d]])
-    curves = [x.curve for x in predict_poses(model, fit.p, fit.rest, poses)]
+    predicted = predict_poses(model, fit.p, fit.rest, poses)
+    curves, near = zip(*((x.curve, x.equilibrium.x) for x in predicted), strict=True)
     ratio = []
     for score in rng.normal(size=DRAWN):  # no end holds a twist, so that EI alone acts
         p = fit.p.copy()
         p[0] += score * fit.std("bending_stiffness")
-        drawn = hangings(model, p, poses, scatter, marked, rng)
+        drawn = hangings(model, p, poses, scatter, marked, rng, near)
         distances = [item.distances(curve) for item, curve in zip(drawn, curves, strict=True)]
         ratio.append(np.mean((np.array(distances) / expected) ** 2))
     # Three standard errors of their mean, and a hundredth for what is not linear.

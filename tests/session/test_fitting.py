@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -25,7 +25,9 @@ def test_a_declared_mesh_is_kept_and_its_error_told():
     config = load_config(BENCH / "short_clean" / "session.yaml")
     coarse = config.model.model_copy(update={"n": 6})
     estimation = config.estimation.model_copy(update={"algorithm1": False})
-    outcome = run_session(replace(config, model=coarse, estimation=estimation))
+    diagnosis = config.diagnosis.model_copy(update={"exclude": tuple(EFFECTS)})
+    config = replace(config, model=coarse, estimation=estimation, diagnosis=diagnosis)
+    outcome = run_session(config)
     assert outcome.discretization.n == 6
     (warning,) = [text for text in outcome.warnings if "mesh" in text]
     assert f"{1e3 * outcome.discretization.error:.3g} mm" in warning

@@ -72,7 +72,7 @@ def test_a_curved_cable_between_ball_joints_is_no_mistake(curved, monkeypatch):
     assert plausibility.find_suspicions(*curved) == ()
 
 
-@pytest.mark.parametrize(("gravity", "count"), [((0.0, 0.0, 9.81), 2), ((0.0, -9.81, 0.0), 4)])
+@pytest.mark.parametrize(("gravity", "count"), [((0.0, 0.0, 9.81), 2), ((0.0, -9.81, 0.0), 3)])
 def test_gravity_along_another_axis_is_named_of_few_poses(curved, gravity, count):
     config, inputs = curved
     (found,) = plausibility.find_suspicions(under(config, gravity), inputs[:count])

@@ -7,7 +7,7 @@ import pytest
 from dlo_casadi.config import load_config
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model, simpler_fits
-from dlo_casadi.session.measure import read_poses
+from dlo_casadi.session.measure import measured_poses, read_inputs
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
 
@@ -15,7 +15,7 @@ BENCH = Path(__file__).parents[1] / "data" / "bench"
 @pytest.fixture(scope="module")
 def session():
     config = load_config(BENCH / "short_clean" / "session.yaml")
-    _, measured = read_poses(config, lambda *_: None)
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
     few = [item for item in measured if not item.held_out][:3]
     return config.estimation, declared_model(config).model, few
 

@@ -13,7 +13,7 @@ from dlo_casadi.config import DeclaredEffect, load_config
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.measure import read_poses
+from dlo_casadi.session.measure import measured_poses, read_inputs
 from dlo_casadi.session.outcome import effect_parameters
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,7 +47,7 @@ def test_stiffness_and_effects_are_those_of_the_truth(name):
     true = true_effects(name)
     effects = tuple(declared_effect(*item) for item in true.items())
     config = replace(config, model=config.model.model_copy(update={"effects": effects}))
-    _, measured = read_poses(config, lambda *_: None)
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
     declared = declared_model(config)
     fit = fit_model(
         declared.model.with_mesh(FINER.get(name, MESH)),
