@@ -52,7 +52,8 @@ def pose_shape(
 ) -> PoseShape:
     """One predicted pose beside its measured points."""
     curve, eq = prediction.curve, prediction.equilibrium
-    s, gap = np.zeros(0), np.zeros((0, curve.d))
+    s: FloatArray = np.zeros(0)
+    gap: FloatArray = np.zeros((0, curve.d))
     if item.has_line:
         s = item.traced.nearest(curve)
         gap = item.traced.points - curve.at(s)
@@ -124,7 +125,8 @@ class _Model:
             if other is not None and other.other_side and not item.held_out:
                 # A fit has used on which side the cable of its poses hangs.
                 side = _branch_shape(other, item)
-                predictions[j], others[j] = known, other = other.prediction, None
+                known, other = other.prediction, None
+                predictions[j], others[j] = known, other
             if known is not None:
                 shape = replace(pose_shape(known, item, other), measured_side=side)
                 shapes[item.pose.name] = self._told(item, known, other, shape)
@@ -168,7 +170,8 @@ class _Model:
             self.uncertainty,
             np.concatenate([places, shape.s]),
         )
-        expected = missed = np.zeros(0)
+        expected: FloatArray = np.zeros(0)
+        missed = expected
         if len(shape.s):
             line = item.traced
 

@@ -35,6 +35,7 @@ POSES = {
     "higher": (3.6, 0.5, "fit"),
     "low": (2.6, 0.5, "fit"),
     "a": (0.3, 0.0, "fit"),
+    "b": (-1.2, 0.0, "fit"),
     "even": (None, 0.5, "held_out"),
     "usual": (2.5, 0.5, "held_out"),
     "other": (3.5, 0.5, "held_out"),
