@@ -8,10 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, Camera, View, Viewpoint
+from dlo_casadi.vision.camera import Array, Camera, Picture, View, Viewpoint
 from dlo_casadi.vision.image import spoilt
 
 MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
@@ -58,7 +57,7 @@ class Board:
         return np.asarray(self.marker_centers[marker], float) + square
 
 
-def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None = None) -> View:
+def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> View:
     """Find the board and return the view of the cable's plane.
 
     With a camera, the pose (R, t) of the board minimises the reprojection error of all corners
@@ -93,7 +92,7 @@ def locate_board(image: NDArray[np.uint8], board: Board, camera: Camera | None =
     return View(homography=cable, camera=camera, **seen)
 
 
-def locate_camera(image: NDArray[np.uint8], board: Board, camera: Camera) -> Viewpoint:
+def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
     """Find the board and return where the camera stands before it.
 
     The pose (R, t) minimises the reprojection error of all corners of all visible markers.
@@ -155,7 +154,7 @@ class _Fit:
 
 
 def _located(
-    image: NDArray[np.uint8], board: Board, camera: Camera | None, least: int = 0
+    image: Picture, board: Board, camera: Camera | None, least: int = 0
 ) -> tuple[_Fit, dict[str, Any]]:
     """Fit of the markers that agree with their declared places, and the fields of a Photograph."""
     seen, repeated = detect_markers(image, board)
@@ -264,7 +263,7 @@ def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) ->
     return ""
 
 
-def detect_markers(image: NDArray[np.uint8], board: Board) -> tuple[dict[int, Array], set[int]]:
+def detect_markers(image: Picture, board: Board) -> tuple[dict[int, Array], set[int]]:
     """Corners (4, 2) [px] of the board's markers, and the numbers that are seen more than once."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:
@@ -273,7 +272,7 @@ def detect_markers(image: NDArray[np.uint8], board: Board) -> tuple[dict[int, Ar
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
 
-    def markers(picture: NDArray[np.uint8]) -> dict[int, list[Array]]:
+    def markers(picture: Picture) -> dict[int, list[Array]]:
         """Corners of all markers by their numbers, once for each time one is seen."""
         quads, numbers, _ = detector.detectMarkers(picture)
         found: dict[int, list[Array]] = {}
@@ -297,7 +296,7 @@ def detect_markers(image: NDArray[np.uint8], board: Board) -> tuple[dict[int, Ar
     return single, set(ours) - set(single)
 
 
-def _refine(grey: NDArray[np.uint8], quad: Array) -> Array:
+def _refine(grey: Picture, quad: Array) -> Array:
     """Corners of a black square on white as the intersections of its four straight sides.
 
     Corner detectors look for saddles; on the L of a blurred square they are pulled inwards by
@@ -314,7 +313,7 @@ def _refine(grey: NDArray[np.uint8], quad: Array) -> Array:
     return corners if jump < 0.1 * size else np.asarray(quad, float)
 
 
-def _side(grey: NDArray[np.uint8], a: Array, b: Array) -> tuple[Array, Array]:
+def _side(grey: Picture, a: Array, b: Array) -> tuple[Array, Array]:
     """Line (point, direction) along the step from black (right of a -> b) to white (left)."""
     length = float(np.linalg.norm(b - a))
     along = (b - a) / length

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import (
@@ -17,7 +17,7 @@ from dlo_casadi.vision.board import (
     Board,
     detect_markers,
 )
-from dlo_casadi.vision.camera import Array, Camera
+from dlo_casadi.vision.camera import Array, Camera, Picture
 
 _LEAST_PHOTOGRAPHS = 3  # each gives two equations for the five numbers of the matrix
 _GOOD_FOCAL = 0.005  # relative std of the focal length: 0.5 % of every length along the view
@@ -41,33 +41,22 @@ _LENSES = {
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera and how well it is known.
-
-    Parameters
-    ----------
-    camera : Camera
-        Matrix [px] and distortion k1, k2, p1, p2, k3.
-    matrix_std : (4,) [px]
-        Standard deviations of fx, fy, cx, cy.
-    spread : scalar [degrees]
-        Between the most different directions from which photographs were taken.
-    reprojection_error : scalar [px]
-        Root mean square over all corners.
-    errors : dict of str to scalar [px]
-        The same for each photograph that was used.
-    problems : dict of str to str
-        Photographs that were not used, and why.
-    advice : tuple of str
-        How to do better; empty where nothing is missing.
-    """
+    """A camera and how well it is known."""
 
     camera: Camera
+    """Matrix [px] and distortion k1, k2, p1, p2, k3."""
     matrix_std: Array
+    """Standard deviations (4,) [px] of fx, fy, cx, cy."""
     spread: float
+    """Degrees between the most different directions from which photographs were taken."""
     reprojection_error: float
+    """Root mean square [px] over all corners."""
     errors: Mapping[str, float]
+    """The same for each photograph that was used."""
     problems: Mapping[str, str]
+    """Photographs that were not used, and why."""
     advice: tuple[str, ...]
+    """How to do better; empty where nothing is missing."""
 
     @property
     def focal_uncertainty(self) -> float:
@@ -75,7 +64,7 @@ class Calibration:
         return float(max(self.matrix_std[:2] / np.diag(self.camera.matrix)[:2]))
 
 
-def calibrate_camera(photographs: Mapping[str, NDArray[np.uint8]], board: Board) -> Calibration:
+def calibrate_camera(photographs: Mapping[str, Picture], board: Board) -> Calibration:
     """Find matrix and lens of the camera that took several photographs of the board.
 
     All poses, the matrix and the lens minimise the reprojection error of all corners, from the
@@ -102,7 +91,16 @@ def calibrate_camera(photographs: Mapping[str, NDArray[np.uint8]], board: Board)
     ----------
     Zhang, A flexible new technique for camera calibration, PAMI 2000, through OpenCV.
     """
-    size = _common_size(photographs)
+    sizes = {name: (image.shape[1], image.shape[0]) for name, image in photographs.items()}
+    listed = list(sizes.values())
+    size = max(listed, key=listed.count, default=(0, 0))
+    for name, other in sizes.items():
+        if other != size:
+            raise VisionError(
+                f"{name} is {other[0]} x {other[1]} px, most photographs are {size[0]} x {size[1]} "
+                "px: they are not of one camera as it was set. Try: the original pictures, neither "
+                "turned nor cut."
+            )
     problems: dict[str, str] = {}
     seen: dict[str, dict[int, Array]] = {}
     for name, image in photographs.items():
@@ -209,36 +207,15 @@ def _matrix_std(slopes: list[Array], displaced: list[Array], rms: float) -> Arra
     rms : scalar [px]
         Of the distances of the corners.
     """
-    rows, moves = [], []
-    for slope, moved in zip(slopes, displaced, strict=True):
-        basis = np.linalg.qr(slope[:, :6])[0]
-        rows.append(slope[:, 6:] - basis @ (basis.T @ slope[:, 6:]))
-        moves.append(moved - basis @ (basis.T @ moved))
-    stacked = np.vstack(rows)
-    scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-12)
-    left, sizes, ways = np.linalg.svd(stacked / scale, full_matrices=False)
-    along = ways.T / np.maximum(sizes, 1e-12) / scale[:, None]
-    unknowns = 6 * len(slopes) + stacked.shape[1]
-    noise = rms * np.sqrt(len(stacked) / 2 / max(len(stacked) - unknowns, 1))
-    by_corners = noise * np.sqrt(CORNERS_THAT_SHARE) * along
-    by_markers = _PLACED * along @ (left.T @ np.vstack(moves))
-    return np.asarray(np.linalg.norm(np.hstack([by_corners, by_markers]), axis=1))[:4]
-
-
-def _common_size(photographs: Mapping[str, NDArray[np.uint8]]) -> tuple[int, int]:
-    """Width and height [px] of all photographs."""
-    sizes = {name: image.shape[1::-1] for name, image in photographs.items()}
-    if len(set(sizes.values())) > 1:
-        listed = list(sizes.values())
-        usual = max(listed, key=listed.count)
-        other = next(name for name, size in sizes.items() if size != usual)
-        raise VisionError(
-            f"{other} is {sizes[other][0]} x {sizes[other][1]} px, most photographs are "
-            f"{usual[0]} x {usual[1]} px: they are not of one camera as it was set. Try: the "
-            "original pictures, neither turned nor cut."
-        )
-    width, height = next(iter(sizes.values()), (0, 0))
-    return int(width), int(height)
+    places = 6 * len(slopes)
+    own, shared = block_diag(*(s[:, :6] for s in slopes)), np.vstack([s[:, 6:] for s in slopes])
+    A = np.hstack([own, shared])
+    scale = np.maximum(np.linalg.norm(A, axis=0), 1e-12)
+    matrix = slice(places, places + 4)
+    along = np.linalg.pinv(A / scale, rcond=0.0)[matrix] / scale[matrix, None]
+    noise = rms * np.sqrt(CORNERS_THAT_SHARE * len(A) / 2 / max(len(A) - A.shape[1], 1))
+    by_both = np.hstack([noise * along, _PLACED * along @ np.vstack(displaced)])
+    return np.asarray(np.linalg.norm(by_both, axis=1))
 
 
 def _advice(found: Calibration, filled: float) -> Iterator[str]:

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.errors import VisionError
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
 
 # OpenCV inverts a lens by a fixed point. Its five default steps leave 0.6 px where a lens bends the
 # corners by 60 px; for 1e-10 px that one needs thirty steps, one of 10 px ten.
@@ -65,30 +67,20 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class Photograph:
-    """A picture's camera, and what it shows of the board.
-
-    Parameters
-    ----------
-    shape : (height, width) [px]
-        Size of the photograph.
-    camera : Camera, optional
-        Its matrix and lens.
-    reprojection_error : scalar [px]
-        Root mean square over the corners of the markers; 0 for two reference points.
-    markers : (n, 4, 2) [px]
-        Corners of the markers that were used.
-    numbers : tuple of int
-        Their numbers.
-    messages : tuple of str
-        Which markers were not used, and why.
-    """
+    """A picture's camera, and what it shows of the board."""
 
     shape: tuple[int, int]
+    """Height and width [px]."""
     camera: Camera | None = None
+    """Its matrix and lens."""
     reprojection_error: float = 0.0
+    """Root mean square [px] over the corners of the markers; 0 for two reference points."""
     markers: Array = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    """Corners (n, 4, 2) [px] of the markers that were used."""
     numbers: tuple[int, ...] = ()
+    """Their numbers."""
     messages: tuple[str, ...] = ()
+    """Which markers were not used, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,14 +93,10 @@ class View(Photograph):
 
     where (a, b) is the undistorted ray in normalised camera coordinates when a camera is known,
     and the pixel (u, v) itself when not.
-
-    Parameters
-    ----------
-    homography : (3, 3)
-        H: board frame [m] to rays [-], or to pixels [px] without a camera.
     """
 
     homography: Array
+    """H (3, 3): board frame [m] to rays [-], or to pixels [px] without a camera."""
 
     def to_board(self, pixels: ArrayLike) -> Array:
         """Points of the cable's plane [m] seen at pixels (K, 2) [px]; shape (K, 2)."""
@@ -191,22 +179,16 @@ class Viewpoint(Photograph):
         q = R p + t
 
     in the camera's frame (x right, y down, z ahead), and is seen at the pixel distort(q_xy / q_z).
-
-    Parameters
-    ----------
-    rotation : (3, 3)
-        R, from the board's axes to the camera's.
-    translation : (3,) [m]
-        t, the board's origin in the camera's frame.
-    covariance : (6, 6) [rad, m]
-        Of a small rotation w and a shift d of the board in the camera's frame, q -> q + w x q + d,
-        from the scatter of the corners.
     """
 
     camera: Camera
     rotation: Array
+    """R (3, 3), from the board's axes to the camera's."""
     translation: Array
+    """t (3,) [m], the board's origin in the camera's frame."""
     covariance: Array
+    """(6, 6) [rad, m], of a small rotation w and a shift d of the board in the camera's frame,
+    q -> q + w x q + d, from the scatter of the corners."""
 
     @property
     def center(self) -> Array:

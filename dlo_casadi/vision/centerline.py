@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline
 from scipy.ndimage import binary_dilation, gaussian_filter1d, label
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, View
+from dlo_casadi.vision.camera import Array, Flags, Picture, View
 from dlo_casadi.vision.chain import Workings, find_cable
 from dlo_casadi.vision.curves import chord_length, fit_curve, length_of, normals
 from dlo_casadi.vision.profiles import (
@@ -46,9 +46,9 @@ class Trace:
     t: Array  # (K,) [m], length along the line, gaps included
     points: Array  # (K, 2) [m], middle of the two edges
     std: Array  # (K,) [m], standard deviation across the cable
-    sound: NDArray[np.bool_]  # (K,), the profile shows the cable and nothing else
-    inside: NDArray[np.bool_]  # (K,), it lies in the photograph
-    glare: NDArray[np.bool_]  # (K,), half of the cable's width is white beyond measure
+    sound: Flags  # (K,), the profile shows the cable and nothing else
+    inside: Flags  # (K,), it lies in the photograph
+    glare: Flags  # (K,), half of the cable's width is white beyond measure
     direction: Array = field(default_factory=lambda: np.zeros(3))
     """Weights (3,) of blue, green and red by which most of the cable stands out."""
     shape: EdgeShape = field(default_factory=EdgeShape)  # typical; 0 where no edges were found
@@ -56,7 +56,7 @@ class Trace:
 
 
 def trace_cable(
-    image: NDArray[np.uint8], view: View, strands: tuple[Array, ...], expected: ExpectedLine
+    image: Picture, view: View, strands: tuple[Array, ...], expected: ExpectedLine
 ) -> Trace:
     """Lay a smooth curve through the strands and move it onto the middle between the edges.
 
@@ -135,7 +135,7 @@ def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BS
     return fit_curve(t, line, np.ones(len(t)), 2 * diameter, 0.5 * diameter), t
 
 
-def _is_usual(found: Crossings, usual: NDArray[np.bool_], diameter: float) -> NDArray[np.bool_]:
+def _is_usual(found: Crossings, usual: Flags, diameter: float) -> Flags:
     """Profiles that are usual in height, width and place of the cable."""
     height = float(np.median(found.height[usual]))
     width = float(np.median(found.width[usual]))
@@ -147,9 +147,7 @@ def _is_usual(found: Crossings, usual: NDArray[np.bool_], diameter: float) -> ND
     )
 
 
-def _beside_end(
-    found: Crossings, t: Array, sound: NDArray[np.bool_], diameter: float
-) -> NDArray[np.bool_]:
+def _beside_end(found: Crossings, t: Array, sound: Flags, diameter: float) -> Flags:
     """Profiles within a diameter of a line's end up to the last that looks unlike those farther in.
 
     The blur of the cable's end, or its holder, moves the middle long before a profile is unusual.
@@ -167,7 +165,7 @@ def _beside_end(
     return beside
 
 
-def _without_rims(sound: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_rims(sound: Flags) -> Flags:
     """Leave out short sound stretches, and the rims of long unsound ones.
 
     Beside a holder, a pin or an occluder its colour leaks into the profile before that shows. The
@@ -180,13 +178,13 @@ def _without_rims(sound: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return _longer(kept, 1.5 / _STEP)
 
 
-def _longer(flags: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+def _longer(flags: Flags, least: float) -> Flags:
     """Those of the flags (K,) that stand in a run of more than `least`."""
     runs, _ = label(flags)
     return flags & (np.bincount(runs)[runs] > least)
 
 
-def _std(rough: Array, fine: Array, sound: NDArray[np.bool_], view: View) -> Array:
+def _std(rough: Array, fine: Array, sound: Flags, view: View) -> Array:
     """Standard deviation of each point (K,) [m].
 
     The scatter of the rough places about the fine ones, over two diameters, falls with the square
@@ -205,37 +203,26 @@ def _std(rough: Array, fine: Array, sound: NDArray[np.bool_], view: View) -> Arr
 
 @dataclass(frozen=True)
 class Centerline:
-    """The centre-line of a cable, as seen in one photograph.
-
-    Parameters
-    ----------
-    points : (K, 2) [m]
-        In the board frame, ordered from start to end.
-    std : (K,) [m]
-        Standard deviation of each point across the cable. Neighbours share their errors.
-    pixels : (K, 2) [px]
-        The same points in the photograph.
-    coverage : scalar in 0..1
-        Length along the points, without the gaps, over the length of the cable.
-    gaps : tuple of int
-        Indices of the points after which a stretch is missing.
-    confidence : scalar in 0..1
-        Share of the line inside the picture that was measured soundly.
-    messages : tuple of str
-        What a user should know, in plain sentences.
-    """
+    """The centre-line of a cable, as seen in one photograph."""
 
     points: Array
+    """(K, 2) [m], in the board frame, ordered from start to end."""
     std: Array
+    """(K,) [m], standard deviation across the cable. Neighbours share their errors."""
     pixels: Array
+    """(K, 2) [px], the same points in the photograph."""
     coverage: float
+    """Length along the points, without the gaps, over the length of the cable, 0..1."""
     gaps: tuple[int, ...]
+    """Indices of the points after which a stretch is missing."""
     confidence: float
+    """Share of the line inside the picture that was measured soundly, 0..1."""
     messages: tuple[str, ...]
+    """What a user should know, in plain sentences."""
 
 
 def extract_centerline(
-    image: NDArray[np.uint8], view: View, cable: KnownCable, workings: Workings | None = None
+    image: Picture, view: View, cable: KnownCable, workings: Workings | None = None
 ) -> Centerline:
     """Isolate the cable, order it from start to end and refine it to sub-pixel.
 
@@ -301,7 +288,7 @@ class MeasuredLine:
 
 
 def measure_line(
-    image: NDArray[np.uint8], view: View, expected: ExpectedLine, workings: Workings
+    image: Picture, view: View, expected: ExpectedLine, workings: Workings
 ) -> MeasuredLine:
     """Find the line in a plane, trace it, and choose the sound and evenly spaced profiles."""
     diameter = expected.diameter

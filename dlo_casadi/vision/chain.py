@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, View
+from dlo_casadi.vision.camera import Array, Flags, View
 from dlo_casadi.vision.curves import length_of
 from dlo_casadi.vision.strands import (
     Contrast,
@@ -34,22 +34,6 @@ _ROOT = 3.0  # diameters from the chain within which a strand that it covers twi
 _ALIKE = 0.5  # largest difference in colour of a cable's strands, of that from the surroundings
 
 
-@dataclass
-class Workings:
-    """What the steps of one extraction have seen: filled as far as it comes."""
-
-    view: View | None = None  # of the plane in which the cable is looked for
-    expected: ExpectedLine | None = None
-    plane: WorkPlane | None = None
-    candidate: NDArray[np.float32] | None = None  # (h, w), how much its pixels stand out
-    cut: float = 0.0  # level above which a pixel may be cable
-    lines: list[Array] = field(default_factory=list)  # all strands at that level, (K, 2) [m]
-    chosen: tuple[Array, ...] = ()  # those that make up the cable, from start to end
-    unsound: Array | None = None  # (K, 2) [m], places on it that do not look like the cable
-    pixels: Array | None = None  # (K, 2) [px], the line that was found
-    gaps: tuple[int, ...] = ()  # indices of those after which a stretch is missing
-
-
 @dataclass(frozen=True)
 class Strand:
     """An unbranched line in metres, and how it looks."""
@@ -66,6 +50,22 @@ class Strand:
         return length_of(self.points)
 
 
+@dataclass
+class Workings:
+    """What the steps of one extraction have seen: filled as far as it comes."""
+
+    view: View | None = None  # of the plane in which the cable is looked for
+    expected: ExpectedLine | None = None
+    plane: WorkPlane | None = None
+    candidate: NDArray[np.float32] | None = None  # (h, w), how much its pixels stand out
+    cut: float = 0.0  # level above which a pixel may be cable
+    strands: list[Strand] = field(default_factory=list)  # all at that level
+    chosen: tuple[Array, ...] = ()  # those that make up the cable, from start to end
+    unsound: Array | None = None  # (K, 2) [m], places on it that do not look like the cable
+    pixels: Array | None = None  # (K, 2) [px], the line that was found
+    gaps: tuple[int, ...] = ()  # indices of those after which a stretch is missing
+
+
 @dataclass(frozen=True)
 class Chain:
     """Strands in the order in which the cable runs through them."""
@@ -75,16 +75,6 @@ class Chain:
     supported: float  # [m], length that was seen
     total: float  # [m], length with straight gaps
     cost: float  # [m], lower is better; about -length for a cable that is seen without a gap
-
-
-@dataclass(frozen=True)
-class _Finding:
-    """A chain, and the strands, the picture and the level in which it was found."""
-
-    chain: Chain
-    strands: list[Strand]
-    candidate: NDArray[np.float32]
-    cut: float
 
 
 def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> Chain:
@@ -97,7 +87,7 @@ def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> 
             "Try: start, end and length in metres and in the board frame?"
         )
     contrast = local_contrast(plane.image, plane.reachable, diameter / plane.pixel)
-    best: _Finding | None = None
+    best: Chain | None = None
     longest = 0.0
     for candidate in candidate_maps(contrast, area_px):
         for cut in thresholds(candidate[plane.reachable], area_px):
@@ -108,17 +98,14 @@ def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> 
             if chain is not None and scene.varied:
                 strands = _of_one_colour(strands, [strands[i] for i in chain.used])
                 chain = order_strands(strands, expected)
-            better = chain is not None and (best is None or chain.cost < best.chain.cost)
-            if chain is not None and better:
-                best = _Finding(chain, strands, candidate, cut)
-                workings.chosen = chain.strands
+            better = chain is not None and (best is None or chain.cost < best.cost)
             if better or best is None:
-                workings.candidate, workings.cut = candidate, cut
-                workings.lines = [strand.points for strand in strands]
-        if best is not None and best.chain.cost < scene.good * min(best.chain.total, length):
+                best, workings.chosen = chain, () if chain is None else chain.strands
+                workings.candidate, workings.cut, workings.strands = candidate, cut, strands
+        if best is not None and best.cost < scene.good * min(best.total, length):
             break
-    if best is None or best.chain.supported < _LEAST * length:
-        seen = 0.0 if best is None else best.chain.supported
+    if best is None or best.supported < _LEAST * length:
+        seen = 0.0 if best is None else best.supported
         mean, light = float(plane.image[plane.reachable].mean()), ""
         if not 15 <= mean <= 245:
             what, cure = ("too dark", "more light") if mean < 15 else ("overexposed", "less light")
@@ -131,14 +118,14 @@ def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> 
             "brightness or colour?"
         )
     if scene.varied:
-        best = replace(best, chain=_with_folds(best, diameter))
-        workings.chosen = best.chain.strands
-    _refuse_twins(best, plane, contrast, expected)
-    return best.chain
+        best = _with_folds(best, workings.strands, diameter)
+        workings.chosen = best.strands
+    _refuse_twins(best, workings, contrast, expected)
+    return best
 
 
 def _strands(
-    mask: NDArray[np.bool_],
+    mask: Flags,
     candidate: NDArray[np.float32],
     plane: WorkPlane,
     contrast: Contrast,
@@ -268,7 +255,7 @@ def _of_one_colour(strands: list[Strand], chosen: list[Strand]) -> list[Strand]:
     return [strand for strand in strands if np.linalg.norm(strand.colour - ours.colour) < most]
 
 
-def _with_folds(found: _Finding, diameter: float) -> Chain:
+def _with_folds(chain: Chain, strands: list[Strand], diameter: float) -> Chain:
     """The chain, with strands inserted along which the cable goes forth and back.
 
     Seen from its side, a bend is a strand with a free end that the cable covers twice: it begins
@@ -280,9 +267,9 @@ def _with_folds(found: _Finding, diameter: float) -> Chain:
         far = np.linalg.norm(line - line[0], axis=1) > 4 * diameter
         return np.asarray(line[int(np.argmax(far)) if far.any() else -1] - line[0])
 
-    parts = list(found.chain.strands)
-    for i, strand in enumerate(found.strands):
-        if i in found.chain.used or strand.length < 2 * diameter:
+    parts = list(chain.strands)
+    for i, strand in enumerate(strands):
+        if i in chain.used or strand.length < 2 * diameter:
             continue
         whole = np.vstack(parts)
         for way in (strand.points, strand.points[::-1]):
@@ -299,11 +286,11 @@ def _with_folds(found: _Finding, diameter: float) -> Chain:
                 split = [parts[k][: at + 1], way, way[::-1], parts[k][at + 1 :]]
                 parts[k : k + 1] = [part for part in split if len(part)]
                 break
-    return replace(found.chain, strands=tuple(parts))
+    return replace(chain, strands=tuple(parts))
 
 
 def _refuse_twins(
-    best: _Finding, plane: WorkPlane, contrast: Contrast, expected: ExpectedLine
+    chain: Chain, workings: Workings, contrast: Contrast, expected: ExpectedLine
 ) -> None:
     """Raise if strands away from the chain look like a second cable.
 
@@ -311,17 +298,20 @@ def _refuse_twins(
     anyway, only one long strand does.
     """
     diameter, length = expected.diameter, expected.typical
-    rest = ((best.candidate > best.cut) & plane.inside).astype(np.uint8)
-    for line in best.chain.strands:
+    plane, candidate = workings.plane, workings.candidate
+    assert plane is not None
+    assert candidate is not None
+    rest = ((candidate > workings.cut) & plane.inside).astype(np.uint8)
+    for line in chain.strands:
         at = np.round(plane.to_pixels(line)).astype(np.int32)
         cv2.polylines(rest, [at], False, 0, round(3 * diameter / plane.pixel))
     if rest.sum() < 0.5 * _TWIN * length * diameter / plane.pixel**2:
         return
-    ours = [best.strands[i] for i in best.chain.used]
+    ours = [workings.strands[i] for i in chain.used]
     level = float(np.median([strand.level for strand in ours]))
     width = float(np.median([strand.width for strand in ours]))
     near, far = 0.0, 0.0
-    strands = _strands(rest > 0, best.candidate, plane, contrast, expected)
+    strands = _strands(rest > 0, candidate, plane, contrast, expected)
     for strand in _of_one_colour(strands, ours) if expected.scene.varied else strands:
         alike = strand.level > _TWIN_CONTRAST * level and 0.6 < strand.width / width < 1.6
         if not alike or strand.length < 5 * diameter:
@@ -334,7 +324,7 @@ def _refuse_twins(
     second = max(near, far)
     if second > _TWIN * length:
         raise VisionError(
-            f"two cables: beside the strand of {best.chain.supported:.3f} m there is "
+            f"two cables: beside the strand of {chain.supported:.3f} m there is "
             f"{second:.3f} m of the same width and colour (the cable is {length:g} m long). "
             "Try: leave one cable in the picture, or cover the other."
         )

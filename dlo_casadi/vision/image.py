@@ -10,21 +10,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from PIL import (
-    BmpImagePlugin,
-    ImageFile,
-    JpegImagePlugin,
-    PngImagePlugin,
-    TiffImagePlugin,
-    WebPImagePlugin,
-)
+from PIL import Image, ImageFile
 
 from dlo_casadi.errors import VisionError, counted
-from dlo_casadi.vision.camera import Array, View
+from dlo_casadi.vision.camera import Array, Picture, View
 from dlo_casadi.vision.chain import Workings
 
-Picture = NDArray[np.uint8]
 # Blue, green, red.
 _BLUE, _ORANGE, _RED = (178, 114, 0), (0, 159, 230), (0, 94, 213)
 _GREEN, _GREY = (115, 158, 0), (150, 150, 150)
@@ -35,18 +26,10 @@ _BLURRED_PX = 2.0  # standard deviation of edges from which markers of some 30 p
 # Pictures with more pixels are not decoded. The camera step was measured to hold 15 bytes a pixel:
 # 1.5 GB for this many, which show a board of 1 m at 0.1 mm a pixel.
 MOST_PIXELS = 100_000_000
-
-# They read the header alone, of files of their own format.
-_HEADERS = (
-    JpegImagePlugin.JpegImageFile,
-    PngImagePlugin.PngImageFile,
-    TiffImagePlugin.TiffImageFile,
-    BmpImagePlugin.BmpImageFile,
-    WebPImagePlugin.WebPImageFile,
-)
+_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 
 
-def read_image(path: Path | str) -> NDArray[np.uint8]:
+def read_image(path: Path | str) -> Picture:
     """Read a photograph, turned upright as its EXIF tag asks.
 
     Parameters
@@ -110,10 +93,11 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
 
 def _opened(data: bytes) -> ImageFile.ImageFile | None:
     """The picture of which only the header is read; None if it is no known image."""
-    for header in _HEADERS:
+    Image.init()
+    for name in _FORMATS:
         with warnings.catch_warnings(), suppress(SyntaxError, OSError, ValueError):
             warnings.simplefilter("ignore")  # of damaged tags that nobody needs
-            return header(BytesIO(data))  # raises for other formats, and damaged headers
+            return Image.OPEN[name][0](BytesIO(data), "")  # raises for files of other formats
     return None
 
 
@@ -127,7 +111,7 @@ def _is_whole(picture: ImageFile.ImageFile) -> bool:
     return False
 
 
-def spoilt(image: NDArray[np.uint8]) -> str:
+def spoilt(image: Picture) -> str:
     """Sentence for a photograph (H, W, 3) that is overexposed or blurred; empty if it is neither.
 
     A step of the height h blurred by the standard deviation s is nowhere steeper than
@@ -178,8 +162,8 @@ def draw_steps(image: Picture, workings: Workings) -> dict[str, Picture]:
         picture[above] = (0.4 * picture[above] + 0.6 * np.array(_ORANGE)).astype(np.uint8)
         # all strands in grey, the chosen ones in blue, numbered from start to end
         pictures["3_strands"] = picture = (plane.image // 3 + 170).astype(np.uint8)
-        for line in workings.lines:
-            _polyline(picture, plane.to_pixels(line), _GREY, 2)
+        for strand in workings.strands:
+            _polyline(picture, plane.to_pixels(strand.points), _GREY, 2)
         for k, line in enumerate(workings.chosen):
             at = plane.to_pixels(line)
             _polyline(picture, at, _BLUE, 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +11,13 @@ from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, Viewpoint
+from dlo_casadi.vision.camera import Array, Flags, Picture, Viewpoint
 from dlo_casadi.vision.centerline import FINE, measure_line
 from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.curves import chord_length, normals
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
+Places: TypeAlias = NDArray[np.intp]
 _NEAREST = 0.2  # m: least distance from which a cable is photographed
 _BESIDE = 1.6  # widths between two stretches below which they share an edge
 _APART = 2.0  # widths along the line from which two places are different stretches
@@ -29,51 +31,36 @@ _POSE_PX = 0.5  # error of an epipolar line from the cameras' places
 
 @dataclass(frozen=True)
 class ImageCurve:
-    """The centre-line in one photograph, ordered from start to end.
-
-    Parameters
-    ----------
-    viewpoint : Viewpoint
-        Where the camera stands.
-    pixels : (K, 2) [px]
-        Middle of the cable's outline, as photographed.
-    std : (K,) [px]
-        Standard deviation of each across the line.
-    whole : (K,) bool
-        Both edges are seen; where not, another stretch of the cable lies beside or behind, and
-        the pixel is only somewhere in their common outline.
-    width : scalar [px]
-        Distance of the two edges, the median along the line.
-    width_std : scalar [px]
-        Its scatter along the line.
-    diameter : scalar [m]
-        Of the cable, as declared.
-    distance : scalar [m]
-        Depth at which the picture was searched: between the fixtures.
-    correlation : scalar [px]
-        Length along the line over which neighbours share their errors, the integral of the
-        correlation: pixels are averaged along the cable by a Gaussian.
-    confidence : scalar in 0..1
-        Share of the line inside the picture that was measured soundly.
-    messages : tuple of str
-        What a user should know.
-    direction, blur : (3,), scalar [px]
-        Colours by which the cable stands out, and the blur of its edges.
-    """
+    """The centre-line in one photograph, ordered from start to end."""
 
     viewpoint: Viewpoint
+    """Where the camera stands."""
     pixels: Array
+    """(K, 2) [px], middle of the cable's outline, as photographed."""
     std: Array
-    whole: NDArray[np.bool_]
+    """(K,) [px], standard deviation of each across the line."""
+    whole: Flags
+    """(K,), both edges are seen; where not, another stretch of the cable lies beside or behind,
+    and the pixel is only somewhere in their common outline."""
     width: float
+    """Distance [px] of the two edges, the median along the line."""
     width_std: float
+    """Its scatter [px] along the line."""
     diameter: float
+    """Of the cable [m], as declared."""
     distance: float
+    """Depth [m] at which the picture was searched: between the fixtures."""
     correlation: float
+    """Length [px] along the line over which neighbours share their errors, the integral of the
+    correlation: pixels are averaged along the cable by a Gaussian."""
     confidence: float
+    """Share of the line inside the picture that was measured soundly, 0..1."""
     messages: tuple[str, ...]
+    """What a user should know."""
     direction: Array
+    """Colours (3,) by which the cable stands out."""
     blur: float
+    """Blur [px] of its edges."""
 
     @property
     def spacing(self) -> float:
@@ -96,7 +83,7 @@ class ImageCurve:
 
 
 def see_cable(
-    image: NDArray[np.uint8],
+    image: Picture,
     viewpoint: Viewpoint,
     cable: KnownCable,
     workings: Workings | None = None,
@@ -231,16 +218,7 @@ def loops_either_way(curve: ImageCurve) -> list[ImageCurve]:
     return ways
 
 
-@dataclass(frozen=True)
-class Match:
-    """Pairs of pixels of two photographs, in order along the cable."""
-
-    first: NDArray[np.intp]  # (P,), their places in the two lines
-    second: NDArray[np.intp]
-    share: float  # of the pixels of both lines that found a partner on their epipolar line
-
-
-def match_lines(one: ImageCurve, other: ImageCurve) -> Match:
+def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Places, Places, float]:
     """Match two lines, in order, by the distances from each other's epipolar lines.
 
     For rays a and b of the same point b^T E a = 0, with the essential matrix E = [t]_x R of the
@@ -251,6 +229,11 @@ def match_lines(one: ImageCurve, other: ImageCurve) -> Match:
     through all pairs (k, l) that never goes back, by dynamic programming; s^2 adds up the
     variances of both pixels and of the cameras' places. Pixels at the ends may be left over, at
     the price of a pair that does not match: what one photograph hides costs alike everywhere.
+
+    Returns
+    -------
+    Places (P,), (P,) of the pairs in the two lines, and the share of the pixels of both that found
+    a partner on their epipolar line.
 
     References
     ----------
@@ -270,7 +253,7 @@ def match_lines(one: ImageCurve, other: ImageCurve) -> Match:
     good = off[first, second] < _GOOD
     first, second = first[good], second[good]
     found = len(np.unique(first)) + len(np.unique(second))
-    return Match(first, second, found / (len(one.pixels) + len(other.pixels)))
+    return first, second, found / (len(one.pixels) + len(other.pixels))
 
 
 def places_along(curve: ImageCurve, points: Array) -> Array:
@@ -295,7 +278,7 @@ def places_along(curve: ImageCurve, points: Array) -> Array:
     return np.where((found >= 0) & (off < _CAP), found / (len(points) - 1), np.nan)
 
 
-def nearest_in_order(away: Array) -> NDArray[np.intp]:
+def nearest_in_order(away: Array) -> Places:
     """Columns of a table of distances (K, M) that rows belong to, never going back.
 
     Distances in standard deviations. Of several columns of a row the nearest is taken; -1 where
@@ -308,14 +291,14 @@ def nearest_in_order(away: Array) -> NDArray[np.intp]:
     return found
 
 
-def triangulate(one: ImageCurve, other: ImageCurve, match: Match) -> Array:
-    """Points (P, 3) [m] of least squares from the matched rays.
+def triangulate(one: ImageCurve, other: ImageCurve, first: Places, second: Places) -> Array:
+    """Points (P, 3) [m] of least squares from the rays of matched pixels.
 
     With a = q_xy / q_z and q = R p + t each ray gives two equations, (a R_z - R_xy) p = t_xy - a
     t_z.
     """
     rows, sides = [], []
-    for seen, chosen in ((one, match.first), (other, match.second)):
+    for seen, chosen in ((one, first), (other, second)):
         R, t = seen.viewpoint.rotation, seen.viewpoint.translation
         rays = seen.rays[chosen]
         rows.append(rays[:, :, None] * R[2] - R[:2])
@@ -325,7 +308,7 @@ def triangulate(one: ImageCurve, other: ImageCurve, match: Match) -> Array:
     return np.linalg.solve(normal, np.einsum("pki,pk->pi", A, b)[..., None])[..., 0]
 
 
-def _cheapest_way(cost: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _cheapest_way(cost: Array) -> tuple[Places, Places]:
     """Places (P,), (P,) of the pairs on the cheapest way through a table of costs (K, L).
 
     In a row, D_l = c_l + min(A_l, D_l-1) with A the best from the row before; with C the running

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter1d, median_filter
 
-from dlo_casadi.vision.camera import Array, View
+from dlo_casadi.vision.camera import Array, Flags, View
 from dlo_casadi.vision.curves import normals
 
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
@@ -34,14 +34,14 @@ class Profiles:
     t: Array  # (K,) [m], where along the curve
     offset: Array  # (M,) [m], where across it, positive to the left
     values: Array  # (K, M, 3), colours
-    inside: NDArray[np.bool_]  # (K,), the cable and its edges lie in the photograph
+    inside: Flags  # (K,), the cable and its edges lie in the photograph
 
-    def core_and_rim(self, diameter: float) -> tuple[Array, NDArray[np.bool_]]:
+    def core_and_rim(self, diameter: float) -> tuple[Array, Flags]:
         """Colours (K, 3) of the cable in each profile, and the offsets (M,) of its surroundings."""
         core = self.values[:, np.abs(self.offset) < 0.3 * diameter].mean(axis=1)
         return core, np.abs(self.offset) > 0.8 * diameter
 
-    def average(self, trusted: NDArray[np.bool_], along: float) -> Profiles:
+    def average(self, trusted: Flags, along: float) -> Profiles:
         """Average trusted profiles along the curve, with a Gaussian of deviation `along` [m].
 
         That lowers the noise of the pixels and of their compression, and bends nothing, since the
@@ -96,7 +96,7 @@ def sample_profiles(
     return Profiles(t, offset, np.asarray(values, dtype=float), inside)
 
 
-def cable_direction(profiles: Profiles, trusted: NDArray[np.bool_], diameter: float) -> Array:
+def cable_direction(profiles: Profiles, trusted: Flags, diameter: float) -> Array:
     """Weights of colours (3,) that separate the cable from its surroundings.
 
     Luminance, where it does: JPEG keeps colour at half the resolution, and smears it. Otherwise
@@ -118,7 +118,7 @@ def cable_direction(profiles: Profiles, trusted: NDArray[np.bool_], diameter: fl
 
 
 def local_directions(
-    profiles: Profiles, direction: Array, trusted: NDArray[np.bool_], diameter: float
+    profiles: Profiles, direction: Array, trusted: Flags, diameter: float
 ) -> Array:
     """Weights of colours (K, 3) for a cable that passes in front of different surroundings.
 
@@ -186,9 +186,7 @@ def find_edges(
     return Crossings(centre, to_left + to_right, 0.5 * (left_blur + right_blur), core - around)
 
 
-def edge_shape(
-    profiles: Profiles, direction: Array, trusted: NDArray[np.bool_], first: EdgeShape
-) -> EdgeShape:
+def edge_shape(profiles: Profiles, direction: Array, trusted: Flags, first: EdgeShape) -> EdgeShape:
     """Width and blur that are typical of the trusted profiles, from a first guess of both."""
     shape = first
     for _ in range(2):

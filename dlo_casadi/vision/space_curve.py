@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import find_objects, label
 
-from dlo_casadi.vision.camera import Array, Viewpoint, compare_pixels
+from dlo_casadi.vision.camera import Array, Picture, Viewpoint, compare_pixels
 from dlo_casadi.vision.centerline import FINE
 from dlo_casadi.vision.curves import DEGREE, SpaceCurve, chord_length, fit_curve, normals
 from dlo_casadi.vision.image_curve import ImageCurve, other_stretches, places_along
@@ -191,7 +190,7 @@ def _nearest(curve: SpaceCurve, seen: ImageCurve, camera: Viewpoint, t: Array) -
 
 
 def measure_shared_outlines(
-    fit: CurveFit, curves: list[ImageCurve], images: list[NDArray[np.uint8]]
+    fit: CurveFit, curves: list[ImageCurve], images: list[Picture]
 ) -> tuple[CurveFit, list[ImageCurve]]:
     """Measure the stretches that share an outline in a photograph, now that the rest is known.
 
@@ -220,7 +219,7 @@ def measure_shared_outlines(
 
 
 def see_beside(
-    image: NDArray[np.uint8],
+    image: Picture,
     seen: ImageCurve,
     curve: Array,
     params: Array,

@@ -8,18 +8,17 @@ from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import Board, locate_camera
-from dlo_casadi.vision.camera import Array, Camera
+from dlo_casadi.vision.camera import Array, Camera, Picture
 from dlo_casadi.vision.centerline import SPACING
 from dlo_casadi.vision.curves import chord_length
 from dlo_casadi.vision.image import spoilt
 from dlo_casadi.vision.image_curve import (
     TIP,
     ImageCurve,
-    Match,
+    Places,
     loops_either_way,
     match_lines,
     see_cable,
@@ -51,52 +50,36 @@ _MISSING = 0.1  # of the length: a line that is shorter by more misses a hidden 
 
 @dataclass(frozen=True)
 class SpaceLine:
-    """A line in space, and how well each of its points is known.
-
-    Parameters
-    ----------
-    points : (K, 3) [m]
-        In the board frame, ordered from start to end, evenly spaced.
-    std : (K,) [m]
-        Largest standard deviation in any direction across the line; where a point lies along it,
-        photographs do not tell.
-    gaps : tuple of int
-        Indices of the points after which a stretch is missing.
-    """
+    """A line in space, and how well each of its points is known."""
 
     points: Array
+    """(K, 3) [m], in the board frame, ordered from start to end, evenly spaced."""
     std: Array
+    """(K,) [m], largest standard deviation in any direction across the line; where a point lies
+    along it, photographs do not tell."""
     gaps: tuple[int, ...]
+    """Indices of the points after which a stretch is missing."""
 
 
 @dataclass(frozen=True)
 class Views:
-    """What the photographs of one pose show.
-
-    Parameters
-    ----------
-    line : SpaceLine or None
-        None where fewer than two photographs agree.
-    curves : dict of str to ImageCurve
-        What is seen in each usable photograph, by its name, in pixels.
-    problems : dict of str to str
-        Why a photograph is not used, and what to try.
-    messages : tuple of str
-        What else a user should know; those on one photograph begin with its name.
-    places : dict of str to (K, 3) [m]
-        Where the pixels of the curves lie: on the line in space, nan for those that are not of it.
-        Without a line it is a guess, at depths from fixture to fixture.
-    """
+    """What the photographs of one pose show."""
 
     line: SpaceLine | None
+    """None where fewer than two photographs agree."""
     curves: Mapping[str, ImageCurve]
+    """What is seen in each usable photograph, by its name, in pixels."""
     problems: Mapping[str, str]
+    """Why a photograph is not used, and what to try."""
     messages: tuple[str, ...]
+    """What else a user should know; those on one photograph begin with its name."""
     places: Mapping[str, Array]
+    """Where the pixels of the curves lie, (K, 3) [m]: on the line in space, nan for those that are
+    not of it. Without a line it is a guess, at depths from fixture to fixture."""
 
 
 def measure_views(
-    photographs: Mapping[str, NDArray[np.uint8]], board: Board, camera: Camera, cable: KnownCable
+    photographs: Mapping[str, Picture], board: Board, camera: Camera, cable: KnownCable
 ) -> Views:
     """Measure a cable in photographs from several places: the line in each, and in space.
 
@@ -206,7 +189,7 @@ def agreeing_fit(
             others = [name for name in curves if name != worst]
             problems[worst] = (
                 f"{worst}: the line in it and that in {', '.join(others)} are not of the same "
-                f"cable in space: at most {100 * pairs[0].match.share:.0f} % of their pixels can "
+                f"cable in space: at most {100 * pairs[0].share:.0f} % of their pixels can "
                 "be matched, or the line would not lead from fixture to fixture. The line in "
                 f"{worst} ends {off[worst]:.0f} px from where the fixtures are declared. Try: are "
                 "both of this pose? Was the cable or the board moved between the photographs?"
@@ -230,7 +213,9 @@ class _Pair(NamedTuple):
 
     one: ImageCurve
     other: ImageCurve
-    match: Match
+    first: Places
+    second: Places
+    share: float
     angle: float
 
 
@@ -240,8 +225,8 @@ def _pairs(curves: Mapping[str, ImageCurve]) -> list[_Pair]:
     for one, other in combinations(curves.values(), 2):
         ahead = float(one.viewpoint.rotation[2] @ other.viewpoint.rotation[2])
         angle = float(np.arccos(np.clip(ahead, -1, 1)))
-        pairs.append(_Pair(one, other, match_lines(one, other), angle))
-    return sorted(pairs, key=lambda pair: -(pair.match.share**8) * np.sin(pair.angle))
+        pairs.append(_Pair(one, other, *match_lines(one, other), angle))
+    return sorted(pairs, key=lambda pair: -(pair.share**8) * np.sin(pair.angle))
 
 
 def _agreement_of(curves: Mapping[str, ImageCurve], cable: KnownCable) -> _Agreement | None:
@@ -255,12 +240,12 @@ def _agreement_of(curves: Mapping[str, ImageCurve], cable: KnownCable) -> _Agree
     shown = np.all(tips < TIP, axis=0)
     far = _FAR * cable.length + TIP * cable.diameter
     spans = int(np.clip(cable.length / (_SPAN * cable.diameter), *_SPANS))
-    for one, other, match, _ in _pairs(curves):
-        if match.share <= _AGREE:
+    for one, other, first, second, share, _ in _pairs(curves):
+        if share <= _AGREE:
             continue
-        along = chord_length(one.pixels)[match.first] + chord_length(other.pixels)[match.second]
-        first = first_curve(triangulate(one, other, match), along, spans)
-        fit = fit_curve_to_images(seen, first)
+        along = chord_length(one.pixels)[first] + chord_length(other.pixels)[second]
+        guess = first_curve(triangulate(one, other, first, second), along, spans)
+        fit = fit_curve_to_images(seen, guess)
         away = fit.curve.away_from(cable.fixtures)
         too_long = fit.curve.length + float(away.sum()) >= _LONGER * cable.length
         if too_long or np.any(away[shown] >= far):
@@ -328,7 +313,7 @@ def _line_and_messages(fit: CurveFit, cable: KnownCable) -> tuple[SpaceLine | No
 
 
 def _unsure(
-    curves: Mapping[str, ImageCurve], photographs: Mapping[str, NDArray[np.uint8]], diameter: float
+    curves: Mapping[str, ImageCurve], photographs: Mapping[str, Picture], diameter: float
 ) -> str:
     """Why a part of the line is not known, and what to try."""
     places = {

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.vision.camera import Array
+from dlo_casadi.vision.camera import Array, Flags, Picture
 
 _SIGNIFICANT = 5.0  # standard deviations of the background's noise
 _MAX_STRANDS = 60
@@ -21,13 +21,11 @@ class Contrast:
     """Difference of a picture from its local background, in units of the background's noise."""
 
     difference: NDArray[np.float32]  # (h, w, 3), (pixel - background) / noise, per channel
-    reachable: NDArray[np.bool_]  # (h, w), pixels that count
+    reachable: Flags  # (h, w), pixels that count
     noise: Array  # (3,) [grey levels], robust standard deviation per channel
 
 
-def local_contrast(
-    image: NDArray[np.uint8], reachable: NDArray[np.bool_], width_px: float
-) -> Contrast:
+def local_contrast(image: Picture, reachable: Flags, width_px: float) -> Contrast:
     """Subtract the median over a window of four cable widths, which sees no cable.
 
     Slow changes of the light and steps at the rims of larger objects remain in the median and so
@@ -85,7 +83,7 @@ def _upper_level(values: NDArray[np.float32], area: float) -> float:
     return float(np.partition(high, high.size - rank)[high.size - rank])
 
 
-def find_strands(mask: NDArray[np.bool_], width_px: float) -> list[tuple[NDArray[np.intp], float]]:
+def find_strands(mask: Flags, width_px: float) -> list[tuple[NDArray[np.intp], float]]:
     """Thin a mask (Zhang and Suen) and cut it into strands, longest first.
 
     A highlight along the cable is closed first. Parts of the wrong width, junctions and spurs

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, View
+from dlo_casadi.vision.camera import Array, Flags, Picture, View
 
 CABLE_PX = 6.0  # width of the cable in this picture
 _MAX_PIXELS = 3.0e6
@@ -93,11 +93,11 @@ class ExpectedLine:
 class WorkPlane:
     """The part of the cable's plane that the cable can reach, at a known scale."""
 
-    image: NDArray[np.uint8]  # (h, w, 3), rectified; rows run down, i.e. along -y
+    image: Picture  # (h, w, 3), rectified; rows run down, i.e. along -y
     pixel: float  # [m], side of one of its pixels
     origin: Array  # (2,) [m], board coordinates of the centre of its first pixel
-    inside: NDArray[np.bool_]  # (h, w), inside the photograph and off the markers
-    reachable: NDArray[np.bool_]  # (h, w), of that, near enough to the fixtures for the cable
+    inside: Flags  # (h, w), inside the photograph and off the markers
+    reachable: Flags  # (h, w), of that, near enough to the fixtures for the cable
 
     def to_board(self, at: Array) -> Array:
         """Points (K, 2) [m] of pixels (K, 2) of the working picture."""
@@ -108,7 +108,7 @@ class WorkPlane:
         return (points - self.origin) / self.pixel * [1.0, -1.0]
 
 
-def rectify(image: NDArray[np.uint8], view: View, expected: ExpectedLine) -> WorkPlane:
+def rectify(image: Picture, view: View, expected: ExpectedLine) -> WorkPlane:
     """Resample the photograph onto the cable's plane, where the cable is `CABLE_PX` wide.
 
     A cable of length L between two fixtures stays inside the ellipse |p - start| + |p - end| <= L,
