@@ -134,10 +134,7 @@ def calibrate_camera(photographs: Mapping[str, Picture], board: Board) -> Calibr
 
 
 def _solve(
-    seen: dict[str, dict[int, Array]],
-    board: Board,
-    size: tuple[int, int],
-    problems: dict[str, str],
+    seen: dict[str, dict[int, Array]], board: Board, size: tuple[int, int], problems: dict[str, str]
 ) -> tuple[Calibration, dict[str, dict[int, float]]]:
     """Calibrate with the lens that is worth its numbers; errors [px] of each marker by picture."""
     if len(seen) < _LEAST_PHOTOGRAPHS:

@@ -298,11 +298,7 @@ def project_outline(
 
 
 def compare_pixels(
-    viewpoint: Viewpoint,
-    pixels: ArrayLike,
-    points: ArrayLike,
-    tangents: ArrayLike,
-    diameter: float,
+    viewpoint: Viewpoint, pixels: ArrayLike, points: ArrayLike, tangents: ArrayLike, diameter: float
 ) -> tuple[Array, Array]:
     """Pixels measured minus those of a curve, across it.
 

@@ -265,11 +265,7 @@ def extract_centerline(
         min(1.0, line.seen / length),
         line.gaps,
         line.confidence,
-        (
-            *_gap_messages(line, length),
-            *_fit_messages(points, line.seen, expected),
-            *line.messages,
-        ),
+        (*_gap_messages(line, length), *_fit_messages(points, line.seen, expected), *line.messages),
     )
 
 

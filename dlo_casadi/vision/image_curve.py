@@ -83,10 +83,7 @@ class ImageCurve:
 
 
 def see_cable(
-    image: Picture,
-    viewpoint: Viewpoint,
-    cable: KnownCable,
-    workings: Workings | None = None,
+    image: Picture, viewpoint: Viewpoint, cable: KnownCable, workings: Workings | None = None
 ) -> ImageCurve:
     """Find the cable in front of the board, order it from start to end, refine it to sub-pixel.
 

@@ -55,9 +55,7 @@ def measure(config, truth_file):
         image = read_image(config.parent / pose["file"])
         view = locate_board(image, board, camera)
         line = extract_centerline(
-            image,
-            view,
-            KnownCable(pose["start"], pose["end"], cable["diameter"], cable["length"]),
+            image, view, KnownCable(pose["start"], pose["end"], cable["diameter"], cable["length"])
         )
         curve = dense(truth[Path(pose["file"]).stem])
         nearest = cKDTree(curve).query(line.points)[1]
@@ -117,9 +115,7 @@ def test_the_real_black_wire_agrees_with_the_clicked_points():
     image = read_image(config.parent / pose["file"])
     view = from_reference(**experiment["measurement"]["reference"], shape=image.shape)
     line = extract_centerline(
-        image,
-        view,
-        KnownCable(pose["start"], pose["end"], cable["diameter"], cable["length"]),
+        image, view, KnownCable(pose["start"], pose["end"], cable["diameter"], cable["length"])
     )
     clicked = np.loadtxt(ROOT / "configs/real/black_wire/trial_0.csv", delimiter=",", skiprows=1)
     curve = dense(clicked)

@@ -23,10 +23,7 @@ def extract(image, truth, width_px=WIDTH_PX, length=None, **fixtures):
 LOOKS = {
     "dark": ({}, 0.05),
     "bright": ({"cable": (230, 230, 230), "board": (50, 50, 50), "shadow": 0.5}, 0.05),
-    "red on green of the same luminance": (
-        {"cable": (60, 60, 220), "board": (60, 155, 30)},
-        0.05,
-    ),
+    "red on green of the same luminance": ({"cable": (60, 60, 220), "board": (60, 155, 30)}, 0.05),
     "highlight brighter than the board": ({"highlight": 200}, 0.05),
     "shadow beside it": ({"shadow": 0.4}, 0.3),
     "blurred and noisy": ({"blur": 2.5, "noise": 10}, 0.15),
