@@ -95,16 +95,8 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
 def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
     """Find the board and return where the camera stands before it.
 
-    The pose (R, t) minimises the reprojection error of all corners of all visible markers.
-
-    Parameters
-    ----------
-    image : (H, W, 3) uint8
-        The photograph.
-    board : Board
-        Markers; the standoff does not count.
-    camera : Camera
-        Intrinsic matrix and distortion.
+    The pose (R, t) minimises the reprojection error of all corners of all visible markers. The
+    board's standoff does not count; the rest is as in `locate_board`.
 
     Raises
     ------

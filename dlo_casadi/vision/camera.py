@@ -13,6 +13,7 @@ from dlo_casadi.errors import VisionError
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 Picture = NDArray[np.uint8]
 
 # OpenCV inverts a lens by a fixed point. Its five default steps leave 0.6 px where a lens bends the

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.ndimage import binary_dilation, gaussian_filter1d, label
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, Flags, Picture, View
+from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, View
 from dlo_casadi.vision.chain import Workings, find_cable
 from dlo_casadi.vision.curves import chord_length, fit_curve, length_of, normals
 from dlo_casadi.vision.profiles import (
@@ -274,7 +273,7 @@ class MeasuredLine:
     """The trace of a cable and what of it counts."""
 
     trace: Trace
-    kept: NDArray[np.intp]  # (K,), sound profiles, evenly spaced
+    kept: Indices  # (K,), sound profiles, evenly spaced
     gaps: tuple[int, ...]  # indices of the kept ones after which a stretch is missing
     seen: float  # [m], length along the kept ones, without the gaps
     confidence: float  # share of the line inside the picture that was measured soundly

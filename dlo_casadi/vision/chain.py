@@ -15,14 +15,16 @@ from scipy.ndimage import gaussian_filter1d
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, Flags, View
 from dlo_casadi.vision.curves import length_of
-from dlo_casadi.vision.strands import (
+from dlo_casadi.vision.workplane import (
     Contrast,
+    ExpectedLine,
+    Scene,
+    WorkPlane,
     candidate_maps,
     find_strands,
     local_contrast,
     thresholds,
 )
-from dlo_casadi.vision.workplane import ExpectedLine, Scene, WorkPlane
 
 _State: TypeAlias = tuple[float, tuple[int, ...], float, float]  # cost, path, seen, total
 _BEAM = 40  # chains that are followed at a time
@@ -61,7 +63,8 @@ class Workings:
     cut: float = 0.0  # level above which a pixel may be cable
     strands: list[Strand] = field(default_factory=list)  # all at that level
     chosen: tuple[Array, ...] = ()  # those that make up the cable, from start to end
-    unsound: Array | None = None  # (K, 2) [m], places on it that do not look like the cable
+    unsound: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    """Places (K, 2) [m] on it that do not look like the cable."""
     pixels: Array | None = None  # (K, 2) [px], the line that was found
     gaps: tuple[int, ...] = ()  # indices of those after which a stretch is missing
 

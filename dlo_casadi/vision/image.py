@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageFile
 
 from dlo_casadi.errors import VisionError, counted
-from dlo_casadi.vision.camera import Array, Picture, View
+from dlo_casadi.vision.camera import Array, Picture
 from dlo_casadi.vision.chain import Workings
 
 # Blue, green, red.
@@ -169,35 +169,30 @@ def draw_steps(image: Picture, workings: Workings) -> dict[str, Picture]:
             _polyline(picture, at, _BLUE, 2)
             _text(picture, at[len(at) // 2], str(k + 1), _BLUE, 0.5)
     pictures["4_centerline"] = picture = image.copy()
-    if workings.view is not None:
-        _draw_line(picture, workings.view, workings)
+    view, pixels, size = workings.view, workings.pixels, max(1.0, max(image.shape[:2]) / 1200)
+    thick = max(1, round(1.5 * size))
+    if view is not None:
+        # markers green, sound stretches blue with arrows from start to end, unsound profiles red
+        for marker in view.markers:
+            _polyline(picture, np.vstack([marker, marker[:1]]), _GREEN, thick)
+        for at in view.to_pixels(workings.unsound):
+            cv2.circle(picture, _pixel(at), thick, _RED, -1, cv2.LINE_AA)
+    if pixels is not None:
+        for part in np.split(pixels, np.array(workings.gaps, dtype=int) + 1):
+            _polyline(picture, part, _BLUE, thick)
+        for k in np.linspace(0, len(pixels) - 1, 9)[1:-1].astype(int):
+            ahead = pixels[min(k + 3, len(pixels) - 1)] - pixels[max(k - 3, 0)]
+            step = 9 * size * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+            ends = _pixel(pixels[k] - step), _pixel(pixels[k] + step)
+            cv2.arrowedLine(picture, *ends, _ORANGE, max(2, round(2 * size)), cv2.LINE_AA, 0, 0.7)
+    if view is not None:
+        _mark_fixtures(picture, workings, view.to_pixels, 0.6 * size)
     return pictures
 
 
 def encoded(picture: Picture, ending: str) -> bytes:
     """Content of a picture's file, in the format of its ending, such as ".jpg"."""
     return bytes(cv2.imencode(ending, picture)[1])
-
-
-def _draw_line(picture: Picture, view: View, workings: Workings) -> None:
-    """Markers green, sound stretches blue with arrows from start to end, unsound profiles red."""
-    size = max(1.0, max(picture.shape[:2]) / 1200)
-    thick = max(1, round(1.5 * size))
-    for marker in view.markers:
-        _polyline(picture, np.vstack([marker, marker[:1]]), _GREEN, thick)
-    if workings.unsound is not None:
-        for at in view.to_pixels(workings.unsound):
-            cv2.circle(picture, _pixel(at), thick, _RED, -1, cv2.LINE_AA)
-    line = workings.pixels
-    if line is not None:
-        for part in np.split(line, np.array(workings.gaps, dtype=int) + 1):
-            _polyline(picture, part, _BLUE, thick)
-        for k in np.linspace(0, len(line) - 1, 9)[1:-1].astype(int):
-            ahead = line[min(k + 3, len(line) - 1)] - line[max(k - 3, 0)]
-            step = 9 * size * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
-            ends, wide = (_pixel(line[k] - step), _pixel(line[k] + step)), max(2, round(2 * size))
-            cv2.arrowedLine(picture, *ends, _ORANGE, wide, cv2.LINE_AA, 0, 0.7)
-    _mark_fixtures(picture, workings, view.to_pixels, 0.6 * size)
 
 
 def _mark_fixtures(

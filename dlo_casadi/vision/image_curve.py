@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, Flags, Picture, Viewpoint
+from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, Viewpoint
 from dlo_casadi.vision.centerline import FINE, measure_line
 from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.curves import chord_length, normals
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
-Places: TypeAlias = NDArray[np.intp]
 _NEAREST = 0.2  # m: least distance from which a cable is photographed
 _BESIDE = 1.6  # widths between two stretches below which they share an edge
 _APART = 2.0  # widths along the line from which two places are different stretches
@@ -87,23 +84,9 @@ def see_cable(
 ) -> ImageCurve:
     """Find the cable in front of the board, order it from start to end, refine it to sub-pixel.
 
-    The photograph is searched as the plane that faces the camera at the distance of the fixtures.
-
-    Parameters
-    ----------
-    image : (H, W, 3) uint8
-        The photograph, blue, green, red.
-    viewpoint : Viewpoint
-        Where the camera stands.
-    cable : KnownCable
-        Its fixtures, (3,) [m] each, and its size.
-    workings : Workings, optional
-        Is filled with what the steps have seen, also where one of them fails.
-
-    Raises
-    ------
-    VisionError
-        If no cable or more than one is found, or if it does not lead to the fixtures.
+    The photograph is searched as the plane that faces the camera at the distance of the fixtures,
+    (3,) [m] each. `viewpoint` tells where the camera stands; the rest is as in
+    `extract_centerline`.
     """
     diameter, workings = cable.diameter, workings or Workings()
     depths = viewpoint.in_camera(cable.fixtures)[:, 2]
@@ -215,7 +198,7 @@ def loops_either_way(curve: ImageCurve) -> list[ImageCurve]:
     return ways
 
 
-def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Places, Places, float]:
+def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Indices, Indices, float]:
     """Match two lines, in order, by the distances from each other's epipolar lines.
 
     For rays a and b of the same point b^T E a = 0, with the essential matrix E = [t]_x R of the
@@ -275,7 +258,7 @@ def places_along(curve: ImageCurve, points: Array) -> Array:
     return np.where((found >= 0) & (off < _CAP), found / (len(points) - 1), np.nan)
 
 
-def nearest_in_order(away: Array) -> Places:
+def nearest_in_order(away: Array) -> Indices:
     """Columns of a table of distances (K, M) that rows belong to, never going back.
 
     Distances in standard deviations. Of several columns of a row the nearest is taken; -1 where
@@ -288,7 +271,7 @@ def nearest_in_order(away: Array) -> Places:
     return found
 
 
-def triangulate(one: ImageCurve, other: ImageCurve, first: Places, second: Places) -> Array:
+def triangulate(one: ImageCurve, other: ImageCurve, first: Indices, second: Indices) -> Array:
     """Points (P, 3) [m] of least squares from the rays of matched pixels.
 
     With a = q_xy / q_z and q = R p + t each ray gives two equations, (a R_z - R_xy) p = t_xy - a
@@ -305,36 +288,25 @@ def triangulate(one: ImageCurve, other: ImageCurve, first: Places, second: Place
     return np.linalg.solve(normal, np.einsum("pki,pk->pi", A, b)[..., None])[..., 0]
 
 
-def _cheapest_way(cost: Array) -> tuple[Places, Places]:
+def _cheapest_way(cost: Array) -> tuple[Indices, Indices]:
     """Places (P,), (P,) of the pairs on the cheapest way through a table of costs (K, L).
 
     In a row, D_l = c_l + min(A_l, D_l-1) with A the best from the row before; with C the running
-    sum of c that is D_l = C_l + min_{m <= l} (A_m - C_m-1), which needs no loop.
+    sum of c that is D_l = C_l + min_{m <= l} (A_m - C_m-1), which needs no loop. A row and a column
+    before the table, and what is added beyond its end, are the price of pixels that are left over.
     """
     high, wide = cost.shape
-    total = np.empty_like(cost)
-    total[0] = np.minimum(cost[0] + _CAP**2 * np.arange(wide), np.cumsum(cost[0]))
-    for k in range(1, high):
-        above = total[k - 1].copy()
-        above[1:] = np.minimum(above[1:], total[k - 1, :-1])
-        above[0] = min(above[0], _CAP**2 * k)
+    total, beyond = np.zeros((high + 1, wide + 1)), np.full((high + 1, wide + 1), np.inf)
+    total[0], total[:, 0] = _CAP**2 * np.arange(wide + 1), _CAP**2 * np.arange(high + 1)
+    beyond[-1], beyond[:, -1] = total[0, ::-1], total[::-1, 0]
+    for k in range(high):
+        above = np.minimum(total[k, :-1], total[k, 1:])
         run = np.cumsum(cost[k])
-        total[k] = run + np.minimum.accumulate(above - run + cost[k])
-    last_row = total[-1] + _CAP**2 * np.arange(wide)[::-1]
-    last_column = total[:, -1] + _CAP**2 * np.arange(high)[::-1]
-    if last_row.min() <= last_column.min():
-        k, m = high - 1, int(last_row.argmin())
-    else:
-        k, m = int(last_column.argmin()), wide - 1
-    way = [(k, m)]
-    while k > 0 or m > 0:
-        behind = total[k, m] - cost[k, m]
-        before = [(k - 1, m - 1), (k - 1, m), (k, m - 1)]
-        best, i, j = min((total[i, j], i, j) for i, j in before if i >= 0 and j >= 0)
-        skipped = _CAP**2 * (m if k == 0 else k if m == 0 else np.inf)
-        if skipped <= behind + 1e-9 and skipped <= best:
-            break
-        k, m = i, j
-        way.append((k, m))
-    first, second = np.array(way[::-1]).T
+        total[k + 1, 1:] = run + np.minimum.accumulate(above - run + cost[k])
+    k, m = map(int, np.unravel_index(np.argmin(total + beyond), total.shape))
+    way = []
+    while k > 0 and m > 0:
+        way.append((k - 1, m - 1))
+        _, k, m = min((total[i, j], i, j) for i, j in ((k - 1, m - 1), (k - 1, m), (k, m - 1)))
+    first, second = np.array(way[::-1], int).reshape(-1, 2).T
     return first, second

@@ -11,14 +11,13 @@ import numpy as np
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import Board, locate_camera
-from dlo_casadi.vision.camera import Array, Camera, Picture
+from dlo_casadi.vision.camera import Array, Camera, Indices, Picture
 from dlo_casadi.vision.centerline import SPACING
 from dlo_casadi.vision.curves import chord_length
 from dlo_casadi.vision.image import spoilt
 from dlo_casadi.vision.image_curve import (
     TIP,
     ImageCurve,
-    Places,
     loops_either_way,
     match_lines,
     see_cable,
@@ -86,11 +85,7 @@ def measure_views(
     Parameters
     ----------
     photographs : dict of str to (H, W, 3) uint8
-        Pictures of one pose, blue, green, red, by their names.
-    board : Board
-        The board that is seen in each.
-    camera : Camera
-        That took them all.
+        Pictures of one pose by their names: one `camera` took them all, each shows the `board`.
     cable : KnownCable
         Its fixtures, (3,) [m] each, and its size.
 
@@ -213,8 +208,8 @@ class _Pair(NamedTuple):
 
     one: ImageCurve
     other: ImageCurve
-    first: Places
-    second: Places
+    first: Indices
+    second: Indices
     share: float
     angle: float
 
