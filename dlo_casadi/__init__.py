@@ -31,25 +31,18 @@ if TYPE_CHECKING:
 # Module -> its public names. They are imported when they are first asked for, so that the command
 # answers at once and an interrupt finds it ready.
 _PUBLIC = {
-    "api": ("PredictedShape", "Result", "fit", "predict"),
-    "codegen": ("CompiledSolver",),
-    "config": ("Config", "load_config"),
-    "effects": ("EFFECTS", "Cable"),
-    "equilibrium.equilibrium": ("Equilibrium",),
-    "equilibrium.pose": ("Pose",),
-    "equilibrium.solve": ("solve_equilibrium",),
-    "errors": (
-        "ConfigError",
-        "DloError",
-        "EquilibriumError",
-        "EstimationError",
-        "MeasurementError",
-        "VisionError",
-    ),
-    "model.cable_model": ("CableModel",),
-    "session": ("Outcome", "run_session"),
+    "api": "PredictedShape Result fit predict",
+    "codegen": "CompiledSolver",
+    "config": "Config load_config",
+    "effects": "EFFECTS Cable",
+    "equilibrium.equilibrium": "Equilibrium",
+    "equilibrium.pose": "Pose",
+    "equilibrium.solve": "solve_equilibrium",
+    "errors": "ConfigError DloError EquilibriumError EstimationError MeasurementError VisionError",
+    "model.cable_model": "CableModel",
+    "session": "Outcome run_session",
 }
-_HOMES = {name: f"{__name__}.{module}" for module, names in _PUBLIC.items() for name in names}
+_HOMES = {name: f"{__name__}.{home}" for home, names in _PUBLIC.items() for name in names.split()}
 
 __all__ = sorted(_HOMES)
 

@@ -15,12 +15,13 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from dlo_casadi.config import Config, implausible_quaternion, load_config
+from dlo_casadi.config import Config, load_config
+from dlo_casadi.config.values import implausible_quaternion
 from dlo_casadi.equilibrium.cable_shape import CableShape, shape_in
 from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.equilibrium.pose import Branch, Pose
@@ -31,6 +32,8 @@ from dlo_casadi.report.notebook import outcome_html, outcome_text, shape_html, s
 from dlo_casadi.report.parameters_text import parameters_of
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
+
+Kind = TypeVar("Kind")
 
 
 class PredictedShape(CableShape):
@@ -83,30 +86,13 @@ class Result(Outcome):
         with ResultsFolder(folder, self.config) as results:
             return results.write(self)
 
-    def predict(
-        self,
-        end: Sequence[float] | None = None,
-        *,
-        start: Sequence[float] | None = None,
-        start_heading: float | None = None,
-        end_heading: float | None = None,
-        start_orientation: Sequence[float] | None = None,
-        end_orientation: Sequence[float] | None = None,
-        turns: float = 0.0,
-        branch: Branch | None = None,
-    ) -> PredictedShape:
-        """Predict the fitted cable's shape in a new pose: `dlo_casadi.predict` without a file."""
-        return predict(
-            parameters_of(self),
-            end,
-            start=start,
-            start_heading=start_heading,
-            end_heading=end_heading,
-            start_orientation=start_orientation,
-            end_orientation=end_orientation,
-            turns=turns,
-            branch=branch,
-        )
+    def predict(self, end: Sequence[float] | None = None, **ends: Any) -> PredictedShape:
+        """Predict the fitted cable's shape in a new pose: `dlo_casadi.predict` without a file.
+
+        Takes what that takes: start, start_heading, end_heading, start_orientation,
+        end_orientation, turns, branch.
+        """
+        return predict(parameters_of(self), end, **ends)
 
 
 def fit(
@@ -163,8 +149,7 @@ def fit(
     if diagnosis is not None:
         options = config.diagnosis.model_copy(update={"enabled": diagnosis})
         config = replace(config, diagnosis=options)
-    outcome = run_session(config, progress, executor)
-    return Result(**{field.name: getattr(outcome, field.name) for field in fields(outcome)})
+    return _as(Result, run_session(config, progress, executor))
 
 
 def predict(
@@ -220,55 +205,39 @@ def predict(
             "  Try: the parameters.yaml or the results folder of a fit."
         )
     cable = parameters if isinstance(parameters, FittedCable) else load_parameters(parameters)
-    pose = _pose(
-        cable,
-        end,
-        start,
-        {
-            "start_heading": start_heading,
-            "end_heading": end_heading,
-            "start_orientation": start_orientation,
-            "end_orientation": end_orientation,
-        },
-        turns,
-        branch,
-    )
-    return _shown(shape_in(cable, pose))
+    asked = {"start": start, "end": end, "turns": turns, "branch": branch}
+    asked |= {"start_heading": start_heading, "end_heading": end_heading}
+    asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
+    shape = shape_in(cable, _pose(cable, asked))
+    other = shape.other_side
+    if other is None:
+        return _as(PredictedShape, shape)
+    return replace(_as(PredictedShape, shape), other_side=_as(PredictedShape, other))
 
 
-def _shown(shape: CableShape) -> PredictedShape:
-    """The same shape and its other side, if it has one, with `plot` and a printed form."""
-    values = {field.name: getattr(shape, field.name) for field in fields(shape)}
-    if shape.other_side is not None:
-        values["other_side"] = _shown(shape.other_side)
-    return PredictedShape(**values)
+def _as(kind: type[Kind], found: Any) -> Kind:
+    """The same values as an object of a class that can show itself."""
+    return kind(**{field.name: getattr(found, field.name) for field in fields(found)})
 
 
-def _pose(
-    cable: FittedCable,
-    end: Sequence[float] | None,
-    start: Sequence[float] | None,
-    directions: Mapping[str, Any],
-    turns: float,
-    branch: Branch | None,
-) -> Pose:
+def _pose(cable: FittedCable, asked: Mapping[str, Any]) -> Pose:
     """End conditions, checked against the boundary; what is not given is as in the session."""
     model, shared = cable.model, cable.metadata.fixtures
-    name, size = model.cable.name, model.node.dimension
+    name, size, spatial = model.cable.name, model.node.dimension, model.in_space
+    start, end, branch = asked["start"], asked["end"], asked["branch"]
     if branch is not None and branch not in get_args(Branch):
         raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
-    if branch is not None and model.in_space:
+    if branch is not None and spatial:
         raise DloError(f"{name!r} is in space: a branch has no meaning")
     if model.end == "free" and end is not None:
         raise DloError(f"the end of {name!r} is free: it cannot be held at {end} m")
     if model.end != "free" and end is None:
-        place = "X Y Z" if model.in_space else "X Y"
         raise DloError(
             f"the end of {name!r} is {model.end}: where is it?\n"
-            f"  Try: --end {place} [m], in Python end."
+            f"  Try: --end {' '.join(model.node.axes).upper()} [m], in Python end."
         )
-    turns = _number(turns, "turns", "full turns")
-    if turns and not (model.in_space and model.start == model.end == "clamped"):
+    turns = _number(asked["turns"], "turns", "full turns")
+    if turns and not (spatial and model.start == model.end == "clamped"):
         raise DloError(f"{name!r} has no turns: it is not in space and clamped at both ends")
     if start is None:
         start = shared.get("start") or (0.0,) * size
@@ -278,59 +247,64 @@ def _pose(
         turns=turns,
         branch=branch,
         name=name or "cable",
-        **_held(cable, directions),
+        **_directions(cable, asked),
     )
 
 
-def _held(cable: FittedCable, given: Mapping[str, Any]) -> dict[str, Any]:
+def _directions(cable: FittedCable, asked: Mapping[str, Any]) -> dict[str, Any]:
     """Directions of the clamps, by their key; none of pins."""
-    model, shared = cable.model, cable.metadata.fixtures
-    kind, other, unit = "heading", "orientation", " [rad]"
-    where = ("a plane", "two numbers of gravity")
-    if model.in_space:
-        kind, other, unit = other, kind, " [qx, qy, qz, qw]"
-        where = ("space", "three numbers of gravity")
+    model, shared, name = cable.model, cable.metadata.fixtures, repr(cable.model.cable.name)
+    kind, unit, other, where = _DIRECTIONS[model.node.increment]
     found: dict[str, Any] = {}
     for side, held in (("start", model.start), ("end", model.end)):
-        key, value = f"{side}_{kind}", given[f"{side}_{kind}"]
-        if given[f"{side}_{other}"] is not None:
-            raise DloError(
-                f"{side}_{other}: {model.cable.name!r} is in {where[0]} ({where[1]}).\n  Try: {key}"
-                f"{unit}"
-            )
+        key = f"{side}_{kind}"
+        value = asked[key]
+        if asked[f"{side}_{other}"] is not None:
+            raise DloError(f"{side}_{other}: {name} is in {where}.\n  Try: {key}{unit}")
         if held != "clamped" and value is not None:
-            raise DloError(f"the {side} of {model.cable.name!r} is {held}: {key} has no meaning")
+            raise DloError(f"the {side} of {name} is {held}: {key} has no meaning")
         if held != "clamped":
             continue
         value = shared.get(key) if value is None else value
         if value is None:
             raise DloError(
-                f"the {side} of {model.cable.name!r} is clamped, and its {kind} differed "
-                f"from pose to pose: give {key}{unit}"
+                f"the {side} of {name} is clamped, and its {kind} differed from pose to pose: "
+                f"give {key}{unit}"
             )
-        found[key] = _orientation(value, key) if model.in_space else _number(value, key, "rad")
+        found[key] = (
+            _orientation(value, key) if kind == "orientation" else _number(value, key, "rad")
+        )
     return found
 
 
+# By the numbers that turn a node: what declares a clamp's direction, what would elsewhere, where.
+_DIRECTIONS = {
+    1: ("heading", " [rad]", "orientation", "a plane (two numbers of gravity)"),
+    3: ("orientation", " [qx, qy, qz, qw]", "heading", "space (three numbers of gravity)"),
+}
 _WORDS = {2: "two finite numbers (x, y)", 3: "three finite numbers (x, y, z)"}
 
 
-def _point(values: Sequence[float], what: str, size: int) -> tuple[float, ...]:
+def _point(values: Any, what: str, size: int) -> tuple[float, ...]:
     point = _finite(values)
     if len(point) != size:
         raise DloError(f"{what}: {_WORDS[size]} in metres belong here, found {values!r}")
     return point
 
 
-def _orientation(values: Sequence[float], what: str) -> tuple[float, ...]:
+def _orientation(values: Any, what: str) -> tuple[float, ...]:
     quaternion = _finite(values)
-    if not quaternion:
-        raise DloError(
-            f"{what}: four finite numbers [qx, qy, qz, qw] belong here, found {values!r}"
-        )
-    if wrong := implausible_quaternion(quaternion):
+    wrong = "four finite numbers [qx, qy, qz, qw] belong here"
+    if not quaternion or (wrong := implausible_quaternion(quaternion)):
         raise DloError(f"{what}: {wrong}, found {values!r}")
     return quaternion
+
+
+def _number(value: Any, what: str, unit: str) -> float:
+    numbers = _finite([value])
+    if not numbers:
+        raise DloError(f"{what}: a finite number [{unit}] belongs here, found {value!r}")
+    return numbers[0]
 
 
 def _finite(values: Any) -> tuple[float, ...]:
@@ -340,13 +314,3 @@ def _finite(values: Any) -> tuple[float, ...]:
     except (TypeError, ValueError):
         return ()
     return tuple(array.tolist()) if array.ndim == 1 and np.all(np.isfinite(array)) else ()
-
-
-def _number(value: Any, what: str, unit: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = np.nan
-    if not np.isfinite(number):
-        raise DloError(f"{what}: a finite number [{unit}] belongs here, found {value!r}")
-    return number

@@ -18,7 +18,7 @@ from rich.console import Console
 import dlo_casadi
 from dlo_casadi.cli import COMMANDS, main, watch
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
-from dlo_casadi.config.schema import config_schema, schema_text
+from dlo_casadi.config.template import config_schema, schema_text
 from dlo_casadi.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from dlo_casadi.cli.watch import Counter
-from dlo_casadi.config.limits import implausible_quaternion
+from dlo_casadi.config.values import implausible_quaternion
 from dlo_casadi.errors import counted
 from dlo_casadi.fleet.overview import overview_html
 from dlo_casadi.paper.algorithm1 import Algorithm1Status, _message

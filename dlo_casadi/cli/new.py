@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from dlo_casadi.cli.options import command, one_of, option, print_json
-from dlo_casadi.config.schema import schema_text
-from dlo_casadi.config.template import template
+from dlo_casadi.config.template import schema_text, template
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
 

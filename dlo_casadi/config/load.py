@@ -6,18 +6,16 @@ import difflib
 import math
 import stat
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from dlo_casadi.config.declared_effects import wrong_effects
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.explain import explain
-from dlo_casadi.config.limits import FINEST_STD, FINEST_TOLERANCE, Range
 from dlo_casadi.config.measuring import Tolerances
-from dlo_casadi.config.problems import Problem, kind_of, show
+from dlo_casadi.config.options import DeclaredEffect
+from dlo_casadi.config.problems import Place, Problem, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, File, Pose, SkippedPose
-from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS
+from dlo_casadi.config.values import FINEST_STD, FINEST_TOLERANCE, Range
+from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, Setup
 from dlo_casadi.effects import Cable as EffectsCable
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS
@@ -46,54 +44,40 @@ def load_config(path: str | Path) -> Config:
     source = Path(path)
     document = Document.read(source)
     if not isinstance(document.data, dict):
+        found = kind_of(document.data)
         raise ConfigError(
-            "a mapping with cable: and experiment: belongs at the top, "
-            f"found {kind_of(document.data)}",
-            file=source,
+            f"a mapping with cable: and experiment: belongs at the top, found {found}", file=source
         )
-    try:
-        file = File.model_validate(document.data, context={"folder": source.absolute().parent})
-    except ValidationError as error:
-        raise document.error(explain(error.errors(), document.data)) from None
-
+    config = Config(source.absolute(), **dict(document.checked(File)))
     if problems := [
-        *_contradictions(file.experiment),
-        *_weightless(file),
-        *wrong_effects(file),
-        *_impossible_values(file.experiment, file.cable.length),
+        *_contradictions(config.experiment),
+        *_weightless(config),
+        *wrong_effects(config),
+        *_impossible_values(config.experiment, config.cable.length),
     ]:
         raise document.error(problems)
 
-    poses = file.experiment.poses
-    unreachable = _unreachable(poses, file.cable, file.experiment.tolerances)
+    poses = config.experiment.poses
+    unreachable = _unreachable(poses, config.cable, config.experiment.tolerances)
     reachable = tuple(pose for pose in poses if pose.name not in unreachable)
     reasons = unreachable | _missing(reachable)
     n_fit = sum(pose.role == "fit" and pose.name not in reasons for pose in poses)
     if n_fit == 0:
         lost = [
-            Problem(
-                ("experiment", "poses", i), f"pose {i + 1} ({pose.shown_by}): {reasons[pose.name]}"
-            )
+            Problem(("experiment", "poses", i), f"{_called(i, pose)}: {reasons[pose.name]}")
             for i, pose in enumerate(poses)
             if pose.role == "fit"
         ]
         raise document.error(lost, "no pose to fit is left")
-    warnings = _oddities(file)
+    warnings = [*_oddities(config)]
     if n_fit == 1:
         warnings.append("only one pose to fit: what it tells cannot be checked on another one")
-    return Config(
-        path=source.absolute(),
-        cable=file.cable,
-        experiment=file.experiment.model_copy(update={"poses": reachable}),
-        model=file.model,
-        estimation=file.estimation,
-        diagnosis=file.diagnosis,
+    skipped = [pose for pose in poses if pose.name in reasons]
+    return replace(
+        config,
+        experiment=config.experiment.model_copy(update={"poses": reachable}),
         warnings=tuple(warnings),
-        skipped=tuple(
-            SkippedPose(pose.name, reasons[pose.name], pose.role)
-            for pose in poses
-            if pose.name in reasons
-        ),
+        skipped=tuple(SkippedPose(pose.name, reasons[pose.name], pose.role) for pose in skipped),
     )
 
 
@@ -115,13 +99,16 @@ _COBYLA_LINKS = 20
 _LARGEST_HEADINGS = {"start": 6.3, "end": 25.0}
 
 
+def _called(index: int, pose: Pose) -> str:
+    return f"pose {index + 1} ({pose.shown_by})"
+
+
 def _contradictions(experiment: Experiment) -> Iterator[Problem]:
     """Find poses that do not fit the boundary, the kind of measurement, or each other."""
-    measurement, poses = experiment.measurement, experiment.poses
+    measurement, held, poses = experiment.measurement, experiment.boundary, experiment.poses
     if experiment.in_space and measurement.kind == "images" and measurement.board is None:
         text = "photographs of a cable in space need a board of markers; a reference is of a plane"
         yield Problem(("experiment", "measurement"), text)
-    held = experiment.boundary
     if experiment.in_space and held.start == "pinned" and held.end == "free":
         text = (
             "on a ball joint and with a free end a cable in space may be turned about gravity, "
@@ -138,8 +125,8 @@ def _contradictions(experiment: Experiment) -> Iterator[Problem]:
         if pose.branch == "previous" and i == 0:
             wrong.append(("the first pose continues none; branch: ccw or cw?", "branch"))
         for message, key in wrong:
-            at = ("experiment", "poses", i) if key is None else ("experiment", "poses", i, key)
-            yield Problem(at, f"pose {i + 1} ({pose.shown_by}): {message}")
+            at: Place = ("experiment", "poses", i)
+            yield Problem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
     if not any(pose.role == "fit" for pose in poses):
         text = "no pose has role: fit, there is nothing to fit to"
         yield Problem(("experiment", "poses"), text)
@@ -160,21 +147,17 @@ def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, st
         yield "several photographs are of a cable in space; gravity: two numbers", "files"
 
 
-def _weightless(file: File) -> Iterator[Problem]:
+def _weightless(config: Config) -> Iterator[Problem]:
     """Why a mass that is not declared cannot be found."""
-    experiment = file.experiment
-    if file.cable.mass is not None:
+    experiment, at = config.experiment, ("cable", "mass")
+    if config.cable.mass is not None:
         return
-    at = ("cable", "mass")
     if not any(experiment.gravity):
         yield Problem(at, "mass: null: without gravity nothing depends on it; declare any")
     elif not any(pose.readings for pose in experiment.poses if pose.role == "fit"):
-        yield Problem(
-            at,
-            "mass: null: shapes tell stiffness over weight alone. Try: the mass in kg, or "
-            "end_force of a fit pose, which tells both",
-        )
-    elif any(item.name == UNKNOWN_MASS.name for item in file.model.effects):
+        text = "mass: null: shapes tell stiffness over weight alone. Try: the mass in kg, or "
+        yield Problem(at, f"{text}end_force of a fit pose, which tells both")
+    elif any(item.name == UNKNOWN_MASS.name for item in config.model.effects):
         yield Problem(at, f"mass: null: {UNKNOWN_MASS.name} is of a declared mass; one of the two")
 
 
@@ -226,15 +209,13 @@ def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) ->
     slack = 3.0 * math.hypot(tolerances.length, tolerances.end)
     reasons: dict[str, str] = {}
     for pose in poses:
-        if pose.end is None:
-            continue
-        distance = math.dist(pose.start, pose.end)
+        end = pose.end or pose.start
+        distance = math.dist(pose.start, end)
         if distance > cable.length + slack:
-            meant = ", ".join(f"{x / 1e3:g}" for x in pose.end)
+            meant = ", ".join(f"{x / 1e3:g}" for x in end)
             hint = f" Did you mean ({meant})?" if 10 * cable.length < distance else ""
             reasons[pose.name] = (
-                f"end ({', '.join(f'{x:g}' for x in pose.end)}) m is {distance:.4g} m from the "
-                "start; "
+                f"end ({', '.join(f'{x:g}' for x in end)}) m is {distance:.4g} m from the start; "
                 f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?{hint}"
             )
     return reasons
@@ -247,74 +228,62 @@ def _missing(poses: Iterable[Pose]) -> dict[str, str]:
 
 
 def _absent(file: Path) -> str:
-    """Why there is no such file to be read; empty if there is."""
+    """Why there is no such file to be read, and what may be meant; empty if there is."""
     try:
         if stat.S_ISREG(file.stat().st_mode):
             return ""
         return f"{file} is no file; a photograph or a CSV belongs here"
     except (FileNotFoundError, NotADirectoryError):
-        return f"{file} does not exist; {_near(file)}"
+        names = [path.name for path in file.parent.glob("*")]
+        near = difflib.get_close_matches(file.name, names, 1, cutoff=0.8)
+        meant = f"did you mean {near[0]}?" if near else "files are found relative to the YAML"
+        return f"{file} does not exist; {meant}"
     except OSError as error:
         return f"{show(str(file))} cannot be read: {error.strerror}"
 
 
-def _near(file: Path) -> str:
-    """What may be meant by a file that does not exist."""
-    try:
-        names = [path.name for path in file.parent.iterdir()]
-    except OSError:
-        names = []
-    near = difflib.get_close_matches(file.name, names, 1, cutoff=0.8)
-    return f"did you mean {near[0]}?" if near else "files are found relative to the YAML"
-
-
-def _oddities(file: File) -> list[str]:
+def _oddities(config: Config) -> Iterator[str]:
     """Find what can be computed with but is probably not meant."""
-    cable, experiment = file.cable, file.experiment
-    held, poses = experiment.boundary, experiment.poses
-    warnings = []
-    if cable.youngs_modulus is not None and cable.youngs_modulus < 1.0e4:
-        warnings.append(
-            f"youngs_modulus {cable.youngs_modulus:g} Pa is softer than any cable: in pascal?"
-        )
+    cable, experiment, estimation = config.cable, config.experiment, config.estimation
+    young, std = cable.youngs_modulus, experiment.measurement.std
+    n, element = config.model.n, config.model.element
+    if young is not None and young < 1.0e4:
+        yield f"youngs_modulus {young:g} Pa is softer than any cable: in pascal?"
     if cable.mass is None:
-        warnings.append(
+        yield (
             f"cable.mass is not declared: stages before the batch take {cable.prior_mass:.3g} kg, "
             "that of a solid cable of this diameter; the readings tell it from there on"
         )
-    spans = [math.dist(pose.start, pose.end) for pose in poses if pose.end is not None]
+    spans = [math.dist(pose.start, pose.end) for pose in experiment.poses if pose.end is not None]
     if spans and 0.0 < 50.0 * max(spans) < cable.length:
-        warnings.append(
+        yield (
             f"the cable is {cable.length:g} m long, but its ends are never more than "
             f"{max(spans):g} m apart: all in metres?"
         )
     if math.hypot(*experiment.gravity) > 100.0:
-        warnings.append(f"gravity is {math.hypot(*experiment.gravity):g} m/s^2: in m/s^2?")
-    std = experiment.measurement.std
+        yield f"gravity is {math.hypot(*experiment.gravity):g} m/s^2: in m/s^2?"
     if std is not None and std > 0.02 * cable.length:
-        warnings.append(f"std {std:g} m is large for a cable of {cable.length:g} m: in metres?")
-    n, element, links = file.model.n, file.model.element, file.estimation.algorithm1_n
+        yield f"std {std:g} m is large for a cable of {cable.length:g} m: in metres?"
     if n is not None and n < _COARSE[ELEMENTS[element].order]:
-        warnings.append(
+        yield (
             f"model.n: {counted(n, f'{element} element')}: so coarse that the mesh's own error "
             "can look like a missing effect. Without model.n the mesh is chosen from the data"
         )
     if n is not None and n > _FINE:
-        warnings.append(
+        yield (
             f"model.n: {counted(n, 'element')} take minutes and much memory; the mesh that is "
             f"chosen from the data, without model.n, never has more than {_FINE}"
         )
-    if file.estimation.algorithm1_inner == "cobyla" and links > _COBYLA_LINKS:
-        warnings.append(
+    links = estimation.algorithm1_n
+    if estimation.algorithm1_inner == "cobyla" and links > _COBYLA_LINKS:
+        yield (
             f"estimation.algorithm1_n: COBYLA takes about {(links / 10) ** 2:.0f} s for one shape "
             f"of {links} links, and the loop needs hundreds; ipopt takes milliseconds"
         )
     for end in ("start", "end"):
-        headings = {pose.name: getattr(pose, f"{end}_heading") for pose in poses}
-        given = {name: value for name, value in headings.items() if value is not None}
-        if given and getattr(held, end) == "pinned":
-            warnings.append(f"{end}_heading is not used, the {end} is pinned: {', '.join(given)}")
-    return warnings
+        given = [p.name for p in experiment.poses if getattr(p, f"{end}_heading") is not None]
+        if given and getattr(experiment.boundary, end) == "pinned":
+            yield f"{end}_heading is not used, the {end} is pinned: {', '.join(given)}"
 
 
 def _impossible_values(experiment: Experiment, length: float) -> Iterator[Problem]:
@@ -337,3 +306,73 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Proble
         most = min(q.upper - q.nominal, q.nominal - q.lower)
         if wrong := Range(FINEST_TOLERANCE, most, q.unit).complaint(declared[key]):
             yield Problem(("experiment", "tolerances", key), f"tolerances.{key}: {wrong}")
+
+
+# ---- declared effects ----------------------------------------------------------------------------
+
+
+def declared_setup(config: Config) -> Setup:
+    """How the cable is held and measured, as far as a configuration tells."""
+    cable, experiment = config.cable, config.experiment
+    measurement = experiment.measurement
+    return Setup(
+        cable=EffectsCable(
+            length=cable.length,
+            mass=cable.prior_mass,
+            diameter=cable.diameter,
+            bending_stiffness=cable.prior_bending_stiffness,
+            name=cable.name,
+            straight=cable.rest_shape == "straight",
+            torsional_stiffness=cable.prior_torsional_stiffness if experiment.in_space else None,
+        ),
+        start=experiment.boundary.start,
+        end=experiment.boundary.end,
+        gravity=experiment.gravity,
+        curved=cable.rest_shape != "straight",
+        n_poses=sum(pose.role == "fit" for pose in experiment.poses),
+        camera=measurement.kind == "images" and None not in (measurement.board, measurement.camera),
+        readings=tuple({name for pose in experiment.poses for name in pose.readings}),
+        tolerances=experiment.tolerances.model_dump(),
+    )
+
+
+def wrong_effects(config: Config) -> list[Problem]:
+    """Find effects, and parameters of theirs, that do not exist or cannot be as declared."""
+    setup = declared_setup(config)
+    found: list[Problem] = []
+    for i, item in enumerate(config.model.effects):
+        found += _wrong(item, ("model", "effects", i), setup)
+    for i, name in enumerate(config.diagnosis.exclude):
+        if name not in EFFECTS:
+            text = f"diagnosis.exclude: {_unknown(name)}"
+            found.append(Problem(("diagnosis", "exclude", i), text))
+    return found
+
+
+def _wrong(item: DeclaredEffect, at: Place, setup: Setup) -> Iterator[Problem]:
+    """Find what is wrong with one declared effect."""
+    if item.name not in EFFECTS:
+        yield Problem((*at, "name"), f"model.effects: {_unknown(item.name)}")
+        return
+    effect, said = EFFECTS[item.name].made_for(setup), f"model.effects: {item.name}"
+    known = {q.name: q for q in effect.parameters(setup.cable)}
+    values = {name: q.nominal for name, q in known.items()}
+    if refusal := effect.refusal(setup, values):
+        yield Problem((*at, "name"), f"{said}: {refusal}")
+        return
+    for name, declared in item.parameters.items():
+        key = (*at, "parameters", name)
+        if name not in known:
+            hint = did_you_mean(name, known)
+            yield Problem(key, f"{said} has no parameter {name!r}{hint}")
+        elif wrong := Range(*known[name].range, known[name].unit).complaint(declared.value):
+            yield Problem(key, f"{said}.{name}: {wrong}")
+        else:
+            values[name] = declared.value
+    as_declared = all(values.get(name) == item.parameters[name].value for name in item.parameters)
+    if as_declared and (refusal := effect.refusal(setup, values)):
+        yield Problem((*at, "name"), f"{said}: {refusal}")
+
+
+def _unknown(name: str) -> str:
+    return f"no effect is called {name!r}{did_you_mean(name, EFFECTS)}"

@@ -8,7 +8,8 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from dlo_casadi.config.limits import (
+from dlo_casadi.config.problems import did_you_mean
+from dlo_casadi.config.values import (
     COORDINATE,
     DISTORTION,
     FOCAL_LENGTH,
@@ -16,9 +17,14 @@ from dlo_casadi.config.limits import (
     MARKER,
     MOMENT_STD,
     PIXELS,
+    NonNegative,
+    Number,
+    Positive,
+    Row,
+    Section,
+    Vector,
+    within,
 )
-from dlo_casadi.config.problems import did_you_mean
-from dlo_casadi.config.values import NonNegative, Number, Positive, Row, Section, Vector, within
 from dlo_casadi.errors import counted
 from dlo_casadi.model.cable_model import Tolerances as Known
 
@@ -40,8 +46,7 @@ class Camera(Section):
         if fx <= 0.0 or fy <= 0.0 or skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
             text = "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
             raise ValueError(text)
-        wrong = [FOCAL_LENGTH.complaint(f) for f in (fx, fy)]
-        wrong += [PIXELS.complaint(c) for c in (cx, cy)]
+        wrong = [*map(FOCAL_LENGTH.complaint, (fx, fy)), *map(PIXELS.complaint, (cx, cy))]
         if any(wrong):
             raise ValueError("; ".join(filter(None, wrong)))
         return matrix
@@ -57,15 +62,17 @@ class Camera(Section):
         return distortion
 
 
-ARUCO_DICTIONARIES = (
-    *(f"DICT_{k}X{k}_{count}" for k in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
-    "DICT_ARUCO_ORIGINAL",
-    "DICT_ARUCO_MIP_36h12",
-    *(f"DICT_APRILTAG_{family}" for family in ("16h5", "25h9", "36h10", "36h11")),
-)
-
-_FAMILIES = {"ORIGINAL": 1024, "36h12": 250, "16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587}
-_MOST_MARKERS = max(_FAMILIES.values())
+# OpenCV's dictionaries of markers, and how many each has.
+_DICTIONARIES = {
+    **{f"DICT_{k}X{k}_{n}": n for k in (4, 5, 6, 7) for n in (50, 100, 250, 1000)},
+    "DICT_ARUCO_ORIGINAL": 1024,
+    "DICT_ARUCO_MIP_36h12": 250,
+    "DICT_APRILTAG_16h5": 30,
+    "DICT_APRILTAG_25h9": 35,
+    "DICT_APRILTAG_36h10": 2320,
+    "DICT_APRILTAG_36h11": 587,
+}
+_MOST_MARKERS = max(_DICTIONARIES.values())
 _Centers: TypeAlias = dict[Annotated[int, Field(ge=0)], Annotated[Vector, within(COORDINATE)]]
 
 
@@ -85,9 +92,9 @@ class Board(Section):
     @field_validator("dictionary")
     @classmethod
     def _known(cls, name: str) -> str:
-        if name not in ARUCO_DICTIONARIES:
+        if name not in _DICTIONARIES:
             raise ValueError(
-                f"OpenCV has no dictionary {name!r}{did_you_mean(name, ARUCO_DICTIONARIES)}"
+                f"OpenCV has no dictionary {name!r}{did_you_mean(name, _DICTIONARIES)}"
             )
         return name
 
@@ -95,8 +102,7 @@ class Board(Section):
     @classmethod
     def _plausible(cls, centers: _Centers, info: ValidationInfo) -> _Centers:
         name, side = info.data.get("dictionary", ""), info.data.get("marker_size", 0.0)
-        size = name.rsplit("_", 1)[-1]
-        count = int(size) if size.isdigit() else _FAMILIES.get(size, _MOST_MARKERS)
+        count = _DICTIONARIES.get(name, _MOST_MARKERS)
         if too_large := [i for i in centers if i >= count]:
             raise ValueError(f"{name} has no marker {too_large[0]:g}: its ids end at {count - 1}")
         for (i, a), (j, b) in itertools.combinations(centers.items(), 2):

@@ -7,9 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from dlo_casadi.config.limits import MESH, REST_COEFFICIENTS
-from dlo_casadi.config.values import Count, Number, Section, Switch
+from dlo_casadi.config.values import Elements, Number, RestCoefficients, Section, Switch
 from dlo_casadi.thresholds import SIGNIFICANCE
+
+ElementName = Literal["quadratic", "arc", "link"]
 
 
 class EffectParameter(Section):
@@ -47,9 +48,9 @@ class DeclaredEffect(Section):
 class ModelOptions(Section):
     """The declared model."""
 
-    n: Annotated[Count, Field(ge=MESH.least, le=MESH.most)] | None = None
+    n: Elements | None = None
     """Number of elements; chosen from the data when absent."""
-    element: Literal["quadratic", "arc", "link"] = "quadratic"
+    element: ElementName = "quadratic"
     """quadratic (curvature changes in an element: fourth order), arc (it is constant: second
     order, five times cheaper) or link (straight, as in the paper; in a plane only)."""
     effects: tuple[
@@ -75,9 +76,7 @@ class EstimationOptions(Section):
     """Whether outlying points weigh less."""
     plausibility: Switch = True
     """Whether contradictions of the configuration stop the fit, or leave out a single pose."""
-    rest_curvature_coefficients: (
-        Annotated[Count, Field(ge=REST_COEFFICIENTS.least, le=REST_COEFFICIENTS.most)] | None
-    ) = None
+    rest_curvature_coefficients: RestCoefficients | None = None
     """Number of coefficients of the rest curvature, 0 for a straight one; chosen from the data."""
 
 

@@ -1,14 +1,17 @@
-"""What is wrong with a file, and how to say it."""
+"""What is wrong with a file, and how to say it: place, reason, and what to try."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
-from typing import NamedTuple
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple, get_args
+
+from pydantic import BaseModel
+from pydantic_core import ErrorDetails
 
 Place = tuple[str | int, ...]
 """Keys and indices that lead from the top of a file to a value."""
-
 
 PLACEHOLDER = "FILL_IN"
 """What stands in a new configuration where only its user knows the value."""
@@ -39,15 +42,181 @@ def show(value: object) -> str:
 
 def kind_of(value: object) -> str:
     """Say what a value is: a mapping, a list, text, nothing, or the value itself."""
-    return {dict: "a mapping", list: "a list", str: "text", type(None): "nothing"}.get(
-        type(value), show(value)
-    )
+    kinds: dict[type, str] = {dict: "a mapping", list: "a list", str: "text"}
+    return kinds.get(type(value), show(value))
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Name the nearest known word if it is near, all of them otherwise."""
     words = sorted(set(known))
-    near = difflib.get_close_matches(word, words, 1, cutoff=0.6)
-    if near:
+    if near := difflib.get_close_matches(word, words, 1, cutoff=0.6):
         return f"; did you mean {near[0]!r}?"
     return f"; known here: {', '.join(words)}" if words else ""
+
+
+# ---- what pydantic finds ---------------------------------------------------------------------
+
+
+# Sections of a file by the keys, and kinds that a file chooses, which lead to them: their classes,
+# and their names in messages.
+_Sections = dict[Place, tuple[type[BaseModel], str]]
+
+
+def _sections(model: type[BaseModel], at: Place = (), name: str = "") -> _Sections:
+    found = {at: (model, name)}
+    for key, field in model.model_fields.items():
+        for inner in _models(field.annotation):
+            kind = inner.model_fields.get("kind")
+            kinds = () if kind is None else get_args(kind.annotation)
+            named = f"{name}.{key}".lstrip(".") + "".join(f" (kind: {kind})" for kind in kinds)
+            found |= _sections(inner, (*at, key, *kinds), named)
+    return found
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """The sections that an annotation names."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models(part)]
+
+
+def _section_at(place: Place, sections: _Sections) -> type[BaseModel]:
+    """The section at a place; what is no key of one, such as an index, is passed over."""
+
+    def leads(at: Place) -> bool:
+        left = iter(place)
+        return all(part in left for part in at)
+
+    return sections[max(filter(leads, sections), key=len)][0]
+
+
+def _label(place: Place, data: Any) -> str:
+    """Name a place in words: cable.length, pose 4 (pose_04.jpg) end."""
+    words: list[str] = []
+    for part in place:
+        if isinstance(data, dict) and part in data:
+            data = data[part]
+            words.append(str(part))
+        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
+            data = data[part]
+            if words == ["experiment", "poses"]:
+                file = data.get("file", data.get("files")) if isinstance(data, dict) else None
+                said = ", ".join(map(str, file)) if isinstance(file, list) else file
+                words = [f"pose {part + 1}" + (f" ({said})" if isinstance(said, str) else "")]
+            else:
+                words[-1] += f"[{part}]"
+    return ".".join(words) or "the top of the file"
+
+
+def _help(section: type[BaseModel], key: object) -> str:
+    """Help on a key, where the section knows it."""
+    field = section.model_fields.get(str(key))
+    return f": {field.description.rstrip('.')}" if field and field.description else ""
+
+
+def _about_number(value: object) -> str:
+    """Guess why text stands where a number belongs."""
+    text = str(value).strip()
+    if isinstance(value, str) and re.fullmatch(_NUMBER, text):
+        return "; write it without quotes"
+    if re.fullmatch(r"[-+]?[0-9]+,[0-9]+", text):
+        return f"; the decimal sign is a point: {text.replace(',', '.')}"
+    if found := re.fullmatch(rf"({_NUMBER})\s*[a-zA-Z/^*0-9]+", text):
+        return f"; write it in SI units without the unit, such as {found[1]}"
+    return ""
+
+
+def _allowed(section: type[BaseModel], key: object) -> str:
+    """The range of a number, where it has two ends."""
+    field = section.model_json_schema()["properties"].get(str(key), {})
+    ends: dict[str, float] = {}
+    for part in (field, *field.get("anyOf", ())):
+        ends |= {name: part[name] for name in ("minimum", "maximum") if name in part}
+    return "; {minimum:g} to {maximum:g} is possible".format(**ends) if len(ends) == 2 else ""
+
+
+_NUMBER = r"[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?"
+
+_MAPPING = "a mapping of keys and values belongs here, found {kind}"
+_NUMBER_TYPE = "a number belongs here, found {input}{number}"
+_WHOLE = "a whole number belongs here, found {input}"
+_MESSAGES: dict[str, str] = {
+    **dict.fromkeys(("float_type", "float_parsing"), _NUMBER_TYPE),
+    "finite_number": "a finite number belongs here, found {input}",
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), _WHOLE),
+    "bool_type": "true or false belongs here, found {input}",
+    "string_type": "text belongs here, found {input}",
+    "greater_than": "must be larger than {gt:g}, found {input}",
+    "greater_than_equal": "must not be smaller than {ge:g}, found {input}{allowed}",
+    "less_than": "must be smaller than {lt:g}, found {input}",
+    "less_than_equal": "must not be larger than {le:g}, found {input}{allowed}",
+    "literal_error": "allowed are {expected}, found {input}",
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), _MAPPING),
+    "tuple_type": "a list belongs here, found {kind}",
+    "too_short": "at least {min_length} belongs here, found {actual_length}",
+    "too_long": "at most {max_length} belong here, found {actual_length}",
+    "invalid_key": "a key must be text, found {input}",
+}
+
+
+def explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any) -> Iterator[Problem]:
+    """Say what pydantic found in a file of that model in the words of the file."""
+    sections = _sections(model)
+    suggested: set[Place] = set()
+    for error in errors:
+        if error["type"] == "extra_forbidden":
+            *above, key = error["loc"]
+            known = _section_at(tuple(above), sections).model_fields
+            near = difflib.get_close_matches(str(key), known, 1, cutoff=0.6)
+            suggested.update((*above, name) for name in near)
+    for error in errors:
+        place, kind, context, found = (
+            error["loc"],
+            error["type"],
+            error.get("ctx", {}),
+            error["input"],
+        )
+        section, label, key = _section_at(place[:-1], sections), _label(place, data), place[-1]
+        if found == PLACEHOLDER:
+            text = f"{label} is still to be filled in{_help(section, key)}"
+        elif kind == "missing" and isinstance(key, int):
+            text = f"{label} has only {key} of its values"
+        elif kind == "missing":
+            if place in suggested:
+                continue
+            text = f"{key!r} is missing in {label}{_help(section, key)}"
+        elif kind == "extra_forbidden":
+            hint = did_you_mean(str(key), section.model_fields)
+            homes = [
+                name or "the top"
+                for inner, name in sections.values()
+                if str(key) in inner.model_fields
+            ]
+            if homes and "did you mean" not in hint:
+                hint = f"; it belongs into {' or '.join(homes)}"
+            text = f"unknown key {show(str(key))} in {_label(place[:-1], data)}{hint}"
+        elif kind in ("union_tag_invalid", "union_tag_not_found"):
+            place = (*place, "kind")
+            text = f"{label}: kind must be images or centerlines, found {show(context.get('tag'))}"
+        elif kind == "value_error" and isinstance(context["error"], Contradiction):
+            for inner in context["error"].problems:
+                at = (*place, *inner.place)
+                yield Problem(at, f"{_label(at, data)}: {inner.message}")
+            continue
+        elif kind == "value_error":
+            text = f"{label}: {context['error']}"
+        elif kind in _MESSAGES:
+            words = {
+                "input": show(found),
+                "kind": kind_of(found),
+                "number": _about_number(found),
+                "allowed": _allowed(section, key),
+            }
+            text = f"{label}: {_MESSAGES[kind].format(**(context | words))}"
+            if key == "start" and found == "free":
+                text += "; only the end can be free"
+            if "tolerances" in place and found == 0:
+                text += "; for a value that is known exactly write a small one, such as 1.0e-6"
+        else:
+            text = f"{label}: {error['msg']}"
+        yield Problem(place, text)

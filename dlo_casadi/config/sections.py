@@ -11,21 +11,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from dlo_casadi.config.limits import STIFFNESS, implausible_gravity, implausible_sizes
 from dlo_casadi.config.measuring import Centerlines, Images, Tolerances
 from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
 from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, show
 from dlo_casadi.config.values import (
-    Direction,
+    STIFFNESS,
     Force,
+    Gravity,
     Moment,
+    Name,
     Number,
     Place,
     Positive,
     Quaternion,
     Section,
+    implausible_sizes,
     optional,
     within,
 )
@@ -40,7 +42,7 @@ DENSITY = 2200.0
 class Cable(Section):
     """The cable between its two fixtures."""
 
-    name: Annotated[str, Field(coerce_numbers_to_str=True)] = "cable"
+    name: Name = "cable"
     """What to call the cable."""
     length: Positive
     """Length along the cable between its two fixtures [m]."""
@@ -81,14 +83,15 @@ class Cable(Section):
     @model_validator(mode="after")
     def _plausible(self) -> Cable:
         declared, young = self.bending_stiffness, self.youngs_modulus
-        problems = implausible_sizes(self.length, self.prior_mass, self.diameter, declared)
+        problems = implausible_sizes(self.length, self.prior_mass, self.diameter)
+        if declared is not None and (wrong := STIFFNESS.complaint(declared)):
+            problems.append(Problem(("bending_stiffness",), wrong))
         if (young is None) == (declared is None):
             found, key = ("neither", ()) if young is None else ("both", ("bending_stiffness",))
             text = f"give youngs_modulus [Pa] or bending_stiffness [N m^2], found {found}"
             problems.append(Problem(key, text))
-        elif young is not None:
-            said = " for EI = E pi d^4 / 64"
-            problems += STIFFNESS.problems(("youngs_modulus",), self.prior_bending_stiffness, said)
+        elif young and (wrong := STIFFNESS.complaint(self.prior_bending_stiffness)):
+            problems.append(Problem(("youngs_modulus",), f"{wrong} for EI = E pi d^4 / 64"))
         if problems:
             raise Contradiction(*problems)
         return self
@@ -209,16 +212,10 @@ class Pose(Section):
         return self
 
 
-def _possible_gravity(gravity: tuple[float, ...]) -> tuple[float, ...]:
-    for problem in implausible_gravity(gravity):
-        raise ValueError(problem.message)
-    return gravity
-
-
 class Experiment(Section):
     """What was measured, and under which conditions."""
 
-    gravity: Annotated[Direction, AfterValidator(_possible_gravity)]
+    gravity: Gravity
     """Gravity in the board frame, such as [0.0, -9.81] [m/s^2]; three numbers put the cable in
     space."""
     boundary: Boundary

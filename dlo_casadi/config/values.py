@@ -1,13 +1,141 @@
-"""What may stand behind a key of a configuration: numbers, places, orientations."""
+"""What may stand behind a key of a file: numbers and their ranges, places, orientations.
+
+What lies beyond a range is a slip (a unit, an exponent) and cannot be computed with: it is refused
+with the range that is allowed. What can be computed but is hardly meant is a warning of
+`load_config`.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeAlias
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from dlo_casadi.config.limits import COORDINATE, FORCE, MOMENT, Range, implausible_quaternion
-from dlo_casadi.config.problems import show
+from dlo_casadi.config.problems import Problem, show
+from dlo_casadi.effects.cable import STIFFNESS_BOUNDS
+from dlo_casadi.errors import counted
+
+
+class Range(NamedTuple):
+    """From where to where a value can lie."""
+
+    least: float
+    most: float
+    unit: str
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, int | float) and self.least <= value <= self.most
+
+    def __str__(self) -> str:
+        return f"{self.least:g} to {self.most:g}{self.unit and ' '}{self.unit} is possible"
+
+    def complaint(self, value: float) -> str:
+        """What is wrong with a value that lies outside; empty if it does not."""
+        return "" if value in self else f"{value:g}{self.unit and ' '}{self.unit}: {self}"
+
+
+# Nothing shorter than a millimetre is held in two fixtures; 100 m hang between two masts.
+LENGTH = Range(1.0e-3, 100.0, "m")
+# Rounding to three digits moves the length of a quaternion by so much at most.
+_UNIT = 2.0e-3
+# Carbon fibres have 5e-6 m; the upper limit is the length itself.
+_THINNEST = 1.0e-6
+# A millimetre of the thinnest wire on sale (copper, 10 um): 9e3 pi (5e-6)^2 1e-3 = 7e-10 kg.
+_LIGHTEST = 1.0e-10
+# A metre of a submarine power cable has 100 kg.
+_HEAVIEST, _HEAVIEST_PER_METRE = 1000.0, 100.0
+# From polystyrene foam to osmium, the densest metal.
+_DENSITIES = Range(15.0, 2.26e4, "kg/m^3")
+# A strip whose thickness is declared as its diameter seems denser (0.9 mm, 0.25 m and 17 g: 1.1e5),
+# a tube lighter; but 200 kg/m^3, less than any rope, are 2e5 in grams, and what is lighter than air
+# does not hang.
+_POSSIBLE_DENSITIES = Range(1.2, 2.0e5, "kg/m^3")
+# A carbon fibre has E pi d^4 / 64 = 2.3e11 pi (5e-6)^4 / 64 = 7e-12 N m^2, a steel bar of 0.5 m
+# 6e8 N m^2: the bounds of the fit itself.
+STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
+# The largest centrifuge for models of soil reaches some 1e3 times the Earth's 9.81 m/s^2.
+GRAVITY = Range(0.0, 1.0e4, "m/s^2")
+# A frame whose origin is farther away is that of a map; of 1e3 m, doubles resolve 1e-13 m.
+COORDINATE = Range(-1.0e3, 1.0e3, "m")
+# A fifth of the wavelength of green light, beyond any camera. Upwards: the cable's length.
+FINEST_STD = 1.0e-7
+# A nanometre over a metre is what interferometers resolve.
+FINEST_TOLERANCE = 1.0e-9
+# The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; taut it pulls more. A moment: a metre's arm.
+FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
+# A nanonewton is what atomic force microscopes resolve.
+FORCE_STD, MOMENT_STD = FORCE._replace(least=1.0e-9), MOMENT._replace(least=1.0e-9)
+# A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
+PIXELS = Range(-1.0e6, 1.0e6, "px")
+FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
+# Terms of a wide lens that cancel one another reach hundreds; a million is a slip.
+DISTORTION = Range(-1.0e6, 1.0e6, "")
+# A marker of a tenth of a millimetre has no pixels; ten metres are the side of a house.
+MARKER = Range(1.0e-4, 10.0, "m")
+# Two elements have a joint between them; of a metre, 2000 are half a millimetre each, less than a
+# cable is thick.
+MESH = Range(2, 2000, "elements")
+# Cubic splines need four coefficients. A line of 240 points has four between two knots of 64; the
+# covariance that a result holds grows with their square.
+REST_COEFFICIENTS = Range(0, 64, "coefficients")
+
+
+def implausible_sizes(length: float, mass: float, diameter: float) -> list[Problem]:
+    """Find sizes [m], [kg] of a cable that no cable has: one by one, then all together."""
+
+    def density(diameter: float) -> float:
+        """Mass over volume [kg/m^3] of a round cable: m / (pi d^2 / 4 L)."""
+        return mass / (length * math.pi * diameter * diameter / 4)  # inf where ** would raise
+
+    def meant(value: float, possible: bool) -> str:
+        return f"did you mean {value:g}? " if possible else ""
+
+    def in_metres() -> str:
+        """Question after a diameter of millimetres or centimetres that would be sound."""
+        sound = [d for d in (diameter / 1e3, diameter / 1e2) if density(d) in _DENSITIES]
+        return f", did you mean {sound[0]:g}?" if sound else ""
+
+    wrong: list[tuple[str, str]] = []
+    if length not in LENGTH:
+        hint = meant(length / 1e3, length / 1e3 in LENGTH)
+        wrong.append(("length", f"{length:g} m: units are SI, {hint}{LENGTH}"))
+    elif diameter > length:
+        text = f"{diameter:g} m is larger than the length {length:g} m: units are SI{in_metres()}"
+        wrong.append(("diameter", text))
+    elif thin := Range(_THINNEST, length, "m").complaint(diameter):
+        wrong.append(("diameter", thin))
+    heaviest = min(_HEAVIEST, _HEAVIEST_PER_METRE * length)
+    if mass > heaviest:
+        hint = meant(mass / 1e3, mass / 1e3 <= heaviest)  # of grams
+        text = f"units are SI, {hint}at most {heaviest:g} kg is possible"
+        wrong.append(("mass", f"{mass:g} kg for {length:g} m: {text}"))
+    elif mass < _LIGHTEST:
+        text = f"no cable is lighter than {_LIGHTEST:g} kg; to leave its weight out, write "
+        wrong.append(("mass", f"{mass:g} kg: {text}gravity: [0, 0]"))
+    apparent = math.nan if wrong else density(diameter)  # told of sizes that are sound alone
+    if apparent > _POSSIBLE_DENSITIES.most:
+        hint = meant(mass / 1e3, apparent / 1e3 in _DENSITIES)
+        text = f"{mass:g} kg make it {apparent / 1e3:.3g} times as dense as water (osmium, the "
+        text += f"densest metal: {_DENSITIES.most / 1e3:g}): units are SI, {hint}diameter and "
+        wrong.append(("mass", f"{text}length in m?"))
+    elif apparent < _POSSIBLE_DENSITIES.least:
+        text = f"{diameter:g} m make {mass:g} kg lighter than air, {apparent:.2g} kg/m^3: units "
+        wrong.append(("diameter", f"{text}are SI{in_metres()}, mass in kg?"))
+    return [Problem((key,), text) for key, text in wrong]
+
+
+def implausible_quaternion(values: Sequence[float]) -> str:
+    """What is wrong with an orientation (x, y, z, w); empty if its length is one."""
+    belongs = "a unit quaternion [qx, qy, qz, qw] belongs here"
+    if len(values) != 4:
+        return f"{belongs}, not {counted(len(values), 'number')}"
+    size = math.hypot(*values)
+    return "" if abs(size - 1) <= _UNIT else f"{belongs}, its length is {size:.4g}"
+
+
+# ---- types -------------------------------------------------------------------------------------
 
 
 def optional(section: type[Section]) -> BeforeValidator:
@@ -17,16 +145,38 @@ def optional(section: type[Section]) -> BeforeValidator:
     )
 
 
-def within(allowed: Range) -> AfterValidator:
-    """Refuse a number, or the numbers of a list, that lie outside of a range."""
+def checked(complaint: Callable[[Any], str]) -> AfterValidator:
+    """Refuse a value with what is wrong with it, if anything is."""
 
     def check(value: Any) -> Any:
-        numbers = value if isinstance(value, tuple) else (value,)
-        if wrong := [message for x in numbers if (message := allowed.complaint(x))]:
-            raise ValueError("; ".join(wrong))
+        if wrong := complaint(value):
+            raise ValueError(wrong)
         return value
 
     return AfterValidator(check)
+
+
+def within(allowed: Range) -> AfterValidator:
+    """Refuse a number, or the numbers of a list, that lie outside of a range."""
+
+    def complaint(value: Any) -> str:
+        numbers = value if isinstance(value, tuple) else (value,)
+        return "; ".join(filter(None, map(allowed.complaint, numbers)))
+
+    return checked(complaint)
+
+
+def stacked(names: Sequence[str]) -> BeforeValidator:
+    """Numbers of several components by their names: one list, the components one after another."""
+
+    def check(value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        if missing := [name for name in names if not isinstance(value.get(name), list | tuple)]:
+            raise ValueError(f"{missing[0]} is missing")
+        return [number for name in names for number in value[name]]
+
+    return BeforeValidator(check)
 
 
 def _listed(belongs: str, schema: Any, *counts: int) -> BeforeValidator:
@@ -41,24 +191,20 @@ def _listed(belongs: str, schema: Any, *counts: int) -> BeforeValidator:
 
 
 def _moment(value: object) -> object:
-    if isinstance(value, list | tuple):
-        if len(value) == 3:
-            return value
-    elif isinstance(value, int | float) and not isinstance(value, bool):
+    if isinstance(value, list | tuple) and len(value) == 3:
+        return value
+    if isinstance(value, int | float) and not isinstance(value, bool):
         return (value,)
     raise ValueError(f"one number belongs here, in space three [mx, my, mz], found {show(value)}")
-
-
-def _unit(value: tuple[float, ...]) -> tuple[float, ...]:
-    if wrong := implausible_quaternion(value):
-        raise ValueError(wrong)
-    return value
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
 NonNegative = Annotated[Number, Field(ge=0.0)]
 Count = Annotated[int, Field(strict=True)]
+Elements = Annotated[Count, Field(ge=MESH.least, le=MESH.most)]
+RestCoefficients = Annotated[Count, Field(ge=REST_COEFFICIENTS.least, le=REST_COEFFICIENTS.most)]
+Name = Annotated[str, Field(coerce_numbers_to_str=True)]
 Switch = Annotated[bool, Field(strict=True)]
 _Two: TypeAlias = tuple[Number, Number]
 Row: TypeAlias = tuple[Number, Number, Number]
@@ -69,6 +215,7 @@ Direction = Annotated[
     _listed("two numbers [x, y] belong here, in space three [x, y, z]", _Two | Row, 2, 3),
 ]
 Place = Annotated[Direction, within(COORDINATE)]
+Gravity = Annotated[Direction, checked(lambda vector: GRAVITY.complaint(math.hypot(*vector)))]
 Force = Annotated[Direction, within(FORCE)]
 Moment = Annotated[
     tuple[Number, ...],
@@ -78,7 +225,7 @@ Moment = Annotated[
 Quaternion = Annotated[
     tuple[Number, ...],
     _listed("a quaternion [qx, qy, qz, qw] belongs here", _Four, 4),
-    AfterValidator(_unit),
+    checked(implausible_quaternion),
 ]
 
 
@@ -86,3 +233,9 @@ class Section(BaseModel):
     """A frozen mapping of the file: unknown keys are errors, the docstring of a key is its help."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class OpenSection(Section):
+    """A section in which other keys may stand beside those that are read."""
+
+    model_config = ConfigDict(extra="ignore")

@@ -11,23 +11,29 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from dlo_casadi.config import (
-    MESH,
-    REST_COEFFICIENTS,
-    Place,
-    Range,
-    implausible_gravity,
+from dlo_casadi.config.document import Document
+from dlo_casadi.config.options import ElementName
+from dlo_casadi.config.problems import Place, Problem, show
+from dlo_casadi.config.sections import Boundary
+from dlo_casadi.config.values import (
+    STIFFNESS,
+    Elements,
+    Gravity,
+    Name,
+    Number,
+    OpenSection,
+    Positive,
+    RestCoefficients,
     implausible_sizes,
-    read_document,
-    show,
+    stacked,
+    within,
 )
 from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
 from dlo_casadi.effects.cable import Parameter
@@ -36,10 +42,8 @@ from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import ConfigError, DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import RestScatter
-from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.rod.node import Frame
 
-FloatArray = NDArray[np.floating]
 FILE = "parameters.yaml"
 SCHEMA = "dlo-parameters/1"
 # What a prediction depends on beside the values of the parameters.
@@ -49,14 +53,68 @@ _MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effect
 _ROUNDING = 1e-9
 # Folders of results that a message lists.
 _LISTED = 5
+_DAMAGED, _REMEDY = "damaged parameters", ".\n  Try: the file as a fit has written it."
 
 
-class _DamagedError(DloError):
-    """What is wrong in a file, and where."""
+class _Cable(OpenSection):
+    name: Name
+    length: Positive
+    mass: Positive
+    diameter: Positive
+    bending_stiffness: Annotated[Positive, within(STIFFNESS)]
+    torsional_stiffness: Positive | None = None
+    rest_shape: str
 
-    def __init__(self, place: Place, message: str) -> None:
-        super().__init__(f"{'.'.join(map(str, place))}{message}")
-        self.place = place
+
+class _Value(OpenSection):
+    value: Number
+    std: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    tolerance: float | None = None
+    interval_95: tuple[float | None, float | None] | None = None
+    identifiable: bool | None = None
+
+
+class _Fitted(OpenSection):
+    coefficients: Annotated[tuple[Number, ...], stacked(Frame.curvatures)]
+
+
+class _State(OpenSection):
+    rest_curvature: Annotated[tuple[Number, ...], stacked(Frame.strains)]
+
+
+class _Covariance(OpenSection):
+    names: tuple[str, ...]
+    values: tuple[tuple[Number, ...], ...]
+
+
+class _Scatter(OpenSection):
+    fixtures: dict[str, float | None] | None = None
+    rest_curvature_std: float = RestScatter().std
+    rest_curvature_smoothness: float = RestScatter().smoothness
+    hanging: float = 0.0
+
+
+class ParametersFile(OpenSection):
+    """What is read of a parameters.yaml; each key as `report.parameters_text` writes it."""
+
+    cable: _Cable
+    boundary: Boundary
+    gravity: Gravity
+    element: ElementName
+    n: Elements
+    n_rest: RestCoefficients
+    effects: tuple[dict[str, Any], ...]
+    parameters: dict[str, _Value]
+    rest_curvature: _Fitted
+    state: _State
+    covariance: _Covariance
+    scatter: _Scatter | None = None
+    fixtures: dict[str, Any] | None = None
+    model_hash: Name
+    config: Name | None = None
+    versions: dict[str, Any] | None = None
 
 
 def load_parameters(path: str | Path) -> FittedCable:
@@ -85,29 +143,28 @@ def load_parameters(path: str | Path) -> FittedCable:
             raise ConfigError(f"no {FILE} in this folder.{_results_near(source)}", source.parent)
     elif not os.path.exists(source):
         raise ConfigError(f"no such file or folder of results.{_results_near(source)}", source)
-    file = read_document(source)
-    document = file.data
-    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
-        found = document.get("schema") if isinstance(document, dict) else type(document).__name__
+    document = Document.read(source)
+    data = document.data
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        found = data.get("schema") if isinstance(data, dict) else type(data).__name__
         raise ConfigError(
             f"no fitted parameters: schema {SCHEMA!r} expected, {found!r} found.\n"
             "  Try: the parameters.yaml in the results folder of a fit.",
             source,
         )
-    line = None
+    file = document.checked(ParametersFile, _DAMAGED, _REMEDY)
+    if problems := [*_contradictions(file)]:
+        raise document.error(problems, _DAMAGED, _REMEDY)
     try:
-        return _rebuild(document, source)
-    except _DamagedError as error:
-        wrong, line = error.message, file.line(error.place)
+        model = _model(file)
+        if problems := [*_unlike(file, model)]:
+            raise document.error(problems, _DAMAGED, _REMEDY)
+    except ConfigError:
+        raise
     except DloError as error:
-        wrong = error.message
-    except KeyError as error:
-        wrong = f"{error.args[0]} is missing"
-    except (TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
-        wrong = str(error)
-    raise ConfigError(
-        f"damaged parameters: {wrong}.\n  Try: the file as a fit has written it.", source, line
-    )
+        raise ConfigError(f"{_DAMAGED}: {error.message}{_REMEDY}", source) from None
+    p = np.array([file.parameters[name].value for name in model.names])
+    return FittedCable(model, p, np.array(file.state.rest_curvature), _metadata(file, data, source))
 
 
 def _results_near(path: Path) -> str:
@@ -124,187 +181,133 @@ def _results_near(path: Path) -> str:
     return f"\n  Try: {listed}" if listed else "\n  Try: the results folder of a fit (dlo fit)."
 
 
-def _rebuild(document: dict[str, Any], source: Path) -> FittedCable:
-    declared, rows = document["cable"], document["parameters"]
-    cable = Cable(
-        length=_positive(declared, "cable", "length"),
-        mass=_positive(declared, "cable", "mass"),
-        diameter=_positive(declared, "cable", "diameter"),
-        bending_stiffness=_positive(declared, "cable", "bending_stiffness"),
-        name=str(declared["name"]),
-        straight=declared["rest_shape"] == "straight",
-    )
-    for place, message in implausible_sizes(
-        cable.length, cable.mass, cable.diameter, cable.bending_stiffness
-    ):
-        raise _DamagedError(("cable", *place), f": {message}")
-    in_space = len(document["gravity"]) == 3
-    if in_space:
-        torsional = _positive(declared, "cable", "torsional_stiffness")
-        cable = replace(cable, torsional_stiffness=torsional)
-    gravity = tuple(_numbers(document["gravity"], 3 if in_space else 2, "gravity").tolist())
-    for place, message in implausible_gravity(gravity):
-        raise _DamagedError(place, f": {message}")
-    boundary = document["boundary"]
-    tolerances = {name: row.get("tolerance") for name, row in rows.items()}
-    model = CableModel(
-        cable=cable,
-        n=_count(document, "n", MESH),
-        element=_one_of(document["element"], tuple(ELEMENTS), "element"),
-        start=_one_of(boundary["start"], ("pinned", "clamped"), "boundary", "start"),
-        end=_one_of(boundary["end"], ("pinned", "clamped", "free"), "boundary", "end"),
-        gravity=gravity,
-        effects=tuple(_effect(row, k) for k, row in enumerate(document["effects"])),
-        n_rest=_count(document, "n_rest", REST_COEFFICIENTS),
-        priors={name: float(std) for name, std in tolerances.items() if std is not None},
-    )
-    if set(rows) != set(model.names):
-        wrong = ", ".join(sorted(set(rows) ^ set(model.names)))
-        raise DloError(f"parameters and effects do not belong together: {wrong}")
-    values = [_within_bounds(q, rows[q.name]) for q in model.parameters]
-    metadata = metadata_of(document, source)
-    if len(metadata.coefficients) != model.n_coefficients:
-        count = len(metadata.coefficients)
-        found = f": {counted(model.n_coefficients, 'number')} belong here, found {count}"
-        raise _DamagedError(("rest_curvature",), found)
-    coefficients = [f"rest_curvature[{k}]" for k in range(model.n_coefficients)]
-    for name in metadata.names:
-        if name not in (*model.names, *coefficients):
-            raise _DamagedError(("covariance", "names"), f": nothing is called {show(name)}")
-    rest = _stacked(document["state"]["rest_curvature"], Frame.strains, "state")
-    return FittedCable(
-        model,
-        _numbers(values, len(values), "parameters"),
-        _numbers(rest, model.chain.n_rests, "state", "rest_curvature"),
-        metadata,
-    )
+def _contradictions(file: ParametersFile) -> Iterator[Problem]:
+    """Find what no cable and no effect can be."""
+    cable = file.cable
+    for (key,), message in implausible_sizes(cable.length, cable.mass, cable.diameter):
+        yield Problem(("cable", key), f"cable.{key}: {message}")
+    for k, row in enumerate(file.effects):
+        yield from _wrong_effect(row, ("effects", k))
+    size = len(file.covariance.names)
+    if [len(row) for row in file.covariance.values] != [size] * size:
+        text = f"covariance.values: {counted(size, 'row')} of as many numbers belong here"
+        yield Problem(("covariance", "values"), text)
 
 
-def metadata_of(document: dict[str, Any], source: Path) -> Metadata:
-    """What a document tells beside the model."""
-    rows = document["parameters"]
-    names = tuple(document["covariance"]["names"])
-    rows_of = np.array(document["covariance"]["values"], dtype=float)
-    covariance = _numbers(rows_of.ravel(), len(names) ** 2, "covariance", "values")
-    covariance = covariance.reshape(len(names), len(names))
-    interval = rows["bending_stiffness"].get("interval_95")
-    scatter = document.get("scatter") or {}
-    rest_scatter = RestScatter(
-        float(scatter.get("rest_curvature_std", 0.0)),
-        float(scatter.get("rest_curvature_smoothness", RestScatter().smoothness)),
-    )
-    hanging = float(scatter.get("hanging", 0.0))
-    fixtures = {name: float(std or 0.0) for name, std in scatter.get("fixtures", {}).items()}
-    return Metadata(
-        path=source,
-        names=names,
-        covariance=covariance,
-        uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter, hanging),
-        std={name: float(row.get("std") or 0.0) for name, row in rows.items()},
-        coefficients=_stacked(
-            document["rest_curvature"]["coefficients"], Frame.curvatures, "rest_curvature"
-        ),
-        fixtures=dict(document.get("fixtures") or {}),
-        identifiable=rows["bending_stiffness"].get("identifiable"),
-        interval_95=None if interval is None else (interval[0], interval[1]),
-        model_hash=str(document["model_hash"]),
-        edited=parameters_hash(document) != document["model_hash"],
-        config=str(document.get("config")),
-        versions=dict(document.get("versions") or {}),
-        document=document,
-    )
-
-
-def _stacked(values: Any, names: Sequence[str], where: str) -> FloatArray:
-    """Numbers as they are in a plane; in space those of all components one after the other."""
-    if isinstance(values, Mapping):
-        values = [value for name in names for value in values[name]]
-    return _numbers(values, len(values), where)
-
-
-def _effect(row: Mapping[str, Any], k: int) -> Effect:
-    name = row["name"]
-    kind = known_effect(name)
+def _wrong_effect(row: Mapping[str, Any], at: Place) -> Iterator[Problem]:
+    name = row.get("name")
+    kind = known_effect(name) if isinstance(name, str) else None
     if kind is None:
         known = ", ".join((*EFFECTS, *NUISANCES))
-        raise _DamagedError(("effects", k), f": no effect is called {name!r}; known: {known}")
-    kinds = {item.name: item.default for item in fields(kind)}
-    options: dict[str, Any] = {}
+        yield Problem(at, f"effects.{at[1]}: no effect is called {show(name)}; known: {known}")
+        return
+    defaults = {item.name: item.default for item in fields(kind)}
     for key, value in row.items():
-        if key == "name":
-            continue
-        if key not in kinds:
-            raise _DamagedError(("effects", k, key), f": {name} knows {', '.join(kinds)}")
-        options[key] = tuple(value) if isinstance(value, list) else value
-        if not _is_like(options[key], kinds[key]):
-            raise _DamagedError(
-                ("effects", k, key),
-                f": something like {kinds[key]!r} belongs here, found {show(value)}",
-            )
-    return kind(**options)
+        where = f"effects.{at[1]}.{key}"
+        if key != "name" and key not in defaults:
+            yield Problem((*at, key), f"{where}: {kind.name} knows {', '.join(defaults)}")
+        elif key != "name" and not _is_like(value, defaults[key]):
+            text = f"something like {defaults[key]!r} belongs here, found {show(value)}"
+            yield Problem((*at, key), f"{where}: {text}")
 
 
 def _is_like(value: Any, example: Any) -> bool:
     """Whether an effect's option is of the kind of its default; numbers are finite."""
     if isinstance(example, tuple):
-        return (
-            isinstance(value, tuple)
-            and len(value) == len(example)
-            and all(_is_like(*pair) for pair in zip(value, example, strict=True))
-        )
+        alike = isinstance(value, list) and len(value) == len(example)
+        return alike and all(map(_is_like, value, example))
     if isinstance(example, float):
-        return _is_number(value) and math.isfinite(value)
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        return number and math.isfinite(value)
     return isinstance(value, type(example))
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _model(file: ParametersFile) -> CableModel:
+    cable = file.cable.model_dump(exclude={"rest_shape"})
+    tolerances = {name: row.tolerance for name, row in file.parameters.items()}
+    return CableModel(
+        cable=Cable(**cable, straight=file.cable.rest_shape == "straight"),
+        n=file.n,
+        element=file.element,
+        start=file.boundary.start,
+        end=file.boundary.end,
+        gravity=file.gravity,
+        effects=tuple(map(_effect, file.effects)),
+        n_rest=file.n_rest,
+        priors={name: std for name, std in tolerances.items() if std is not None},
+    )
 
 
-def _positive(section: Mapping[str, Any], where: str, key: str) -> float:
-    value = section[key]
-    if not _is_number(value) or not 0 < value < math.inf:
-        raise _DamagedError((where, key), f" must be a positive number, found {show(value)}")
-    return float(value)
+def _effect(row: Mapping[str, Any]) -> Effect:
+    kind = known_effect(row["name"])
+    assert kind is not None  # checked before
+    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
+    del options["name"]
+    return kind(**options)
 
 
-def _count(document: Mapping[str, Any], key: str, allowed: Range) -> int:
-    value = document[key]
-    if not _is_number(value) or value not in allowed or value != int(value):
-        raise _DamagedError((key,), f" must be a whole number, found {show(value)}: {allowed}")
-    return int(value)
+def _unlike(file: ParametersFile, model: CableModel) -> Iterator[Problem]:
+    """Find what does not suit the model: other parameters, other numbers of them, their bounds."""
+    if strange := set(file.parameters) ^ set(model.names):
+        wrong = ", ".join(sorted(strange))
+        yield Problem(("parameters",), f"parameters and effects do not belong together: {wrong}")
+        return
+    for q in model.parameters:
+        if wrong := _beyond(q, file.parameters[q.name]):
+            name = f"parameters.{q.name}.value"
+            yield Problem(("parameters", q.name, "value"), f"{name}: {wrong}")
+    for key, size, found in (
+        ("rest_curvature", model.n_coefficients, file.rest_curvature.coefficients),
+        ("state", model.chain.n_rests, file.state.rest_curvature),
+    ):
+        if len(found) != size:
+            text = f"{counted(size, 'number')} belong here, found {len(found)}"
+            yield Problem((key,), f"{key}: {text}")
+    coefficients = {f"rest_curvature[{k}]" for k in range(model.n_coefficients)}
+    for name in set(file.covariance.names) - {*model.names, *coefficients}:
+        text = f"covariance.names: nothing is called {show(name)}"
+        yield Problem(("covariance", "names"), text)
 
 
-def _within_bounds(q: Parameter, row: Mapping[str, Any]) -> float:
-    """Value of a parameter, within the bounds of the file and of the model."""
-    value, place = row["value"], ("parameters", q.name, "value")
-    if not _is_number(value) or not math.isfinite(value):
-        raise _DamagedError(place, f" must be finite, found {show(value)}")
-    lower = max(q.lower, -math.inf if row.get("lower") is None else float(row["lower"]))
-    upper = min(q.upper, math.inf if row.get("upper") is None else float(row["upper"]))
-    beyond = max(lower - value, value - upper)
-    bound = lower if lower > value else upper
-    if (q.log and value <= 0) or beyond > _ROUNDING * max(q.scale, abs(bound)):
-        raise _DamagedError(
-            place,
-            f": {value:.12g} {q.unit} lies outside of its bounds [{lower:.12g}, {upper:.12g}]",
-        )
-    return float(value)
+def _beyond(q: Parameter, row: _Value) -> str:
+    """Whether a value lies outside of its bounds, of the file and of the model; empty if not."""
+    lower = max(q.lower, -math.inf if row.lower is None else row.lower)
+    upper = min(q.upper, math.inf if row.upper is None else row.upper)
+    bound = lower if lower > row.value else upper
+    beyond = max(lower - row.value, row.value - upper)
+    if not (q.log and row.value <= 0) and beyond <= _ROUNDING * max(q.scale, abs(bound)):
+        return ""
+    bounds = f"[{lower:.12g}, {upper:.12g}]"
+    return f"{row.value:.12g} {q.unit} lies outside of its bounds {bounds}"
 
 
-def _numbers(values: ArrayLike, size: int, *where: str) -> FloatArray:
-    array = np.array(values, dtype=float)
-    if array.shape != (size,):
-        raise _DamagedError(where, f": {counted(size, 'number')} belong here, found {array.size}")
-    if not np.all(np.isfinite(array)):
-        raise _DamagedError(where, ": all numbers must be finite")
-    return array
+def metadata_of(document: dict[str, Any], source: Path) -> Metadata:
+    """What a document tells beside the model."""
+    return _metadata(ParametersFile.model_validate(document), document, source)
 
 
-def _one_of(value: Any, allowed: tuple[str, ...], *where: str) -> Any:
-    if value not in allowed:
-        raise _DamagedError(where, f" must be {' or '.join(allowed)}, found {show(value)}")
-    return value
+def _metadata(file: ParametersFile, document: dict[str, Any], source: Path) -> Metadata:
+    names, stiffness = file.covariance.names, file.parameters["bending_stiffness"]
+    covariance = np.array(file.covariance.values, dtype=float).reshape(len(names), len(names))
+    scatter = file.scatter or _Scatter()
+    fixtures = {name: std or 0.0 for name, std in (scatter.fixtures or {}).items()}
+    rest_scatter = RestScatter(scatter.rest_curvature_std, scatter.rest_curvature_smoothness)
+    return Metadata(
+        path=source,
+        names=names,
+        covariance=covariance,
+        uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter, scatter.hanging),
+        std={name: row.std or 0.0 for name, row in file.parameters.items()},
+        coefficients=np.array(file.rest_curvature.coefficients, dtype=float),
+        fixtures=file.fixtures or {},
+        identifiable=stiffness.identifiable,
+        interval_95=stiffness.interval_95,
+        model_hash=file.model_hash,
+        edited=parameters_hash(document) != file.model_hash,
+        config=str(file.config),
+        versions=file.versions or {},
+        document=document,
+    )
 
 
 def parameters_hash(document: Mapping[str, Any]) -> str:

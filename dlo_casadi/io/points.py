@@ -15,6 +15,7 @@ from dlo_casadi.config.problems import show
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.files import write_file
 
+FloatArray = npt.NDArray[np.float64]
 AXES = ["x_m", "y_m", "z_m"]
 PLACE = "s_m"
 
@@ -44,9 +45,9 @@ class MeasuredPoints:
         Measured points of which each is the mean.
     """
 
-    points: npt.NDArray[np.float64]
-    s: npt.NDArray[np.float64] | None = None
-    count: npt.NDArray[np.float64] | float = 1.0
+    points: FloatArray
+    s: FloatArray | None = None
+    count: FloatArray | float = 1.0
 
     def means(self, most: int) -> MeasuredPoints:
         """Means of the points on each of at most so many equally long stretches.
@@ -102,37 +103,26 @@ def read_points(
         If the file cannot be read so; the message names the file and the line.
     """
     source = Path(path)
-    table, marked = _parse(source, len(start))
+    header, table = _parse(source, len(start))
     if len(table) == 0:
         raise MeasurementError("has a header but no points", pose=source.name)
-    if marked:
-        return _markers(source, table, length)
-    step = np.linalg.norm(np.diff(table, axis=0), axis=1)
-    points = table[np.concatenate(([True], step > _SAME_POINT))]
-    _check_points(source, points)
-    return MeasuredPoints(points[::-1].copy() if _runs_backwards(points, start, end) else points)
-
-
-def _markers(source: Path, table: npt.NDArray[np.float64], length: float) -> MeasuredPoints:
-    """Markers in the order of their arc lengths, the first column."""
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    s, points = table[:, 0], table[:, 1:]
-    twice = s[1:][np.diff(s) <= _SAME_POINT]
-    if len(twice):
-        raise MeasurementError(f"{PLACE} {twice[0]:g} m stands twice", pose=source.name)
-    outside = s[(s < 0) | (s > length + _SAME_POINT)]
-    if len(outside):
-        raise MeasurementError(
-            f"{PLACE} {outside[0]:g} m is not between 0 and cable.length {length:g} m: arc length "
-            "from the start, in metres?",
-            pose=source.name,
-        )
-    _check_points(source, points)
-    return MeasuredPoints(points, s)
-
-
-def _check_points(source: Path, points: npt.NDArray[np.float64]) -> None:
-    """Raise if there are too few points, or if they are not in metres."""
+    s = None
+    if header[0] == PLACE:
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        s, points = table[:, 0], table[:, 1:]
+        twice = s[1:][np.diff(s) <= _SAME_POINT]
+        if len(twice):
+            raise MeasurementError(f"{PLACE} {twice[0]:g} m stands twice", pose=source.name)
+        outside = s[(s < 0) | (s > length + _SAME_POINT)]
+        if len(outside):
+            raise MeasurementError(
+                f"{PLACE} {outside[0]:g} m is not between 0 and cable.length {length:g} m: arc "
+                "length from the start, in metres?",
+                pose=source.name,
+            )
+    else:
+        step = np.linalg.norm(np.diff(table, axis=0), axis=1)
+        points = table[np.concatenate(([True], step > _SAME_POINT))]
     if len(points) == 1:
         raise MeasurementError("holds one point only; a pose takes two or more", pose=source.name)
     along = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
@@ -142,6 +132,20 @@ def _check_points(source: Path, points: npt.NDArray[np.float64]) -> None:
             "they are in millimetres, divide them by 1000",
             pose=source.name,
         )
+    if s is None and _runs_backwards(points, start, end):
+        points = points[::-1].copy()
+    return MeasuredPoints(points, s)
+
+
+def _runs_backwards(
+    points: FloatArray, start: Sequence[float], end: Sequence[float] | None
+) -> bool:
+    first, last = points[0], points[-1]
+    forward, backward = math.dist(first, start), math.dist(last, start)
+    if end is not None:
+        forward += math.dist(last, end)
+        backward += math.dist(first, end)
+    return backward < forward
 
 
 def write_points(path: str | Path, points: npt.ArrayLike, s: npt.ArrayLike | None = None) -> None:
@@ -177,14 +181,14 @@ def write_points(path: str | Path, points: npt.ArrayLike, s: npt.ArrayLike | Non
     write_table(target, header, array)
 
 
-def write_table(path: Path, header: Sequence[str], rows: npt.NDArray[np.float64]) -> None:
+def write_table(path: Path, header: Sequence[str], rows: FloatArray) -> None:
     """Write numbers (K, columns) under their names as CSV, whole or not at all."""
     lines = [",".join(header), *(",".join(map(repr, row)) for row in rows.tolist())]
     write_file(path, "\n".join(lines) + "\n")
 
 
-def _parse(source: Path, dimension: int) -> tuple[npt.NDArray[np.float64], bool]:
-    """Read header and numbers (K, columns), K >= 0, and whether arc lengths are the first."""
+def _parse(source: Path, dimension: int) -> tuple[list[str], FloatArray]:
+    """Read header and numbers (K, columns), K >= 0."""
     try:
         with source.open("rb") as file:
             content = file.read(_LARGEST + 1)
@@ -198,63 +202,49 @@ def _parse(source: Path, dimension: int) -> tuple[npt.NDArray[np.float64], bool]
             f"is larger than {_LARGEST} bytes; keep every tenth point, a few hundred suffice",
             pose=source.name,
         )
-
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            cells = next(csv.reader([line]), [])
-        except csv.Error as error:
-            raise MeasurementError(
-                f"line {number}: {error}; one point a line belongs here", pose=source.name
-            ) from None
-        if any(cell.strip() for cell in cells) or len(cells) > 1:
-            rows.append((number, [cell.strip() for cell in cells]))
     axes = AXES[:dimension]
     line, markers = ",".join(axes), ",".join([PLACE, *axes])
-    if not rows:
+    header: list[str] = []
+    table: list[list[float]] = []
+    for number, text in enumerate(lines, start=1):
+        try:
+            cells = [cell.strip() for cell in next(csv.reader([text]), [])]
+            if not any(cells) and len(cells) <= 1:
+                continue
+            if header:
+                table.append(_numbers(cells, header))
+            elif cells in (axes, [PLACE, *axes]):
+                header = cells
+            else:
+                raise ValueError(
+                    f"the header must be {line} (metres), or {markers} of markers at known arc "
+                    f"lengths, found {show(text)}"
+                )
+        except csv.Error as error:
+            wrong = f"line {number}: {error}; one point a line belongs here"
+            raise MeasurementError(wrong, pose=source.name) from None
+        except ValueError as error:
+            raise MeasurementError(f"line {number}: {error}", pose=source.name) from None
+    if not header:
         raise MeasurementError(f"is empty; a header {line} and points belong here", source.name)
-    number, header = rows[0]
-    if header not in (axes, [PLACE, *axes]):
-        raise MeasurementError(
-            f"line {number}: the header must be {line} (metres), or {markers} of markers at known "
-            f"arc lengths, found {show(lines[number - 1])}",
-            pose=source.name,
-        )
-    table = [_numbers(source, *row, header) for row in rows[1:]]
-    return np.array(table).reshape(-1, len(header)), header[0] == PLACE
+    return header, np.array(table).reshape(-1, len(header))
 
 
-def _numbers(source: Path, number: int, cells: list[str], header: list[str]) -> list[float]:
+def _numbers(cells: list[str], header: list[str]) -> list[float]:
+    """Numbers of a line, or a ValueError that says what is wrong with it."""
     if len(cells) != len(header):
         names = ",".join(name.removesuffix("_m") for name in header)
-        raise MeasurementError(
-            f"line {number}: {_COUNTS[len(header)]} numbers {names} belong here, found "
-            f"{len(cells)}: {show(','.join(cells))}",
-            pose=source.name,
-        )
+        belongs = f"{_COUNTS[len(header)]} numbers {names} belong here"
+        raise ValueError(f"{belongs}, found {len(cells)}: {show(','.join(cells))}")
     values = []
     for cell in cells:
         try:
             values.append(float(cell))
         except ValueError:
-            raise MeasurementError(
-                f"line {number}: {show(cell)} is not a number", pose=source.name
-            ) from None
+            raise ValueError(f"{show(cell)} is not a number") from None
         if not math.isfinite(values[-1]):
-            raise MeasurementError(
-                f"line {number}: {show(cell)} is not a finite number; leave out the points that "
-                "were not measured, gaps are allowed",
-                pose=source.name,
+            raise ValueError(
+                f"{show(cell)} is not a finite number; leave out the points that were not "
+                "measured, gaps are allowed"
             )
     return values
-
-
-def _runs_backwards(
-    points: npt.NDArray[np.float64], start: Sequence[float], end: Sequence[float] | None
-) -> bool:
-    first, last = points[0], points[-1]
-    forward, backward = math.dist(first, start), math.dist(last, start)
-    if end is not None:
-        forward += math.dist(last, end)
-        backward += math.dist(first, end)
-    return backward < forward

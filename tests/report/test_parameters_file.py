@@ -65,7 +65,7 @@ def test_a_cable_in_space_is_rebuilt_exactly(outcome, tmp_path):
     assert np.array_equal(cable.metadata.coefficients, fit.coefficients)
     assert not cable.metadata.edited
     for change, message in (
-        (lambda d: d["cable"].pop("torsional_stiffness"), "torsional_stiffness is missing"),
+        (lambda d: d["cable"].pop("torsional_stiffness"), "has no torsional stiffness: in space"),
         (lambda d: d["rest_curvature"]["coefficients"].pop("k_z"), "k_z is missing"),
         (lambda d: d["rest_curvature"]["coefficients"]["k_z"].pop(), "26 numbers belong here"),
     ):
@@ -205,21 +205,27 @@ def damaged(file, tmp_path, change):
     ("change", "message"),
     [
         (lambda d: d.update(schema="other/1"), "schema 'dlo-parameters/1' expected, 'other/1'"),
-        (lambda d: d.pop("cable"), "cable is missing"),
-        (lambda d: d["cable"].update(length=-1.0), "cable.length must be a positive number"),
-        (lambda d: d["cable"].update(length="long"), "cable.length must be a positive number"),
+        (lambda d: d.pop("cable"), "'cable' is missing"),
+        (
+            lambda d: d["cable"].update(length=-1.0),
+            "cable.length: must be larger than 0, found -1.0",
+        ),
+        (lambda d: d["cable"].update(length="long"), "cable.length: a number belongs here, found"),
         (
             lambda d: d.update(element="beam"),
-            "element must be quadratic or arc or link, found 'beam'",
+            "element: allowed are 'quadratic', 'arc' or 'link', found 'beam'",
         ),
-        (lambda d: d["boundary"].update(end="glued"), "boundary.end must be pinned or clamped"),
+        (
+            lambda d: d["boundary"].update(end="glued"),
+            "boundary.end: allowed are 'pinned', 'clamped'",
+        ),
         (lambda d: d["effects"].append({"name": "magic", "label": "x"}), "called 'magic'"),
         (lambda d: d["effects"].pop(), "do not belong together: image_scale.factor"),
         (lambda d: d["state"]["rest_curvature"].pop(), "20 numbers belong here, found 19"),
-        (lambda d: d["parameters"]["end_offset.dx"].update(value=None), "must be finite"),
+        (lambda d: d["parameters"]["end_offset.dx"].update(value=None), "found nothing"),
         (
             lambda d: d["parameters"]["bending_stiffness"].update(value="soft"),
-            "parameters.bending_stiffness.value must be finite, found 'soft'",
+            "parameters.bending_stiffness.value: a number belongs here, found 'soft'",
         ),
         (
             lambda d: d["parameters"]["bending_stiffness"].update(value=-0.3),
@@ -247,12 +253,15 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.update(n=math.inf), "n must be a whole number, found inf: 2 to 2000 elements"),
-        (lambda d: d.update(n=10**9), "n must be a whole number, found 1000000000: 2 to 2000"),
-        (lambda d: d.update(n=20.5), "n must be a whole number, found 20.5"),
+        (lambda d: d.update(n=math.inf), "n: a whole number belongs here, found inf"),
+        (
+            lambda d: d.update(n=10**9),
+            "n: must not be larger than 2000, found 1000000000; 2 to 2000",
+        ),
+        (lambda d: d.update(n=20.5), "n: a whole number belongs here, found 20.5"),
         (
             lambda d: d.update(n_rest=100_000),
-            "n_rest must be a whole number, found 100000: 0 to 64",
+            "n_rest: must not be larger than 64, found 100000; 0 to 64",
         ),
         (
             lambda d: d["cable"].update(bending_stiffness=1e-300),
@@ -280,8 +289,9 @@ def test_a_value_that_cannot_be_computed_with_is_named_with_its_line(
         load_parameters(damaged(file, tmp_path, change))
     assert "Try: the file as a fit has written it." in str(caught.value)
     key = re.findall(r"\w+", message.split()[0])[-1]
+    listed = re.findall(rf"line (\d+): {re.escape(message)}", str(caught.value))  # one of several
     lines = caught.value.file.read_text().splitlines()
-    assert f"{key}:" in lines[caught.value.line - 1]
+    assert f"{key}:" in lines[(caught.value.line or int(listed[0])) - 1]
 
 
 @pytest.mark.parametrize("bound", ["lower", "upper"])
