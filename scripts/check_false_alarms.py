@@ -41,9 +41,9 @@ from dlo_casadi.effects import EFFECTS
 from dlo_casadi.equilibrium.equilibrium import tipping
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.spread import modes_in
+from dlo_casadi.estimation.constrained import profile_intervals
 from dlo_casadi.estimation.fit import SEARCH_MESH
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.io.files import write_file
 from dlo_casadi.model.rest_curvature import SMOOTHNESS, RestScatter
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor

@@ -55,7 +55,7 @@ from dlo_casadi.api import PredictedShape, Result
 from dlo_casadi.cli import main as command
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.errors import DloError
-from dlo_casadi.estimation.profile import student_95, threshold
+from dlo_casadi.estimation.constrained import student_95, threshold
 from dlo_casadi.io.files import write_file
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.report.terminal import candidate_table, print_summary

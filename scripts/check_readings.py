@@ -39,8 +39,8 @@ from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.constrained import profile_intervals
 from dlo_casadi.estimation.fit import fine_enough
-from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.io.files import write_file
 from dlo_casadi.report.canvas import BLUE, GREY, VERMILLION, save_figure, styled
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor

@@ -15,7 +15,7 @@ from paper.content import Claim, Part, Section, Target, drawing
 from paper.fits import estimate
 
 from dlo_casadi.estimation import fit as fitting
-from dlo_casadi.estimation.profile import profile_interval, stiffness_profile, threshold
+from dlo_casadi.estimation.constrained import profile_interval, stiffness_profile, threshold
 
 
 @pytest.fixture(scope="module")

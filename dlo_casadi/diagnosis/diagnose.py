@@ -2,24 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Literal
 
-from dlo_casadi.diagnosis.crossval import CrossValidation
-from dlo_casadi.diagnosis.equivalents import equivalents
-from dlo_casadi.diagnosis.hidden_weight import HiddenWeight, hidden_weight
-from dlo_casadi.diagnosis.next_pose import NextPose, next_pose
-from dlo_casadi.diagnosis.pull import Pull, estimate_pull
-from dlo_casadi.diagnosis.search import Search
-from dlo_casadi.diagnosis.selection import AddedEffect, Ranked
-from dlo_casadi.diagnosis.structure import Structure, screening_degrees, structure_of
+import numpy as np
+
+from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
+from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.next_measurement import HiddenWeight, NextPose, hidden_weight, next_pose
+from dlo_casadi.diagnosis.refits import (
+    Confirmed,
+    confirm,
+    confirm_cause,
+    confirm_from_data,
+    refit_without,
+    screened_from_data,
+)
+from dlo_casadi.diagnosis.screening import Screen, Screened, survival
+from dlo_casadi.diagnosis.selection import (
+    AddedEffect,
+    Ranked,
+    as_complete,
+    choose,
+    explained_by,
+    improving,
+    misleads,
+    p_with_closed_noise,
+    ranking,
+    shortcoming,
+    sidak,
+    why_lost,
+)
+from dlo_casadi.diagnosis.structure import (
+    Structure,
+    noise_degrees,
+    screening_degrees,
+    structure_of,
+)
+from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
+from dlo_casadi.effects import PointLoad
+from dlo_casadi.estimation.fit import fine_enough
+from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.variances import SETTLED_MODES, settle
 from dlo_casadi.runtime.executors import InProcess
-from dlo_casadi.thresholds import SIGNIFICANCE
+from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.thresholds import (
+    BIC_APART,
+    DIFFERENT,
+    LEFT,
+    NEAREST,
+    REFITTED,
+    SIGNIFICANCE,
+    UNSEEN,
+    UNSEEN_LEFT,
+    WORTH,
+)
 
 Verdict = Literal["complete", "effect_found", "unexplained"]
+# Of a candidate beside others that explain what the declared model misses by far.
+NOT_NEAR = "does not come near the measured shapes"
 
 
 @dataclass(frozen=True)
@@ -37,7 +82,7 @@ class Diagnosis:
         All candidates of the first step: those confirmed by BIC, then the others by score.
     unexplained : bool
         Whether structure is left, or poses that were left out are not predicted.
-    pull : Pull or None
+    pull : UnknownForce or None
         Where that is so: the load that assumes no cause; None where none fits.
     weight : HiddenWeight or None
         That the fit would not notice.
@@ -52,7 +97,7 @@ class Diagnosis:
     added: tuple[AddedEffect, ...] = ()
     ranked: tuple[Ranked, ...] = ()
     unexplained: bool = False
-    pull: Pull | None = None
+    pull: UnknownForce | None = None
     weight: HiddenWeight | None = None
 
     @property
@@ -102,27 +147,23 @@ def diagnose(
     search = Search(fit, center, exclude, significance, max_effects, step, run_in, finest)
     # Where left-out poses are not even reached no effect can be followed: first what pulls.
     lost = search.astray and fit.noise.source != "misfit"
-    pull = estimate_pull(fit, search.executor) if lost else None
+    pull = estimate_unknown_force(fit, search.executor) if lost else None
     found = search.run(pull)
     if found.unexplained and pull is not None:
         found = search.run()
     elif found.unexplained:
-        pull = estimate_pull(fit if found.added else found.fit, search.executor)
+        pull = estimate_unknown_force(fit if found.added else found.fit, search.executor)
         found = search.with_cause_of(pull, found)
     if found.unexplained and found.added:
         found = search.without_wrong_causes(found, pull)
         if found.added or not fit.errors_known:
-            pull = estimate_pull(found.fit, search.executor)
+            pull = estimate_unknown_force(found.fit, search.executor)
     tried = {row.name for row in found.ranked}
-    added = tuple(
-        replace(
-            item,
-            equivalents=equivalents(
-                found.fit, item.candidate, tried, [rival.candidate for rival in item.rivals]
-            ),
-        )
-        for item in found.added
-    )
+
+    def named(item: AddedEffect) -> AddedEffect:
+        rivals = [rival.candidate for rival in item.rivals]
+        return replace(item, equivalents=equivalents(found.fit, item.candidate, tried, rivals))
+
     return Diagnosis(
         before=fit,
         after=found.fit,
@@ -130,7 +171,7 @@ def diagnose(
         validation_after=found.validation,
         structure_before=structure_of(fit, screening_degrees(fit)),
         structure_after=found.structure,
-        added=added,
+        added=tuple(map(named, found.added)),
         ranked=found.ranked,
         unexplained=found.unexplained,
         pull=pull if found.unexplained else None,
@@ -150,3 +191,259 @@ def separating_pose(diagnosis: Diagnosis) -> NextPose | None:
             names = (item.candidate.name, rival.candidate.name)
             return None if found is None else replace(found, separates=names)
     return None
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a search has ended.
+
+    Parameters
+    ----------
+    fit : Fit
+    added : tuple of AddedEffect
+    ranked : tuple of Ranked
+    validation : CrossValidation
+    structure : Structure
+    unexplained : bool
+    """
+
+    fit: Fit
+    added: tuple[AddedEffect, ...]
+    ranked: tuple[Ranked, ...]
+    validation: CrossValidation
+    structure: Structure
+    unexplained: bool
+
+
+@dataclass(frozen=True)
+class Search:
+    """Search for effects that a declared model lacks: the arguments of `diagnose`."""
+
+    declared: Fit
+    center: tuple[float, float] | None
+    exclude: Sequence[str]
+    significance: float
+    max_effects: int
+    step: Callable[[str, int, int], None]
+    executor: Executor
+    finest: int | None = None
+
+    @cached_property
+    def validation(self) -> CrossValidation:
+        """Of the declared model."""
+        return cross_validate(self.declared)
+
+    @property
+    def error(self) -> float:
+        """Cross-validated error of the declared model [m], 0 where it tells nothing."""
+        return self.validation.error if self.validation.complete else 0.0
+
+    @property
+    def astray(self) -> bool:
+        """Whether the declared model cannot follow the poses that are left out."""
+        return self.several and not self.validation.complete
+
+    @property
+    def several(self) -> bool:
+        """Whether a pull may have a cause: in one pose a force fits as well as any."""
+        return len(self.declared.problem.used) > 1 and self.max_effects > 0
+
+    @property
+    def doubt(self) -> float | None:
+        """What a gain has to be held against where a pose or two were taken again and again."""
+        problem = self.declared.problem
+        count = different_poses(problem.history, problem.unknowns.model.cable.length)
+        return self.significance if count < min(DIFFERENT, len(problem.used)) else None
+
+    @cached_property
+    def first(self) -> list[Screened]:
+        """Score tests in the declared model."""
+        return self._screened(self.declared)
+
+    def _screened(self, current: Fit) -> list[Screened]:
+        """Score tests of all `candidates_of` a fit, best first."""
+        listed = candidates_of(current, self.center, self.exclude)
+        if not listed:
+            return []
+        return Screen(current, listed).run(screening_degrees(current), self.executor)
+
+    def run(self, pull: UnknownForce | None = None) -> Found:
+        """Add effects until the residual is noise, or nothing improves what is left out.
+
+        Parameters
+        ----------
+        pull : UnknownForce, optional
+            Whose causes are tried in the first step; else all effects, followed from the
+            declared model.
+        """
+        current, validation = self.declared, self.validation
+        added: list[AddedEffect] = []
+        ranked: list[Ranked] = []
+        lost: dict[str, str] = {}
+        for k in range(self.max_effects):
+            self.step("search for a missing effect", k, self.max_effects)
+            misfit = current.noise.source == "misfit"
+            tried: list[Confirmed | None] = []
+            if misfit and pull is None:
+                screened, tried = self._from_data(current)
+            else:
+                screened = self.first if k == 0 else self._screened(current)
+            p_values = {x.candidate.name: sidak(x.p_value, len(screened)) for x in screened}
+            if k == 0 and pull is not None:
+                tried = self._causes(pull, screened)
+            elif not misfit:
+                tried = self._leading(current, screened, p_values)
+            explaining = explained_by(current, tried)
+            confirmed = explaining or improving(tried, validation, self.doubt)
+            if k == 0:
+                ranked = ranking(screened, p_values, confirmed, tried)
+            # What a second effect explains may be what the first one, if wrong, has left.
+            apart = np.inf if added and not explaining else BIC_APART
+            chosen, misleading = choose(confirmed, apart), []
+            while chosen and not explaining and misleads(chosen[0], current, validation):
+                misleading.append(chosen[0])
+                confirmed.remove(chosen[0])
+                chosen = choose(confirmed, apart)
+            if k == 0:
+                why = partial(shortcoming, validation=validation, doubt=self.doubt)
+                other = (lambda _: NOT_NEAR) if explaining else why
+                lost = why_lost(tried, confirmed, misleading, chosen, other)
+            if chosen is None:
+                break
+            winner, rivals = chosen
+            p_value = p_values[winner.candidate.name]
+            if k == 0 and pull is not None:
+                single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
+                p_value = sidak(single, len(screened))
+            closed = winner.fit if explaining else as_complete(winner.fit)
+            if not (closed.errors_known or misfit):
+                again = p_with_closed_noise(current, closed, winner, len(screened))
+                p_value = max(p_value, again)
+            if p_value > self.significance:
+                if not added:
+                    names = [item.candidate.name for item in (winner, *rivals)]
+                    lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
+                break
+            current = closed
+            after = cross_validate(current)
+            added.append(AddedEffect(winner.candidate, p_value, validation, after, tuple(rivals)))
+            validation = after
+        self.step("search for a missing effect", self.max_effects, self.max_effects)
+        listed = tuple(replace(row, reason=lost.get(row.name, "")) for row in ranked)
+        return self._ended(*self._pruned(current, added), listed)
+
+    def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
+        """Backward step: without the effects that a later one has made superfluous.
+
+        An effect has to be as significant as when it was added, and worth its parameters.
+        """
+        for effect in added[:-1]:
+            smaller = refit_without(fit, effect.candidate)
+            if smaller is None:
+                continue
+            screened = self._screened(smaller)
+            single = {item.candidate.name: item.p_value for item in screened}
+            p_value = sidak(single[effect.candidate.name], len(screened))
+            price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
+            gain = 2 * (smaller.point.objective - fit.point.objective)
+            if gain < price or p_value > self.significance:
+                fit = settle(smaller)
+                added = [item for item in added if item is not effect]
+        return fit, added
+
+    def _leading(
+        self, current: Fit, screened: Sequence[Screened], p_values: Mapping[str, float]
+    ) -> list[Confirmed | None]:
+        """Refits of the significant candidates with the highest scores."""
+        significant = [x for x in screened if p_values[x.candidate.name] < self.significance]
+        leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
+        worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
+        return list(map_in_order(self.executor, partial(confirm, current), worthy))
+
+    def _from_data(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None]]:
+        """Fits from the measured shapes of the candidates that come nearest to them.
+
+        Beside a misfit scores are no order, and a refit leads where the declared model has gone.
+        """
+        listed = candidates_of(current, self.center, self.exclude)
+        begun = screened_from_data(current, listed, self.executor)
+        least = min((start.guess.objective for _, start in begun), default=0.0)
+        near = [pair for pair in begun if pair[1].guess.objective <= NEAREST * least]
+        refit = partial(confirm_from_data, current)
+        tried = list(map_in_order(self.executor, refit, near[:REFITTED]))
+        return [item for item, _ in begun], tried
+
+    def _causes(self, pull: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
+        """Refits of all loads at one place, whatever their scores, that give the pull's forces.
+
+        Two free forces in each pose would gain more than their price if the law were wrong.
+        """
+        loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
+        refit = partial(confirm_cause, self.declared, pull)
+        free = 2 * len(self.declared.problem.used) + 1
+        price = free * np.log(self.declared.problem.n_residuals)
+        return [
+            item
+            for item in map_in_order(self.executor, refit, loads)
+            if item is not None and item.bic >= pull.gain - price
+        ]
+
+    def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
+        """What has been found, and whether it explains the data."""
+        if not added and not fit.noise.known:
+            fit = settle(fit)
+        found = self._judged(fit, added, ranked)
+        if not (found.unexplained and added and self.finest):
+            return found
+        # What effects leave may be the mesh's, which was fine enough for what they explain.
+        finer, _ = fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)
+        return found if finer is fit else self._judged(finer, added, ranked)
+
+    def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
+        validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
+        limit = UNSEEN * max(fit.expected_error, validation.expected)
+        if added:
+            limit = max(limit, UNSEEN_LEFT * self.error)
+        # From one pose alone another one is not predicted to first order of the covariance.
+        told = bool(added) or len(self.declared.problem.used) > 2
+        unpredicted = told and validation.error > limit
+        unexplained = structure.p_noise < self.significance or unpredicted
+        unexplained |= fit.noise.source == "misfit"
+        return Found(fit, tuple(added), ranked, validation, structure, unexplained)
+
+    def with_cause_of(self, pull: UnknownForce | None, found: Found) -> Found:
+        """Return a search that begins with a cause of the pull, if it explains the data."""
+        if pull is None or not self.several:
+            return found
+        other = self.run(pull)
+        return found if other.unexplained else other
+
+    def without_wrong_causes(self, found: Found, pull: UnknownForce | None) -> Found:
+        """Withdraw effects that do not explain nearly all of what the declared model lacks.
+
+        Something is missing still, and a wrong effect may stand for a part of it. Effects stay
+        if the mean square error of what is left out, beyond noise and fixtures, falls to less
+        than LEFT of what it was: then what is missing beside them is small against what they
+        explain. And all go if one force in each pose explains more than they do.
+        """
+        floor = found.fit.expected_error**2
+        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, self.error))
+        if after <= LEFT * before and not self._needless(found, pull):
+            return found
+        return self._ended(self.declared, [], found.ranked)
+
+    def _needless(self, found: Found, alone: UnknownForce | None) -> bool:
+        """Whether one force per pose on the declared model does better than with the effects."""
+        if alone is None or not self.several:
+            return False
+        pull = estimate_unknown_force(found.fit, self.executor)
+        n = np.log(self.declared.problem.n_residuals)
+        extra = sum(len(item.candidate.frees) for item in found.added) * n
+        if pull is None:
+            return True
+        if 2 * alone.fit.point.objective >= 2 * pull.fit.point.objective + extra:
+            return False
+        p_alone, p_found = (
+            structure_of(x, noise_degrees(x)).p_value for x in (alone.fit, found.fit)
+        )
+        return p_alone > p_found

@@ -95,7 +95,7 @@ class _Moving:
     def by_names(self, fit: Fit, scan: Mapping[str, float]) -> list[FloatArray]:
         """Whitened derivatives (R_j, names) of each pose's residuals, at a scan."""
         problem, unknowns = self.problem, self.problem.unknowns
-        p = _at(scan, unknowns.model, fit)
+        p = fit.values_in(unknowns.model, scan)
         theta = unknowns.pack(p, fit.coefficients)
         rest = unknowns.rest(theta)
         columns = [unknowns.names.index(name) for name in self.names]
@@ -115,14 +115,6 @@ def with_springs(
 ) -> Shapes:
     """Shapes in which springs that do not pull yet are where they hang on the cable."""
     return equilibria.solve(shapes, p, rest)[0] if equilibria.model.n_springs else shapes
-
-
-def _at(scan: Mapping[str, float], model: CableModel, fit: Fit) -> FloatArray:
-    """Parameters of a model that holds a fit's, at a scan."""
-    p = fit.values_in(model)
-    for name, value in scan.items():
-        p[model.names.index(name)] = value
-    return p
 
 
 def _scan(active: Sequence[Candidate], k: int) -> dict[str, float]:
@@ -201,7 +193,7 @@ class Screen:
     def _linearized(self) -> tuple[Problem, Point, Linearization]:
         """The fit's model with candidates at their nominal values, linearised at the fit."""
         problem = self.fit.problem
-        p = _at(_scan(self.listed, 0), self.model, self.fit)
+        p = self.fit.values_in(self.model, _scan(self.listed, 0))
         # Nuisances that are candidates enter twice: with their prior, and free.
         free = self.fit.free_in(self.model)
         unknowns = Unknowns(self.model, free, p)

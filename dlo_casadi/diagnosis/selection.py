@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.diagnosis.confirm import Confirmed
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
@@ -212,12 +212,13 @@ def _worse(one: CrossValidation, other: CrossValidation) -> str:
     return f"predicts what is left out worse: {errors}"
 
 
-def misleads(fit: Fit, before: Fit, validation: CrossValidation) -> bool:
+def misleads(item: Confirmed, before: Fit, validation: CrossValidation) -> bool:
     """Whether a fit with an effect tells a user, who knows the ends alone, worse than one without.
 
-    `validation` follows the branches on which poses were measured, without the effect.
+    A nuisance never does. `validation` follows the branches on which poses were measured, without
+    the effect.
     """
-    told = _told(fit)
+    told = 0.0 if item.candidate.nuisance else _told(item.fit)
     return told > validation.rmse and told > MISLEADING * _told(before)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,8 +96,7 @@ def _promised(normal: Normal) -> float:
     """Decrease of the objective that an undamped step promises."""
     matrix = normal.hessian + NO_INFORMATION * np.eye(len(normal.hessian))
     shared = normal.gradient @ np.linalg.solve(matrix, normal.gradient)
-    own = sum(slope @ np.linalg.solve(block, slope) for block, _, slope in normal.inner)
-    return float(shared + own) / 2
+    return float(shared) / 2 + normal.by_deviations
 
 
 def _ahead(
@@ -121,7 +121,7 @@ def _ahead(
 
 def _stepped(problem: Problem, point: Point, lin: Linearization, damping: float) -> Point | None:
     """The point after a damped step within reach; None if some pose loses its equilibrium."""
-    normal, equilibria = problem.normal_equations(point, lin), problem.equilibria
+    normal = problem.normal_equations(point, lin)
     lower, upper = problem.unknowns.reach(point.theta)
     scale = np.maximum(np.diag(normal.hessian), 1e-12)
     # A direction without any information (the place of a mass of zero) must not move.
@@ -130,14 +130,11 @@ def _stepped(problem: Problem, point: Point, lin: Linearization, damping: float)
     new = point.theta + step
     if np.any(new < lower) or np.any(new > upper):
         step = _bounded_step(matrix, normal.gradient, lower - point.theta, upper - point.theta)
-    deviation = point.shapes.deviation.copy()
-    for j, (block, cross, slope) in zip(problem.used, normal.inner, strict=True):
-        own = np.linalg.solve(block, cross @ step + slope)
-        deviation[j, equilibria.used_deviations] -= own
-    change = problem.shape_step(lin.shapes, step, deviation - point.shapes.deviation)
+    change, deviation = problem.moved(lin.shapes, normal, step)
     if float(np.abs(change.x).max()) > LONGEST_MOVE:
         return None
-    guess = replace(equilibria.moved(point.shapes, change), deviation=deviation)
+    guess = problem.equilibria.moved(point.shapes, change)
+    guess = replace(guess, deviation=point.shapes.deviation + deviation)
     return problem.balanced(Values(point.theta + step, guess, point.projections), reach=1.0)
 
 
@@ -162,7 +159,7 @@ def refit(
     model: CableModel,
     *,
     free: Sequence[str] | None = None,
-    values: FloatArray | None = None,
+    values: Mapping[str, float] = MappingProxyType({}),
     steps: int = 40,
 ) -> Fit:
     """Fit a similar model, or the same on another mesh, from a fit's minimum and with its weights.
@@ -171,9 +168,9 @@ def refit(
     ----------
     free : sequence of str, optional
         Names of the parameters to estimate; by default all but those that the fit keeps fixed.
-    values : (n_parameters,), optional
+    values : mapping, optional
         Where parameters that the fit does not have start, and where those stay that are not
-        estimated; by default as the fit has them, or nominal.
+        estimated, by name; by default as the fit has them, or nominal.
     steps : int
         Iterations at most.
 
@@ -184,8 +181,7 @@ def refit(
     """
     chosen = fit.free_in(model) if free is None else np.isin(model.names, free)
     known = np.isin(model.names, fit.model.names)
-    found = fit.values_in(model)
-    p = found if values is None else np.where(known & chosen, found, values)
+    p = np.where(known & chosen, fit.values_in(model), fit.values_in(model, values))
     problem = replace(fit.problem, unknowns=Unknowns(model, chosen, p))
     theta = problem.unknowns.pack(p, fit.coefficients)
     start = Values(theta, carried_shapes(problem, fit), fit.point.projections)

@@ -15,7 +15,7 @@ from dlo_casadi.estimation.descent import descend, on_other_mesh, refit
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.starting_points import DECADES, ROLLS, starting_points
+from dlo_casadi.estimation.start import DECADES, ROLLS, starting_points
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import (
     SCATTER_FLOOR,

@@ -119,6 +119,12 @@ class Normal:
     gradient: FloatArray
     inner: list[tuple[FloatArray, FloatArray, FloatArray]]
 
+    @property
+    def by_deviations(self) -> float:
+        """Decrease of the objective that a step of the deviations alone promises."""
+        steps = (slope @ np.linalg.solve(block, slope) for block, _, slope in self.inner)
+        return float(sum(steps)) / 2
+
 
 @dataclass(frozen=True, eq=False)
 class Priors:
@@ -304,17 +310,22 @@ class Problem:
 
     def evaluate(self, values: Values) -> Point:
         """Objective at given unknowns and equilibria."""
-        theta, shapes, seen = values.theta, values.shapes, self.observed(values)
+        seen = self.observed(values)
         moved = self.located(values, seen)
         residuals: list[FloatArray] = [
             white @ self.measured[j].residual(seen[j], s)
             for white, j, s in zip(self.whitening, self.used, moved, strict=True)
         ]
+        objective, data = self.objective(values, residuals)
+        return Point(values.theta, values.shapes, moved, objective, data, residuals)
+
+    def objective(self, values: Values, residuals: list[FloatArray]) -> tuple[float, float]:
+        """Half the sum of squares, priors included, and that of the whitened residuals alone."""
         data = float(sum(white @ white for white in residuals))
-        gap = theta - self.mean
-        used = shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
+        gap = values.theta - self.mean
+        used = values.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
         prior = float(gap @ self.precision @ gap + ((used / self.deviation_std) ** 2).sum())
-        return Point(theta, shapes, moved, (data + prior) / 2, data, residuals)
+        return (data + prior) / 2, data
 
     def balanced(self, values: Values, **options: Any) -> Point | None:
         """The objective at equilibria of all poses near some values; None if a pose has none there.
@@ -378,8 +389,13 @@ class Problem:
             inner.append((block, cross, slope))
         return Normal(hessian, gradient, inner)
 
-    def shape_step(self, along: Tangents, step: FloatArray, deviation: FloatArray) -> Vector:
-        """How the shapes move with a step of theta and of the deviations, one column."""
-        own = deviation[:, self.equilibria.used_deviations]
+    def moved(self, along: Tangents, normal: Normal, step: FloatArray) -> tuple[Vector, FloatArray]:
+        """How shapes, one column, and deviations (m, n_deviations) move with a step of theta."""
+        own = np.zeros((self.equilibria.m, len(self.equilibria.used_deviations)))
+        for j, (block, cross, slope) in zip(self.used, normal.inner, strict=True):
+            own[j] = -np.linalg.solve(block, cross @ step + slope)
         both = np.concatenate([np.broadcast_to(step, (len(own), len(step))), own], axis=1)
-        return Vector(along.x @ both[:, None, :, None], along.lam @ both[:, :, None])
+        shapes = Vector(along.x @ both[:, None, :, None], along.lam @ both[:, :, None])
+        deviation = np.zeros((len(own), len(self.unknowns.model.deviation_names)))
+        deviation[:, self.equilibria.used_deviations] = own
+        return shapes, deviation

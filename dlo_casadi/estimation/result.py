@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -357,9 +358,11 @@ class Fit:
         """Value of a parameter (SI)."""
         return float(self.p[self.model.names.index(name)])
 
-    def values_in(self, model: CableModel) -> FloatArray:
-        """Parameter vector of a similar model: this fit's values, nominal where it has none."""
-        known = dict(zip(self.model.names, self.p, strict=True))
+    def values_in(
+        self, model: CableModel, given: Mapping[str, float] = MappingProxyType({})
+    ) -> FloatArray:
+        """Parameter vector of a similar model: as given, this fit's, nominal where it has none."""
+        known = {**dict(zip(self.model.names, self.p, strict=True)), **given}
         return np.array([known.get(q.name, q.nominal) for q in model.parameters])
 
     def free_in(self, model: CableModel) -> NDArray[np.bool_]:

@@ -1,7 +1,8 @@
-"""A first point of the batch problem: shapes from the measured lines, then all at once."""
+"""Where a fit starts: shapes from the measured lines, all at once, over decades of stiffness."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +11,10 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
 from dlo_casadi.equilibrium.guesses import first_nodes, line_nodes
-from dlo_casadi.estimation.problem import NO_INFORMATION, Problem, Values
+from dlo_casadi.estimation.problem import NO_INFORMATION, Point, Problem, Values
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes, Tangents
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel
 from dlo_casadi.rod.band import Vector
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
@@ -31,6 +33,16 @@ LONGEST = 0.7
 EITHER_WAY, LOOK = np.pi / 2, 4
 # A step is taken back where the objective has risen beyond this factor, and this part is tried.
 RISE, PART = 1.5, 0.3
+# Decades about the prior stiffness from which fits are started.
+DECADES = (0, -1, 1, -2, 2, -3, 3)
+# Rolls of the end [rad] about which twists are counted in turn: a standard deviation to both sides.
+ROLLS = (0.0, 1.0, -1.0)
+# Iterations of all starts, and how many more the promising ones take in space, where frames take
+# longer: at the true stiffnesses, none of three sessions in which an effect is missing had settled
+# after 6 whole steps, two had after 12 to 20, one had not.
+FIRST_LOOK, MORE = 6, 14
+# Starts that are descended from, and unknowns [scaled] within which two starts are one.
+DESCENTS, ALIKE = 3, 1e-2
 
 
 def measured_shapes(
@@ -216,24 +228,20 @@ class Guess(Values):
 
 @dataclass(frozen=True)
 class _Step:
-    """A Gauss-Newton step from inconsistent values.
+    """A Gauss-Newton step from `here`, values with their objective and projections.
 
-    Parameters
-    ----------
-    objective : float
-        Of the unknowns as they are, once the linearised forces balance.
-    theta : (size,)
-    shapes : Vector
-    deviation : (m, n_deviations)
-    projections : list of (K_j,) [m]
-        Of the shapes as they are.
+    In theta (size,), shapes and the poses' own deviations (m, n_deviations).
     """
 
-    objective: float
+    here: Guess
     theta: FloatArray
     shapes: Vector
     deviation: FloatArray
-    projections: list[FloatArray]
+
+    @property
+    def longest(self) -> float:
+        """Largest turn of a node [rad]."""
+        return float(np.abs(self.shapes.x).max())
 
 
 def all_at_once(
@@ -255,75 +263,170 @@ def all_at_once(
     Guess or None
         None if the first matrices are singular.
     """
-    last: tuple[Guess, _Step] | None = None
+    last: _Step | None = None
     share = 1.0
     for _ in range(iterations + 1):
         step = _step(problem, guess, held)
-        if step is None or (last and step.objective > RISE * last[1].objective):
-            if last is None:
-                return None
-            share *= PART
+        if step and not (last and step.here.objective > RISE * last.here.objective):
+            last, share = step, min(1.0, LONGEST / max(step.longest, SETTLED))
+        elif last is None:
+            return None
         else:
-            last = replace(guess, objective=step.objective, projections=step.projections), step
-            share = min(1.0, LONGEST / max(float(np.abs(step.shapes.x).max()), SETTLED))
-        if share * float(np.abs(last[1].shapes.x).max()) < SETTLED:
+            share *= PART
+        if share * last.longest < SETTLED:
             break
-        guess = _moved(problem, *last, share)
-    return None if last is None else last[0]
-
-
-def _moved(problem: Problem, guess: Guess, step: _Step, share: float) -> Guess:
-    """A share of a step; multipliers, unknown at first, take the whole of theirs."""
-    deviation = guess.shapes.deviation + share * step.deviation
-    change = Vector(share * step.shapes.x, step.shapes.y)
-    shapes = replace(problem.equilibria.moved(guess.shapes, change), deviation=deviation)
-    return Guess(guess.theta + share * step.theta, shapes, guess.projections)
+        # Multipliers, unknown at first, take the whole of their step.
+        change = Vector(share * last.shapes.x, last.shapes.y)
+        deviation = last.here.shapes.deviation + share * last.deviation
+        moved = replace(problem.equilibria.moved(last.here.shapes, change), deviation=deviation)
+        guess = Guess(last.here.theta + share * last.theta, moved, last.here.projections)
+    return None if last is None else last.here
 
 
 def _step(problem: Problem, guess: Guess, held: NDArray[np.bool_]) -> _Step | None:
     """Where the linearised balance and residuals lead; None where matrices are singular."""
-    unknowns, equilibria = problem.unknowns, problem.equilibria
-    theta, shapes = guess.theta, guess.shapes
-    columns, moving = equilibria.used_deviations, ~held
-    own = np.diag(1 / problem.deviation_std**2 + 1e-12)
-    state = problem.state(guess)
+    unknowns, equilibria, theta = problem.unknowns, problem.equilibria, guess.theta
+    state, moving = problem.state(guess), ~held
+    here = replace(guess, projections=problem.located(guess, problem.observed(guess)))
     try:
         along = equilibria.directions(*state, unknowns.slopes(theta), unknowns.rest_slopes)
         force = equilibria.imbalance(*state)
         assert along.tangent is not None
         correction = along.tangent.factor().solve(Vector(-force.x, -force.y))
-    except np.linalg.LinAlgError:
+        ahead = problem.linearize_along(here, along, correction)
+        normal = problem.normal_equations(here, ahead)
+    except np.linalg.LinAlgError:  # a shape about to snap moves without bounds
         return None
-    projections = problem.located(guess, problem.observed(guess))
-    ahead = problem.linearize_along(replace(guess, projections=projections), along, correction)
-    gap = theta - problem.mean
-    hessian, gradient = problem.precision.copy(), problem.precision @ gap
-    objective = float(gap @ gradient) / 2
-    inner = []
-    rows = zip(problem.used, ahead.residuals, ahead.by_theta, ahead.by_deviation, strict=True)
-    for j, e, a, b in rows:
-        now = shapes.deviation[j, columns]
-        block = b.T @ b + own
-        cross, slope = b.T @ a, b.T @ e + own @ now
-        try:
-            solved = np.linalg.solve(block, np.column_stack([cross, slope]))
-        except np.linalg.LinAlgError:  # a shape about to snap moves without bounds
-            return None
-        hessian += a.T @ a - cross.T @ solved[:, :-1]
-        gradient += a.T @ e - cross.T @ solved[:, -1]
-        objective += float(e @ e + now @ own @ now - slope @ solved[:, -1]) / 2
-        inner.append(solved)
-    damped = hessian[np.ix_(moving, moving)]
+    objective = problem.objective(here, ahead.residuals)[0] - normal.by_deviations
+    damped = normal.hessian[np.ix_(moving, moving)]
     damped += np.diag(1e-6 * np.diag(damped) + NO_INFORMATION)
     step = np.zeros_like(theta)
-    step[moving] = -np.linalg.solve(damped, gradient[moving])
+    step[moving] = -np.linalg.solve(damped, normal.gradient[moving])
     lower, upper = unknowns.bounds
     step = np.clip(theta + np.clip(step, -3, 3), lower, upper) - theta
-    deviation = np.zeros_like(shapes.deviation)
-    for j, solved in zip(problem.used, inner, strict=True):
-        deviation[j, columns] -= solved[:, :-1] @ step + solved[:, -1]
-    change = correction + problem.shape_step(along, step, deviation)
+    moved, deviation = problem.moved(along, normal, step)
+    change = correction + moved
     # A sum of squares: below zero the matrices are singular but for rounding, and promise anything.
     if not (0 <= objective < np.inf and np.all(np.isfinite(change.x))):
         return None
-    return _Step(objective, step, change, deviation, projections)
+    return _Step(replace(here, objective=objective), step, change, deviation)
+
+
+def starting_points(
+    problem: Problem,
+    theta: FloatArray,
+    decades: Sequence[float] = DECADES,
+    rolls: Sequence[float] = ROLLS,
+    *,
+    either_way: bool = False,
+) -> list[Fit]:
+    """Equilibria near the measured shapes for stiffnesses over decades, best first.
+
+    Where the problem has no weights yet, they are taken at the first shapes.
+
+    Starts take a few iterations, then the most promising take more, until as many as are
+    descended from have led to equilibria. Where none has, no decade is left out. `either_way`: see
+    `turned_either_way`.
+    """
+    for whole in (False, True):
+        problem, guesses = _guesses(
+            problem, theta, decades, rolls, either_way=either_way, whole=whole
+        )
+        found = _equilibria(problem, guesses)
+        if found:
+            break
+    ranked = sorted(found, key=lambda point: point.objective)
+    return [Fit(problem, point) for point in ranked]
+
+
+def _guesses(
+    problem: Problem,
+    theta: FloatArray,
+    decades: Sequence[float],
+    rolls: Sequence[float],
+    *,
+    either_way: bool,
+    whole: bool,
+) -> tuple[Problem, list[Guess]]:
+    """Starts after a few iterations, each roll's over decades of stiffness; see `_outwards`."""
+    names = problem.unknowns.names
+    rolls = rolls if END_ROLL in names else (0.0,)
+    held = _held(problem)
+    guesses: list[Guess] = []
+    for roll in rolls:
+        shapes, projections = measured_shapes(problem, roll)
+        if problem.weights is None:
+            problem = problem.weighed(Values(theta, shapes, projections))
+        rolled = theta.copy()
+        if roll:
+            own = names.index(END_ROLL)
+            rolled[own] += roll / problem.unknowns.scales[own]
+        if either_way:
+            still = held | (np.array(names) == END_ROLL)
+            turned = turned_either_way(problem, Guess(rolled, shapes, projections), still, roll)
+            shapes, projections = turned.shapes, turned.projections
+        near = Guess(rolled, shapes, projections)
+        guesses += _outwards(problem, near, held, decades, whole=whole)
+    return problem, guesses
+
+
+def _outwards(
+    problem: Problem,
+    near: Guess,
+    held: NDArray[np.bool_],
+    decades: Sequence[float],
+    *,
+    whole: bool,
+) -> list[Guess]:
+    """Guesses by decade, from the middle outwards until the best of them is not an outermost one.
+
+    Over decades of stiffness the objective has one valley, in one of twelve sessions and a ridge
+    beside it. With stiffnesses declared right, and 10 and 100 times off either way, eleven sessions
+    end at the minimum to which all decades lead, in 55 of 55 fits; so do twelve in space as they
+    are declared. `whole`: all decades.
+    """
+    # Bending and torsion go together: their ratio is known better than either.
+    stiffnesses = [k for k, name in enumerate(problem.unknowns.names) if name in STIFFNESSES]
+    found: dict[float, Guess] = {}
+    for size in sorted({abs(decade) for decade in decades}):
+        for decade in (decade for decade in decades if abs(decade) == size):
+            theta = near.theta.copy()
+            theta[stiffnesses] += decade * np.log(10)
+            guess = all_at_once(problem, replace(near, theta=theta), held, FIRST_LOOK)
+            if guess is not None:
+                found[decade] = guess
+        best = min(found, key=lambda decade: found[decade].objective, default=size)
+        if abs(best) < size and not whole:
+            break
+    return list(found.values())
+
+
+def _held(problem: Problem) -> NDArray[np.bool_]:
+    """Entries of theta that starts leave where they are: all but the rest shape.
+
+    And the roll of a cable in its end clamp, which is as unknown.
+    """
+    names = problem.unknowns.names
+    held = np.array([k < problem.unknowns.n_parameters for k in range(len(names))])
+    return held & np.array([name != END_ROLL for name in names])
+
+
+def _equilibria(problem: Problem, guesses: Sequence[Guess]) -> list[Point]:
+    """Equilibria that the most promising guesses lead to."""
+    held, found = _held(problem), list[Point]()
+    ranked = sorted(guesses, key=lambda guess: guess.objective)
+    for k, guess in enumerate(ranked):
+        if len(found) == DESCENTS:
+            break
+        if any(np.allclose(guess.theta, other.theta, atol=ALIKE) for other in ranked[:k]):
+            continue
+        more = all_at_once(problem, guess, held, MORE) if problem.unknowns.model.in_space else None
+        point = equilibria_near(problem, more, guess)
+        found += [point] if point else []
+    return found
+
+
+def equilibria_near(problem: Problem, *guesses: Guess | None) -> Point | None:
+    """Equilibria near the first of some guesses that has any; None if none has."""
+    points = (problem.balanced(guess, max_iterations=40) for guess in guesses if guess)
+    return next((point for point in points if point), None)

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.descent import descend
-from dlo_casadi.estimation.repeats import different_poses, with_repeats
-from dlo_casadi.estimation.rest_scatter import (
+from dlo_casadi.estimation.repeats import (
     MOST_POSES,
     RestLikelihood,
     ScatterEstimate,
     ScatterSample,
+    different_poses,
     estimate_rest_scatter,
+    with_repeats,
 )
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
-from dlo_casadi.estimation.moment import LEAST_POINTS, law_of, measured_moment_curve
+from dlo_casadi.estimation.stiffness import LEAST_POINTS, law_of, measured_moment_curve
 from dlo_casadi.report.canvas import (
     BLACK,
     BLUE,

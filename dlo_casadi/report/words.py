@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dlo_casadi.diagnosis.next_pose import NextPose, NextReading
+from dlo_casadi.diagnosis.next_measurement import NextPose, NextReading
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted

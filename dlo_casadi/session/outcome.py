@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import Diagnosis, Verdict
-from dlo_casadi.diagnosis.hidden_weight import HiddenWeight
-from dlo_casadi.diagnosis.next_pose import NextPose
-from dlo_casadi.diagnosis.pull import Pull
+from dlo_casadi.diagnosis.next_measurement import HiddenWeight, NextPose
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import Structure
+from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
@@ -379,7 +378,7 @@ class Outcome:
         What was added to the declared model.
     candidates : tuple of Ranked
         All effects that were tried, the likely ones first.
-    unexplained : Pull or None
+    unexplained : UnknownForce or None
         The load that assumes no cause.
     next_pose : NextPose or None
         The pose that separates rival explanations.
@@ -406,7 +405,7 @@ class Outcome:
     warnings: tuple[str, ...] = ()
     effects: tuple[FoundEffect, ...] = ()
     candidates: tuple[Ranked, ...] = ()
-    unexplained: Pull | None = None
+    unexplained: UnknownForce | None = None
     next_pose: NextPose | None = None
     structure: tuple[Structure, Structure] | None = None
     cross_validated: float | None = None

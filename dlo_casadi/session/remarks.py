@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.config import SkippedPose
-from dlo_casadi.diagnosis.hidden_weight import HiddenWeight
-from dlo_casadi.diagnosis.repeatability import alike, limiting_spread
+from dlo_casadi.diagnosis.next_measurement import HiddenWeight
+from dlo_casadi.diagnosis.structure import alike, limiting_spread
 from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.errors import counted
 from dlo_casadi.estimation.fit import allowed_mesh_error

@@ -15,10 +15,9 @@ import numpy as np
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import diagnose, separating_pose
 from dlo_casadi.errors import DloError
-from dlo_casadi.estimation.branches import as_measured
+from dlo_casadi.estimation.constrained import as_measured, profile_intervals
 from dlo_casadi.estimation.fit import SEARCH_MESH, fine_enough, mesh_error, refine_mesh
 from dlo_casadi.estimation.prediction import noise_distance
-from dlo_casadi.estimation.profile import profile_intervals
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES
 from dlo_casadi.model.cable_model import CableModel

@@ -12,7 +12,7 @@ from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
 from dlo_casadi.equilibrium.tipping import sides_of, tipping_of
-from dlo_casadi.estimation.branches import EnergyGap
+from dlo_casadi.estimation.constrained import EnergyGap, Interval
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
     Prediction,
@@ -21,7 +21,6 @@ from dlo_casadi.estimation.prediction import (
     predict_poses,
     rms_distance,
 )
-from dlo_casadi.estimation.profile import Interval
 from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, solve_equilibrium
-from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.profile import (
+from dlo_casadi.estimation.constrained import (
     Interval,
     profile_interval,
     stiffness_profile,
     threshold,
 )
+from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.paper.algorithm1 import gravity_slopes, run_algorithm1

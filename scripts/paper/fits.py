@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import CableModel
+from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.paper.algorithm1 import run_algorithm1

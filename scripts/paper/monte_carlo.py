@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from dlo_casadi import CableModel, DloError
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem, Values
-from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import settle

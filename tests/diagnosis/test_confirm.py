@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
-from dlo_casadi.diagnosis.confirm import refit_with
-from dlo_casadi.diagnosis.pull import _Search
+from dlo_casadi.diagnosis.refits import refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen
-from dlo_casadi.diagnosis.search import _drop
+from dlo_casadi.diagnosis.unknown_force import _Search
 from dlo_casadi.effects import Cable, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
@@ -68,7 +67,7 @@ def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
     }
     slope, std = (f("stiffness_gradient.slope") for f in (larger.value, larger.std))
     assert abs(slope - 0.4) < 3 * std
-    smaller = _drop(larger, taper)
+    smaller = refit_without(larger, taper)
     assert kept(smaller) == FIXED
     assert "lumped_mass.mass" not in smaller.problem.unknowns.names
 

@@ -10,10 +10,9 @@ import pytest
 
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis import diagnose as module
-from dlo_casadi.diagnosis.candidates import candidates, setup_of
+from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
-from dlo_casadi.diagnosis.equivalents import equivalents
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
 from dlo_casadi.effects import EFFECTS, BendingSoftening, LumpedMass
@@ -102,9 +101,7 @@ def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
     start = fit_of((declared, measured), std=config.experiment.measurement.std)
     force = next(c for c in candidates(model, setup_of(model)) if c.name == "point_force")
     larger = force.add_to(start.model)
-    values = larger.nominal.copy()
-    for key, value in effect.items():
-        values[larger.names.index(f"point_force.{key}")] = value
+    values = {f"point_force.{key}": value for key, value in effect.items()}
     fit = refit(start, larger, values=values)
     assert equivalents(fit, force, tried=()) == (untried,)
     assert equivalents(fit, force, tried=(untried,)) == ()
@@ -115,7 +112,8 @@ def test_effects_that_do_not_predict_a_pose_left_out_are_no_explanation(monkeypa
 
     They are withdrawn: what is left is what the declared model leaves.
     """
-    monkeypatch.setattr(module, "estimate_pull", lambda *_: None)  # half a minute, not needed
+    # Half a minute, not needed.
+    monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: None)
     tried = {"stiffness_gradient", "gravity_tilt"}
     config = load_config(BENCH / "stretch" / "session.yaml")
     measured = measured_poses(config, read_inputs(config, lambda *_: None))
@@ -160,7 +158,7 @@ def test_leaving_a_pose_out_in_one_step_is_close_to_fitting_again(session):
 def test_the_place_of_a_mass_of_zero_stops_nothing(fit):
     """It has no information at all: predictions are those without the mass."""
     model = fit.model.with_effect(LumpedMass())
-    values = np.array([*fit.p, 0.0, 0.1])
+    values = {"lumped_mass.mass": 0.0, "lumped_mass.position": 0.1}
     held = [*fit.model.names, "lumped_mass.position"]  # the mass stays at zero
     same = refit(fit, model, values=values, free=held)
     here, there = cross_validate(fit), cross_validate(same)

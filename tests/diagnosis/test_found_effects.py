@@ -10,9 +10,9 @@ import pytest
 
 from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
-from dlo_casadi.diagnosis.causes import start_from
 from dlo_casadi.diagnosis.diagnose import diagnose
-from dlo_casadi.diagnosis.pull import Pull
+from dlo_casadi.diagnosis.refits import start_from
+from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model
@@ -88,7 +88,7 @@ def test_a_tether_is_found_and_is_no_point_force():
 
 def test_wrong_causes_beside_an_unexplained_residual_are_withdrawn(monkeypatch):
     """A force and a stiff section stand for a tether in part; nothing predicts from them."""
-    monkeypatch.setattr(module, "estimate_pull", lambda *_: None)  # seconds, not needed
+    monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: None)  # seconds, not needed
     fit = session("tether", *TETHER)
     found = diagnose(fit, exclude=rivals_of("point_force", "stiff_section"))
     assert found.verdict == "unexplained"
@@ -110,7 +110,7 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     stiffness, position, *anchor = TETHER
     seen = fit.problem.observed(fit.point)
     places = [seen[j].curve.at(np.array([position]))[0] for j in fit.problem.used]
-    pull = Pull(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), 0.0, fit)
+    pull = UnknownForce(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), 0.0, fit)
     listed = {c.name: c for c in candidates(fit.model, setup_of(fit.model, n_poses=len(ENDS)))}
     start = start_from(pull, listed["tether"])
     names = ("stiffness", "position", "anchor_x", "anchor_y")

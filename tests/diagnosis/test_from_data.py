@@ -7,8 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
-from dlo_casadi.diagnosis.confirm import screened_from_data
-from dlo_casadi.diagnosis.from_data import fit_from_data, origins_of, start_from_data
+from dlo_casadi.diagnosis.refits import (
+    fit_from_data,
+    origins_of,
+    screened_from_data,
+    start_from_data,
+)
 from dlo_casadi.effects import BendingAnisotropy, Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model, fitted_closely

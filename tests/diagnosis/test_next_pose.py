@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis.next_pose import _separation, next_reading
+from dlo_casadi.diagnosis.next_measurement import _separation, next_reading
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.cable_model import Tolerances

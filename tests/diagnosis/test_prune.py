@@ -5,7 +5,7 @@ import pytest
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.diagnosis.search import Search
+from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose

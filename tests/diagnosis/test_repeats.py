@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis.confirm import Confirmed
 from dlo_casadi.diagnosis.crossval import CrossValidation
-from dlo_casadi.diagnosis.repeatability import limiting_spread
+from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.selection import improving
+from dlo_casadi.diagnosis.structure import limiting_spread
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.fit import fit_model

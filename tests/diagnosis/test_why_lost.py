@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis.confirm import Confirmed
 from dlo_casadi.diagnosis.crossval import CrossValidation
+from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.selection import choose, improving, shortcoming, why_lost
 
 COUNTS = np.full(6, 40.0)

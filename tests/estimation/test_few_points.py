@@ -11,8 +11,8 @@ from test_gauss_newton import CABLE, STD, measured_from
 from dlo_casadi.diagnosis.selection import p_with_closed_noise
 from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.constrained import threshold
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.profile import threshold
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.rest_curvature import RestScatter
 from dlo_casadi.session.fitting import nuisances

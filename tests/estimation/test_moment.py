@@ -9,7 +9,7 @@ from dlo_casadi.effects import BendingSoftening, Cable
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.moment import law_of, measured_moment_curve
+from dlo_casadi.estimation.stiffness import law_of, measured_moment_curve
 from dlo_casadi.model.cable_model import CableModel
 
 EI = 8e-4

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dlo_casadi.estimation.rest_scatter import RestLikelihood, ScatterSample, estimate_rest_scatter
+from dlo_casadi.estimation.repeats import RestLikelihood, ScatterSample, estimate_rest_scatter
 from dlo_casadi.model.rest_curvature import MODES, RestScatter, modes_of
 
 M, ROWS = 9, 6

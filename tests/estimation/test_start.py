@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.estimation import starting_points
+from dlo_casadi.estimation import start as starting_points
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way

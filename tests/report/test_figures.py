@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dlo_casadi.diagnosis.pull import Pull
 from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.equilibrium.pose import Pose
@@ -43,7 +43,7 @@ EFFECT = FoundEffect(
 def pull(*forces):
     """A load of so much in the first poses."""
     poses = tuple(f"pose_{k:02d}" for k in range(1, 1 + len(forces)))
-    return Pull(np.array(forces), 0.3, (0.28, 0.32), 0.0, None, poses)
+    return UnknownForce(np.array(forces), 0.3, (0.28, 0.32), 0.0, None, poses)
 
 
 LOAD = pull((0.0, 1.0), (0.0, 1.0))

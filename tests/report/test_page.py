@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from test_figures import CANDIDATES, EFFECT, LOAD, with_readings
 
-from dlo_casadi.diagnosis.next_pose import NextPose, NextReading
+from dlo_casadi.diagnosis.next_measurement import NextPose, NextReading
 from dlo_casadi.report import canvas, figures
 from dlo_casadi.report.page import (
     breakable,

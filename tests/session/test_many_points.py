@@ -6,8 +6,8 @@ import pytest
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.profile import profile_interval
 from dlo_casadi.io.points import MeasuredPoints, write_points
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose

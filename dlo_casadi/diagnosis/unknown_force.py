@@ -14,7 +14,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.starting_points import DECADES, starting_points
+from dlo_casadi.estimation.start import DECADES, starting_points
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.runtime.executors import InProcess
@@ -34,7 +34,7 @@ MOST_STEPS = 150
 
 
 @dataclass(frozen=True)
-class Pull:
+class UnknownForce:
     """A force per pose at one place of the cable.
 
     Parameters
@@ -64,7 +64,7 @@ class Pull:
         return np.asarray(self.force_per_pose.mean(axis=0))
 
 
-def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
+def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> UnknownForce | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
     The fit without it may have gone far astray, so that it is no place to start from: on a
@@ -100,7 +100,7 @@ def estimate_pull(base: Fit, executor: Executor | None = None) -> Pull | None:
     interval = (float(max(0.0, position - half)), float(min(length, position + half)))
     gain = 2 * (base.point.objective - best.point.objective)
     names = tuple(best.problem.measured[j].pose.name for j in best.problem.used)
-    return Pull(forces, position, interval, gain, best, names)
+    return UnknownForce(forces, position, interval, gain, best, names)
 
 
 @dataclass(frozen=True)
