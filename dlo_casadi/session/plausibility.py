@@ -129,42 +129,42 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
 # ---- fits ---------------------------------------------------------------------------------------
 
 
-class Comparison(NamedTuple):
-    """The declared session beside the hypothesis that explains its shapes best, both fitted.
+class Coarse(NamedTuple):
+    """A quick fit of the declared cable without effects to a few poses.
 
     Parameters
     ----------
-    what : str
-        The hypothesis.
-    own, other : Fit or None
+    fit : Fit or None
         None where no stiffness gives equilibria near the shapes.
-    length : float [m]
-        Of the cable.
+    rms : float [m]
+        Distance that it leaves; without a fit as far as ends that contradict a pose.
+    weight : bool
+        Whether the shapes tell stiffness over weight.
+    """
+
+    fit: Fit | None
+    rms: float
+    weight: bool
+
+
+class Comparison(NamedTuple):
+    """The declared session beside the hypothesis `what` that explains its shapes best.
+
+    Both are fitted; `length` [m] is that of the cable.
     """
 
     what: str
-    own: Fit | None
-    other: Fit | None
+    own: Coarse
+    other: Coarse
     length: float
-
-    @property
-    def misfits(self) -> tuple[float, float]:
-        """RMS distances [m] that the declaration and the hypothesis leave.
-
-        Without a fit as far as ends that contradict a pose.
-        """
-        pair = (self.own, self.other)
-        left = [CONTRADICTS * self.length if fit is None else fit.residual_rms for fit in pair]
-        return left[0], left[1]
 
     @property
     def told(self) -> str:
         """What both leave, in words."""
-        own, other = self.misfits
-        left = f"the lines are {own:.3g} m RMS from the shapes of any stiffness, but"
-        if self.own is None:
+        left = f"the lines are {self.own.rms:.3g} m RMS from the shapes of any stiffness, but"
+        if self.own.fit is None:
             left = "no stiffness gives equilibria near the lines, but they are within"
-        return f"{left} {other:.3g} m with {self.what}"
+        return f"{left} {self.other.rms:.3g} m with {self.what}"
 
     @property
     def better(self) -> bool:
@@ -173,15 +173,15 @@ class Comparison(NamedTuple):
         Where the declaration has no fit the hypothesis has to show a weight: a fit of few points
         may fail, or not, by chance.
         """
-        if self.own is None and not tells_weight(self.other):
+        if self.own.fit is None and not self.other.weight:
             return False
-        own, other = self.misfits
+        own, other = self.own.rms, self.other.rms
         return own > UNEXPLAINED * self.length and other < MUCH_BETTER * own
 
     @property
     def certain(self) -> bool:
         """Whether it is clearly better, and no effect that is missing explains it."""
-        return self.better and self.misfits[0] > BEYOND_EFFECTS * self.length
+        return self.better and self.own.rms > BEYOND_EFFECTS * self.length
 
     @property
     def shows_weight(self) -> bool:
@@ -189,13 +189,11 @@ class Comparison(NamedTuple):
 
         Under gravity against the weight the best fit is a cable too stiff to show any.
         """
-        if self.other is None or not tells_weight(self.other) or tells_weight(self.own):
-            return False
-        own, other = self.misfits
-        if other > BEYOND_EFFECTS * self.length:
+        (fit, other, weight), own = self.other, self.own
+        if fit is None or not weight or own.weight or other > BEYOND_EFFECTS * self.length:
             return False
         # Difference of the BIC of two models with the same unknowns.
-        return bool(2 * self.other.problem.n_residuals * np.log(own / other) > BIC_APART)
+        return bool(2 * fit.problem.n_residuals * np.log(own.rms / other) > BIC_APART)
 
 
 def compare(
@@ -206,26 +204,21 @@ def compare(
     Of so many poses at most. None where there is no hypothesis, or the declared session explains
     its shapes and weight.
     """
-    if not hypotheses:
-        return None
     length = session.config.cable.length
-    own = coarse_fit(session, most)
-    if own is not None and tells_weight(own) and own.residual_rms <= UNEXPLAINED * length:
+    own = coarse_fit(session, most) if hypotheses else None
+    if own is None or (own.weight and own.rms <= UNEXPLAINED * length):
         return None
     tried = []
     for what, meant in hypotheses:
         tried.append(Comparison(what, own, coarse_fit(meant, most), length))
-        if tried[-1].certain and tried[-1].misfits[1] < UNEXPLAINED * length:
+        if tried[-1].certain and tried[-1].other.rms < UNEXPLAINED * length:
             break
-    return min(tried, key=lambda found: found.misfits)
+    return min(tried, key=lambda found: found.other.rms)
 
 
-def coarse_fit(session: Session, most: int = _POSES) -> Fit | None:
-    """Fit of the declared cable without effects; None if none is found.
-
-    It takes all poses, whatever their role.
-    """
-    measured = []
+def coarse_fit(session: Session, most: int = _POSES) -> Coarse:
+    """Quick fit of so many poses at most, evenly picked, whatever their role."""
+    measured, length = [], session.config.cable.length
     for k in spread(len(session.read), most):
         item = session.read[k]
         kept = spread(len(item.points), _POINTS)
@@ -234,18 +227,12 @@ def coarse_fit(session: Session, most: int = _POSES) -> Fit | None:
         measured.append(MeasuredPose.of_points(pose, item.points[kept], s=s))
     model = declared_model(session.config).model
     model = replace(model, effects=(), priors={}, n=_MESH, n_rest=_REST)
-    noise = UNEXPLAINED * session.config.cable.length
     try:
-        return fit_model(model, measured, Tolerances(), noise, decades=_DECADES)
+        fit = fit_model(model, measured, Tolerances(), UNEXPLAINED * length, decades=_DECADES)
     except EstimationError:
-        return None
-
-
-def tells_weight(fit: Fit | None) -> bool:
-    """Whether there is a fit, and its shapes tell stiffness over weight."""
-    if fit is None:
-        return False
-    return bool(fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS))
+        return Coarse(None, CONTRADICTS * length, False)
+    known = fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS)
+    return Coarse(fit, fit.residual_rms, bool(known))
 
 
 def wrong_readings(session: Session) -> tuple[Suspicion, ...]:
@@ -253,7 +240,9 @@ def wrong_readings(session: Session) -> tuple[Suspicion, ...]:
     fitted = [item for item in session.read if item.role == "fit" and not item.views]
     fitted = [item for item in fitted if session.declared[item.name].readings]
     shown = [fitted[k] for k in spread(len(fitted), _POSES)]
-    fit = coarse_fit(replace(session, read=tuple(shown))) if shown else None
+    if not shown:
+        return ()
+    fit, _, sized = coarse_fit(replace(session, read=tuple(shown)))
     if fit is None:
         return ()
     seen = fit.problem.observed(fit.point)
@@ -276,7 +265,7 @@ def wrong_readings(session: Session) -> tuple[Suspicion, ...]:
                 forces if kind == "moment" else None,
             )
         )
-    return misread(compared, sized=tells_weight(fit))
+    return misread(compared, sized=sized)
 
 
 # ---- exchanged ends -----------------------------------------------------------------------------
@@ -347,8 +336,8 @@ def hangs_elsewhere(session: Session) -> tuple[Suspicion, ...]:
     if found is None or not (found.better or found.shows_weight):
         return ()
     weightless = ""
-    if found.own is not None and not tells_weight(found.own):
-        least = found.own.value(BENDING_STIFFNESS)
+    if found.own.fit is not None and not found.own.weight:
+        least = found.own.fit.value(BENDING_STIFFNESS)
         weightless = (
             f"the lines show no weight, as if bending_stiffness were {least:.2g} N m^2 or more; "
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from dlo_casadi.estimation.fit import allowed_mesh_error
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
-from dlo_casadi.session.pose_shape import PoseShape
+from dlo_casadi.session.pose_shape import BranchShape, PoseShape
 from dlo_casadi.thresholds import FIXTURES, UNSEEN
 
 FloatArray = NDArray[np.floating]
@@ -82,39 +82,38 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
             for name, shape in stage.other_branch.items()
             if not (side := either[name]) or side.other.chosen_by != shape.chosen_by
         }
-        for chosen_by in dict.fromkeys(shape.chosen_by for shape in others.values()):
-            found = {k: shape for k, shape in others.items() if shape.chosen_by == chosen_by}
-            predicted = max(stage.shapes[name].rmse or 0.0 for name in found)
-            measured = max(shape.rmse for shape in found.values())
+        for chosen_by, names in _by_choice(others):
+            predicted = max(stage.shapes[name].rmse or 0.0 for name in names)
+            measured = max(others[name].rmse for name in names)
             lines.append(
-                f"stage {stage.name}: {', '.join(found)}: the equilibrium of lowest energy, which "
+                f"stage {stage.name}: {', '.join(names)}: the equilibrium of lowest energy, which "
                 f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
                 f"off, on the measured branch {1e3 * measured:.3g} mm; {_cure(chosen_by)}"
-                + _undecided(name for name in found if stage.shapes[name].undecided)
             )
-        sides = stage.measured_side
-        for chosen_by in dict.fromkeys(side.chosen_by for side in sides.values()):
-            names = ", ".join(k for k, side in sides.items() if side.chosen_by == chosen_by)
-            lines.append(
-                f"stage {stage.name}: {names}: the cable of these fit poses hangs on another side "
-                "than that of lowest energy; they are compared where they hang, and a prediction "
-                f"of the same ends needs `{chosen_by}`"
-            )
+            if undecided := [name for name in names if stage.shapes[name].undecided]:
+                told = ", ".join(undecided)
+                lines[-1] += (
+                    f". The fit is too uncertain to tell which of the two is lower in {told}"
+                )
+        lines += [
+            f"stage {stage.name}: {', '.join(names)}: the cable of these fit poses hangs on "
+            "another side than that of lowest energy; they are compared where they hang, and a "
+            f"prediction of the same ends needs `{chosen_by}`"
+            for chosen_by, names in _by_choice(stage.measured_side)
+        ]
     return lines
+
+
+def _by_choice(found: Mapping[str, BranchShape]) -> Iterator[tuple[str | None, list[str]]]:
+    """Names of poses that the same choice puts on the measured branch."""
+    for chosen_by in dict.fromkeys(shape.chosen_by for shape in found.values()):
+        yield chosen_by, [name for name, shape in found.items() if shape.chosen_by == chosen_by]
 
 
 def _cure(chosen_by: str | None) -> str:
     if chosen_by is None:
         return "no `branch` of these poses would choose it: take them again, or leave them out"
     return f"`{chosen_by}` in these poses chooses it"
-
-
-def _undecided(found: Iterable[str]) -> str:
-    """That the parameters do not tell which equilibrium of some poses is lower."""
-    names = ", ".join(found)
-    return (
-        f". The fit is too uncertain to tell which of the two is lower in {names}" if names else ""
-    )
 
 
 def weight_warning(weight: HiddenWeight, expected: float) -> str:

@@ -90,20 +90,21 @@ def test_what_is_seen_at_a_glance_refuses_nothing_that_a_fit_explains(curved, mo
 def test_a_strap_or_a_stiff_cable_is_doubted_but_not_refused():
     """Only a misfit that no missing effect leaves refuses a session."""
 
-    class Left:
-        """A fit that leaves so much [m]."""
+    def left(rms):
+        """A fit that leaves so much [m]; none if that is nothing known."""
+        return plausibility.Coarse(rms, rms or 0.05, False)
 
-        def __init__(self, rms):
-            self.residual_rms = rms
+    def comparison(what, own, other):
+        return plausibility.Comparison(what, left(own), left(other), 1.0)
 
     found = [
-        plausibility.Comparison("", Left(own), Left(other), 1.0)
-        for own, other in ((0.008, 0.001), (0.02, 0.001), (0.02, 0.015), (0.0015, 0.0003))
+        comparison("", *both)
+        for both in ((0.008, 0.001), (0.02, 0.001), (0.02, 0.015), (0.0015, 0.0003))
     ]
     assert [item.better for item in found] == [True, True, False, False]
     assert [item.certain for item in found] == [False, True, False, False]
     assert found[0].told.startswith("the lines are 0.008 m RMS from the shapes of any stiffness")
-    assert plausibility.Comparison("y down", None, Left(0.001), 1.0).told == (
+    assert comparison("y down", None, 0.001).told == (
         "no stiffness gives equilibria near the lines, but they are within 0.001 m with y down"
     )
 
