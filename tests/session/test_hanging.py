@@ -91,7 +91,7 @@ def test_a_strap_or_a_stiff_cable_is_doubted_but_not_refused():
     """Only a misfit that no missing effect leaves refuses a session."""
 
     def left(rms):
-        """A fit that leaves so much [m]; none if that is nothing known."""
+        """A fit that leaves so much [m], or none, which counts as 50 mm of a metre."""
         return plausibility.Coarse(rms, rms or 0.05, False)
 
     def comparison(what, own, other):
