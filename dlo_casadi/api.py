@@ -22,8 +22,7 @@ from matplotlib.figure import Figure
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.config.values import implausible_quaternion
-from dlo_casadi.equilibrium.cable_shape import CableShape, shape_in
-from dlo_casadi.equilibrium.fitted_cable import FittedCable
+from dlo_casadi.equilibrium.fitted_cable import CableShape, FittedCable, shape_in
 from dlo_casadi.equilibrium.pose import Branch, Pose
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.io.parameters import load_parameters

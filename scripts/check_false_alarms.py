@@ -38,9 +38,8 @@ from simulated import random_session
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.effects import EFFECTS
-from dlo_casadi.equilibrium.equilibrium import tipping
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.equilibrium.spread import modes_in
+from dlo_casadi.equilibrium.spread import modes_in, tipping
 from dlo_casadi.estimation.constrained import profile_intervals
 from dlo_casadi.estimation.fit import SEARCH_MESH
 from dlo_casadi.estimation.prediction import predict_poses

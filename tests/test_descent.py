@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.effects import Cable, Tether
-from dlo_casadi.equilibrium.descent import _convex, descend
+from dlo_casadi.equilibrium.minima import _convex, descend
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel

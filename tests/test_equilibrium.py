@@ -24,7 +24,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.equilibrium import Equilibrium, Status
 from dlo_casadi.equilibrium.guesses import guesses
-from dlo_casadi.equilibrium.ipopt import by_ipopt
+from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError

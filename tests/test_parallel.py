@@ -15,7 +15,7 @@ import cv2
 import pytest
 from threadpoolctl import threadpool_info
 
-from dlo_casadi.equilibrium.ipopt import run_ipopt
+from dlo_casadi.equilibrium.minima import run_ipopt
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.runtime import parallel
 from dlo_casadi.runtime.executors import InProcess, interrupts_held

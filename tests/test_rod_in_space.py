@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import EFFECTS, Cable
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.descent import descend
 from dlo_casadi.equilibrium.guesses import same_sign
+from dlo_casadi.equilibrium.minima import descend
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError

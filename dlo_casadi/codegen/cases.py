@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.codegen.kernels import Kernels, kernels_of
 from dlo_casadi.equilibrium.guesses import resting_headings
+from dlo_casadi.equilibrium.solve import coarse_rest
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
@@ -175,12 +176,7 @@ class _SpaceCase(Case):
         if not self.coarse_elements:
             return found
         coarse = self.model.with_mesh(self.coarse_elements, "arc")
-        # Rest strains of the coarse cells: means of those of the fine ones.
-        (low, high), (start, end) = self.model.chain.cells.T, coarse.chain.cells.T[..., None]
-        inside = np.minimum(high, end) - np.maximum(low, start)
-        shares = np.clip(inside, 0.0, None) / (end - start)
-        parts = np.split(self.rest, len(self.model.node.strains))
-        rest = np.concatenate([shares @ part for part in parts])
+        rest = coarse_rest(self.model, coarse, self.rest)
         return found | {"coarse_kernel": kernels_of(coarse, self.p, rest, self.inline)}
 
     @property

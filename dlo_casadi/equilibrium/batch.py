@@ -8,25 +8,23 @@ order.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
-from dlo_casadi.equilibrium.descent import descend
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
+from dlo_casadi.equilibrium.minima import descend, stepped
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.model.assembly import Assembly, CurveSlopes, Inputs, Shapes, Tangents, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 
 FloatArray = NDArray[np.floating]
 
-# Newton's method for many poses: longest step of a node, and how far nodes may move from where it
-# started [rad].
-LONGEST_STEP = 0.5
+# How far nodes may move from where Newton's method has started [rad].
 REACH = 1.5
 # Steps by a matrix that is kept shrink by this factor at least, or it is evaluated anew: five
 # gradients cost less than one matrix. Steps longer than NEAR [rad] change the matrix too much.
@@ -34,27 +32,6 @@ CONTRACTION = 0.2
 NEAR = 0.1
 # Iterations of a descent to a minimum: the poses of one session in space took 7 to 23.
 DOWNHILL = 40
-
-
-@dataclass(frozen=True)
-class Observations:
-    """What sensors would see of m poses, and how it changes along q directions.
-
-    Measured curves `z` (m, n + 1, d or 2 d) and `readings` (m, n_reactions), see
-    `ends.REACTIONS`; `slopes` and `reading_slopes` (..., q).
-    """
-
-    z: FloatArray
-    slopes: FloatArray
-    readings: FloatArray
-    reading_slopes: FloatArray
-
-    def pose(self, j: int, length: float) -> tuple[Observed, ObservedChange]:
-        """Of one pose, of a cable of that length [m]."""
-        return (
-            Observed(NodeCurve.of(length, self.z[j]), self.readings[j]),
-            ObservedChange(self.slopes[j], self.reading_slopes[j]),
-        )
 
 
 class BatchEquilibrium:
@@ -90,22 +67,18 @@ class BatchEquilibrium:
         if rest.ndim == 2:
             return rest
         out = np.repeat(rest[None], self.m, axis=0)
+        if not self.model.has_state:
+            return out
         # Poses that leave what they find need not be gone through in order.
-        if self.model.has_state and not self._stays(shapes, p, out):
-            for j in range(self.m - 1):
-                out[j + 1] = self._after(j, shapes, p, out)[0]
+        after = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))[0]
+        for j in range(self.m - 1 if np.any(after != out) else 0):
+            out[j + 1] = self._after(j, shapes, p, out)[0]
         return out
-
-    def _stays(self, shapes: Shapes, p: FloatArray, rests: FloatArray) -> bool:
-        """Whether every pose leaves the rest curvature that it finds."""
-        after = self.assembly.state_after(shapes, Inputs.of(p, rests, self._ends))[0]
-        return bool(np.all(after == rests))
 
     def _after(self, j: int, shapes: Shapes, p: FloatArray, rests: FloatArray) -> FloatArray:
         """Rest curvature (1, n_rests) after pose j."""
-        here = [j]
-        given = Inputs.of(p, rests[here], self._ends[here])
-        return self.assembly.state_after(shapes.subset(here), given)[0]
+        given = Inputs.of(p, rests[[j]], self._ends[[j]])
+        return self.assembly.state_after(shapes.subset([j]), given)[0]
 
     def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Rest curvature (n_rests,) that the last pose leaves behind."""
@@ -130,11 +103,10 @@ class BatchEquilibrium:
         """Imbalance alone, for a small part of the cost."""
         return self.assembly.imbalance(shapes, self._given(shapes, p, rest))
 
-    def moved(self, shapes: Shapes, step: Vector, share: FloatArray | float = 1.0) -> Shapes:
-        """Shapes after a share (m,) of a step of one column."""
-        s = np.broadcast_to(share, (len(shapes.x),))
-        x = self.node.moved(shapes.x, s[:, None, None] * step.x[..., 0])
-        return replace(shapes, x=x, lam=shapes.lam + s[:, None] * step.y[..., 0])
+    def moved(self, shapes: Shapes, step: Vector) -> Shapes:
+        """Shapes after a step of one column."""
+        x = self.node.moved(shapes.x, step.x[..., 0])
+        return replace(shapes, x=x, lam=shapes.lam + step.y[..., 0])
 
     def solve(
         self,
@@ -182,19 +154,18 @@ class BatchEquilibrium:
             fresh = stale[active] | coupled
             force, matrix = self._linearized(here, given, active, fresh, matrix)
             try:
-                step = self._newton(here, given, force, matrix.subset(active), coupled)
+                step = self._newton(force, matrix, active)
+                step = self._handed_on(here, given, matrix, step) if coupled else step
             except np.linalg.LinAlgError:
                 break
             size = np.abs(step.x).max(axis=(1, 2, 3))
             if coupled:
                 size[:] = size.max()
-            share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
-            there = self.moved(here, step, share)
-            now.x[active], now.lam[active] = there.x, there.lam
+            now.x[active], now.lam[active] = stepped(self.node, here, step, size)
             done = _settled(size, last[active], tolerance, fresh)
             stale[active] = ~(size < CONTRACTION * last[active]) & np.isfinite(last[active])
             stale[active] |= size > NEAR
-            way = self.node.difference(shapes.x[active], there.x)
+            way = self.node.difference(shapes.x[active], now.x[active])
             lost = ~(np.abs(way).max(axis=(1, 2)) <= reach)
             converged[active[done & ~lost]] = True
             last[active] = size
@@ -236,53 +207,29 @@ class BatchEquilibrium:
         """Imbalance of the active poses, and all poses' matrices, of some of them evaluated."""
         if fresh.all():
             _, force, new = self.assembly.balance(here, given)
-            if len(active) == self.m or matrix is None:
-                return force, new
-            return force, matrix.replaced(active, new)
-        assert matrix is not None
-        force = self.assembly.imbalance(here, given)
-        if fresh.any():
-            _, _, new = self.assembly.balance(here.subset(fresh), given.subset(fresh))
-            matrix = matrix.replaced(active[fresh], new)
-        return force, matrix
-
-    def _newton(
-        self, here: Shapes, given: Inputs, force: Vector, matrix: BandMatrix, coupled: bool
-    ) -> Vector:
-        """Newton step of one column; not finite where the shape is not."""
-        finite = np.flatnonzero(np.isfinite(matrix.diagonal).all(axis=(1, 2, 3)))
-        right = Vector(-force.x, -force.y)
-        if len(finite) == len(matrix.diagonal):
-            step = matrix.factor().solve(right)
         else:
-            step = Vector(np.full_like(force.x, np.nan), np.full_like(force.y, np.nan))
-            if len(finite):
-                found = (
-                    matrix.subset(finite).factor().solve(Vector(right.x[finite], right.y[finite]))
-                )
-                step.x[finite], step.y[finite] = found.x, found.y
-        return self._pass_on(here, given, matrix, step) if coupled else step
+            force = self.assembly.imbalance(here, given)
+            _, _, new = self.assembly.balance(here.subset(fresh), given.subset(fresh))
+        return force, new if matrix is None else matrix.replaced(active[fresh], new)
 
-    def _pass_on(self, here: Shapes, given: Inputs, matrix: BandMatrix, step: Vector) -> Vector:
+    @staticmethod
+    def _newton(force: Vector, matrix: BandMatrix, active: NDArray[np.intp]) -> Vector:
+        """Newton step of one column of the active poses; not finite where the shape is not."""
+        finite = np.isfinite(matrix.diagonal[active]).all(axis=(1, 2, 3))
+        step = Vector(np.full_like(force.x, np.nan), np.full_like(force.y, np.nan))
+        right = Vector(-force.x[finite], -force.y[finite])
+        found = matrix.subset(active[finite]).factor().solve(right)
+        step.x[finite], step.y[finite] = found.x, found.y
+        return step
+
+    def _handed_on(self, here: Shapes, given: Inputs, matrix: BandMatrix, step: Vector) -> Vector:
         """Newton step with the change of rest curvature handed from pose to pose."""
-        a, n_p = self.assembly, given.p.shape[1]
-        change: FloatArray = np.zeros((1, given.rest.shape[1], 1))
-        none = np.zeros((1, n_p, 1))
-        x, y = step.x.copy(), step.y.copy()
-        after = a.state_after(here, given)
+        after = self.assembly.state_after(here, given)
         if not after[1].any():
             return step
-        for j in range(len(x)):
-            one = np.array([j])
-            if change.any():
-                along = _still(a, 1, change, none)
-                load = a.imbalance_by(here.subset(one), given.subset(one), along)
-                more = matrix.subset(one).factor().solve(load)
-                x[j] -= more.x[0]
-                y[j] -= more.y[0]
-            slopes = tuple(part[one] for part in after)
-            change = a.state_along(slopes, x[one], change, none)
-        return Vector(x, y)
+        still = self._still(given, np.zeros((given.rest.shape[1], 1)))
+        ways = self._in_order(here, given, matrix, replace(still, x=step.x, lam=step.y), after)
+        return Vector(ways.x, ways.lam)
 
     # ---- derivatives -----------------------------------------------------------------------------
 
@@ -311,45 +258,66 @@ class BatchEquilibrium:
             Columns: the unknowns, then the model's deviations.
         """
         given = self._given(shapes, p, rest)
-        _, _, matrix = self.assembly.balance(shapes, given)
         size, own = slopes.shape[1], len(self.used_deviations)
-        q, m = size + own, self.m
-        p_along = np.zeros((m, slopes.shape[0], q))
-        p_along[:, :, :size] = slopes
-        rest_along = np.zeros((m, rest_slopes.shape[0], q))
-        rest_along[:, :, :size] = rest_slopes
-        deviation = np.zeros((m, len(self.model.deviation_names), q))
-        deviation[:, self.used_deviations, size + np.arange(own)] = 1.0
-        still = replace(_still(self.assembly, m, rest_along, p_along), deviation=deviation)
-        if self.model.has_state:
-            slopes_after = self.assembly.state_after(shapes, given)
-            if slopes_after[1].any() or not self.assembly.rest_stays(slopes_after):
-                return replace(
-                    self._carried(shapes, given, matrix, still, slopes_after), tangent=matrix
-                )
-            # A state that is not there yet hands on what it finds, and its own parameters' part.
-            left = slopes_after[3] @ p_along
-            still.rest[1:] += left[:-1].cumsum(axis=0)
-        return self._solved(shapes, given, matrix, still)
+        deviation = np.zeros((len(self.model.deviation_names), size + own))
+        deviation[self.used_deviations, size + np.arange(own)] = 1.0
+        by_p, by_rest = (np.pad(part, [(0, 0), (0, own)]) for part in (slopes, rest_slopes))
+        still = self._still(given, by_rest, by_p, deviation)
+        if not self.model.has_state:
+            return self._solved(shapes, given, still)
+        after = self.assembly.state_after(shapes, given)
+        if after[1].any() or not self.assembly.rest_stays(after):
+            _, _, matrix = self.assembly.balance(shapes, given)
+            found = self._in_order(shapes, given, matrix, still, after)
+            return replace(found, tangent=matrix)
+        # A state that is not there yet hands on what it finds, and its own parameters' part.
+        left = after[3] @ still.p
+        still.rest[1:] += left[:-1].cumsum(axis=0)
+        return self._solved(shapes, given, still)
 
     def by_rest(
-        self, shapes: Shapes, p: FloatArray, rest: FloatArray, modes: FloatArray
+        self,
+        shapes: Shapes,
+        p: FloatArray,
+        rest: FloatArray,
+        modes: FloatArray,
+        by_p: FloatArray | None = None,
+        by_deviation: FloatArray | None = None,
     ) -> Tangents:
-        """How each equilibrium moves with its own rest curvature along modes (n_cells, q)."""
+        """How each equilibrium moves with its own rest curvature along modes (n_rests, q).
+
+        And with the parameters (n_parameters, q) and deviations (n_deviations, q) that go with
+        them, if any.
+        """
         given = self._given(shapes, p, rest)
-        _, _, matrix = self.assembly.balance(shapes, given)
-        along = np.broadcast_to(modes, (self.m, *modes.shape))
-        none = np.zeros((self.m, given.p.shape[1], modes.shape[1]))
-        return self._solved(shapes, given, matrix, _still(self.assembly, self.m, along, none))
+        return self._solved(shapes, given, self._still(given, modes, by_p, by_deviation))
+
+    def _still(
+        self,
+        given: Inputs,
+        by_rest: FloatArray,
+        by_p: FloatArray | None = None,
+        by_deviation: FloatArray | None = None,
+    ) -> Tangents:
+        """Directions (rows, q), alike for all poses, along which nodes and multipliers stay."""
+        a, q = self.assembly, by_rest.shape[1]
+        counts = (given.p.shape[1], len(by_rest), len(self.model.deviation_names))
+        p, rest, deviation = (
+            np.repeat((np.zeros((count, q)) if part is None else part)[None], self.m, axis=0)
+            for count, part in zip(counts, (by_p, by_rest, by_deviation), strict=True)
+        )
+        x, lam = np.zeros((self.m, a.n, a.b, q)), np.zeros((self.m, a.k, q))
+        return Tangents(x, lam, p, rest, deviation)
 
     def _solved(
-        self, shapes: Shapes, given: Inputs, matrix: BandMatrix, still: Tangents
+        self, shapes: Shapes, given: Inputs, still: Tangents, matrix: BandMatrix | None = None
     ) -> Tangents:
-        load = self.assembly.imbalance_by(shapes, given, still)
-        found = matrix.factor().solve(load)
-        return replace(still, x=-found.x, lam=-found.y, tangent=matrix)
+        """Directions with the way that nodes and multipliers take along them, beside their own."""
+        matrix = self.assembly.balance(shapes, given)[2] if matrix is None else matrix
+        found = matrix.factor().solve(self.assembly.imbalance_by(shapes, given, still))
+        return replace(still, x=still.x - found.x, lam=still.lam - found.y, tangent=matrix)
 
-    def _carried(
+    def _in_order(
         self,
         shapes: Shapes,
         given: Inputs,
@@ -357,37 +325,38 @@ class BatchEquilibrium:
         along: Tangents,
         after: tuple[FloatArray, ...],
     ) -> Tangents:
-        """`directions` in order: a pose finds the rest curvature that the one before has left."""
+        """As `_solved`; each pose finds the rest curvature that the one before it has left."""
         x, lam, rest = along.x.copy(), along.lam.copy(), along.rest.copy()
-        size = rest.shape[2] - len(self.used_deviations)
         for j in range(self.m):
             one = np.array([j])
             now = Tangents(x[one], lam[one], along.p[one], rest[one], along.deviation[one])
-            now = self._solved(shapes.subset(one), given.subset(one), matrix.subset(one), now)
+            if now.p.any() or now.rest.any() or now.deviation.any():
+                now = self._solved(shapes.subset(one), given.subset(one), now, matrix.subset(one))
             x[j], lam[j] = now.x[0], now.lam[0]
             if j + 1 < self.m:
                 slopes = tuple(part[one] for part in after)
-                change = self.assembly.state_along(slopes, now.x, now.rest, now.p)[0]
+                rest[j + 1] = self.assembly.state_along(slopes, now.x, now.rest, now.p)[0]
                 # What a pose's own deviation leaves behind is left out of the later ones.
-                rest[j + 1, :, :size] = change[:, :size]
+                rest[j + 1][:, along.deviation.any(axis=(0, 1))] = 0.0
         return replace(along, x=x, lam=lam, rest=rest)
 
     def observe(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Tangents
-    ) -> Observations:
-        """Measured curves and readings, and their derivatives along directions."""
-        given = self._given(shapes, p, rest)
+    ) -> list[tuple[Observed, ObservedChange]]:
+        """What sensors see of each pose, and how it changes along directions."""
+        given, length = self._given(shapes, p, rest), self.model.cable.length
         slopes = self.assembly.curve_slopes(shapes, given)
-        return Observations(
+        each = zip(
             slopes.z,
-            slopes.along(along),
             self.assembly.readings(shapes, given),
+            slopes.along(along),
             self.assembly.readings_along(shapes, given, along),
+            strict=True,
         )
-
-    def curve_slopes(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> CurveSlopes:
-        """Measured curves and what their derivatives are made of."""
-        return self.assembly.curve_slopes(shapes, self._given(shapes, p, rest))
+        return [
+            (Observed(NodeCurve.of(length, z), readings), ObservedChange(change, reading_change))
+            for z, readings, change, reading_change in each
+        ]
 
     def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
         """What sensors see of each pose."""
@@ -404,18 +373,6 @@ class BatchEquilibrium:
         bends = self.node.difference(shapes.x[:, :-1], shapes.x[:, 1:])
         free = np.abs(bends).max(axis=(1, 2)) < JOINT_BOUND
         return np.asarray((negative == self.model.n_multipliers) & free)
-
-
-def _still(a: Assembly, m: int, rest: FloatArray, p: FloatArray) -> Tangents:
-    """Directions along which nodes, multipliers and deviations stay."""
-    q = rest.shape[2]
-    return Tangents(
-        np.zeros((m, a.n, a.b, q)),
-        np.zeros((m, a.k, q)),
-        p,
-        rest,
-        np.zeros((m, len(a.model.deviation_names), q)),
-    )
 
 
 def _settled(

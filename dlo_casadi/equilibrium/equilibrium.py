@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -118,21 +117,6 @@ class Equilibrium:
         return self.status is Status.STABLE
 
 
-def tipping(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
-    """Angle [rad] by which the clamp must turn until two sides are equally low, to first order.
-
-    dV/d(angle) of a clamp is the moment on it.
-    """
-    return abs(other.energy - eq.energy) / tipping_lever(model, eq, other)
-
-
-def tipping_lever(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
-    """Difference [N m] of the moments on the clamp that tips the cable."""
-    assert model.tipped_by is not None
-    k = model.border_names.index(model.tipped_by)
-    return max(abs(float(other.multipliers[k] - eq.multipliers[k])), 1e-300)
-
-
 def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
     """Smallest radius [m] of curvatures that are means over cells (n, 2), see `Equilibrium`."""
     widths = np.diff(cells, axis=1).ravel()
@@ -152,7 +136,7 @@ def equilibria_of(
     shapes: Shapes,
     given: Inputs,
     *,
-    statuses: Sequence[Status],
+    stable: NDArray[np.bool_],
     iterations: NDArray[np.intp],
     bound_multipliers: FloatArray | None = None,
 ) -> list[Equilibrium]:
@@ -162,23 +146,29 @@ def equilibria_of(
     ----------
     shapes : Shapes
     given : Inputs
-    statuses : sequence of Status
+    stable : (m,) bool
     iterations : (m,) int
     bound_multipliers : (m, n_nodes - 1) [N m], optional
         Zero if they are not given.
     """
-    assembly, chain = assembly_of(model), model.chain
+    assembly, chain, node = assembly_of(model), model.chain, model.node
     total, force, _ = assembly.balance(shapes, given)
     energies = total - assembly.work(shapes, force)
     residuals = np.abs(force.y[..., 0]).max(axis=1, initial=0.0)
     strains = assembly.strain(shapes, given)
-    on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(model.node)
+    on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(node)
     points = assembly.nodes(shapes, given)
     if bound_multipliers is None:
         bound_multipliers = np.zeros((len(shapes.x), chain.n_nodes - 1))
     out = []
-    for j, status in enumerate(statuses):
+    for j in range(len(shapes.x)):
         curvature = chain.curvatures(strains[j]).ravel()
+        known = dict(zip(model.border_names, shapes.lam[j], strict=True))
+        moments = [
+            node.to_world(x, np.array([known.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
+            for side, x in zip(("start", "end"), shapes.x[j][[0, -1]], strict=True)
+        ]
+        twisted = "twist" in node.strains
         out.append(
             Equilibrium(
                 x=shapes.x[j],
@@ -186,25 +176,15 @@ def equilibria_of(
                 energy=float(energies[j]),
                 lam=on_fixtures[j, rows["end_force"]],
                 lam_start=on_fixtures[j, rows["start_force"]],
-                moments=clamp_moments(model, shapes.x[j], shapes.lam[j]),
+                moments=np.squeeze(np.array(moments)),
                 multipliers=shapes.lam[j],
                 bound_multipliers=bound_multipliers[j],
                 curvature=curvature,
-                twist=strains[j, : chain.n_cells] if model.in_space else np.zeros(chain.n_cells),
+                twist=strains[j, : chain.n_cells] if twisted else np.zeros(chain.n_cells),
                 min_bend_radius=smallest_radius(curvature, chain.cells),
                 residual=float(residuals[j]),
-                status=status,
+                status=Status.STABLE if stable[j] else Status.UNSTABLE,
                 iterations=int(iterations[j]),
             )
         )
     return out
-
-
-def clamp_moments(model: CableModel, x: FloatArray, lam: FloatArray) -> FloatArray:
-    """Moments [N m] on the clamps (start, end): (2,), in space (2, 3) about the world's axes."""
-    node, named = model.node, dict(zip(model.border_names, lam, strict=True))
-    moments = [
-        node.to_world(frame, np.array([named.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
-        for side, frame in (("start", x[0]), ("end", x[-1]))
-    ]
-    return np.squeeze(np.array(moments))

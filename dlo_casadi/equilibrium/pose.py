@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.rod.node import Frame, quaternion_product
+from dlo_casadi.rod.node import Frame, Heading, Node, quaternion_product
 
 FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
@@ -57,6 +57,20 @@ class Pose:
     camera_center: tuple[float, float, float] | None = None
 
     @property
+    def node(self) -> type[Node]:
+        """What the nodes of a cable carry that is held so: headings in a plane, frames in space."""
+        return Heading if len(self.start) == 2 else Frame
+
+    @property
+    def directions(self) -> dict[str, Any]:
+        """What tells the directions of the ends, by its name in a session."""
+        names: tuple[str, ...] = ("start_heading", "end_heading")
+        if self.node is Frame:
+            names = ("start_orientation", "end_orientation", "turns")
+        known = {name: getattr(self, name) for name in names}
+        return {name: list(x) if isinstance(x, tuple) else x for name, x in known.items()}
+
+    @property
     def ends(self) -> FloatArray:
         """Start, end [m], start frame, end frame: see `EndConditions.vector`."""
         end = self.end if self.end is not None else (0.0,) * len(self.start)
@@ -70,7 +84,7 @@ class Pose:
     @property
     def frames(self) -> tuple[FloatArray, FloatArray]:
         """Frames (coordinates,) of both ends as nodes carry them: in a plane headings [rad]."""
-        if len(self.start) == 2:
+        if self.node is Heading:
             return np.array([self.start_heading or 0.0]), np.array([self.end_heading or 0.0])
         first, last = self.start_orientation, self.end_orientation
         return _unit(first or Frame.identity), _unit(last or Frame.identity)

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.equilibrium.descent import descend
 from dlo_casadi.equilibrium.equilibrium import (
     JOINT_BOUND,
     NEARBY,
     Equilibrium,
-    Status,
     equilibria_of,
 )
 from dlo_casadi.equilibrium.guesses import first_nodes
-from dlo_casadi.equilibrium.ipopt import by_ipopt
+from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend
 from dlo_casadi.equilibrium.pose import SIGNS, Pose
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import COARSE_MESH, CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.rod.node import Frame, Heading
 
 FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.intp]
@@ -40,36 +39,34 @@ WAYS_ROUND = (0.5, -0.5)
 MOST_SHED = 1.3
 
 
-def check_pose(model: CableModel, p: FloatArray, pose: Pose) -> None:
-    """Raise EquilibriumError where the end is missing or out of reach, or a number not finite."""
+def _no_equilibrium(pose: Pose, what: str, hint: str) -> EquilibriumError:
+    return EquilibriumError(f"{what}.\n  Try: {hint}", pose.name, pose.end)
+
+
+def out_of_reach(model: CableModel, p: FloatArray, pose: Pose) -> EquilibriumError | None:
+    """Why a pose has no equilibrium: its end is missing or too far, or a number is not finite."""
     if pose.end is None and model.end != "free":
-        raise EquilibriumError(
-            f"no equilibrium: the end of the cable is {model.end}, and the pose has none.\n"
-            "  Try: Pose(start, end).",
-            pose.name,
-        )
+        what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
+        return _no_equilibrium(pose, what, "Pose(start, end).")
     if not np.all(np.isfinite(pose.vector)):
-        raise EquilibriumError(
+        what = (
             f"no equilibrium: a number of the pose is not finite: start {pose.start} m, end "
-            f"{pose.end} m, headings {pose.start_heading} and {pose.end_heading} rad.\n"
-            "  Try: see where these numbers come from.",
-            pose.name,
-            pose.end,
+            f"{pose.end} m, headings {pose.start_heading} and {pose.end_heading} rad"
         )
+        return _no_equilibrium(pose, what, "see where these numbers come from.")
     if pose.end is None or model.extensible:
-        return
+        return None
     ends, true_length = lagrangian_of(model).held(p, pose.ends, 0)
     start, end = np.array(ends).ravel()[: 2 * model.node.dimension].reshape(2, -1)
     distance, length = float(np.linalg.norm(end - start)), float(true_length)
-    if distance >= length:
-        where = ", ".join(f"{x:.4f}" for x in pose.end)
-        raise EquilibriumError(
-            f"no equilibrium: the end ({where}) m is {distance:.4f} m "
-            f"from the start, the cable is {length:.4f} m long.\n"
-            "  Try: end in metres? cable.length?",
-            pose.name,
-            pose.end,
-        )
+    if distance < length:
+        return None
+    where = ", ".join(f"{x:.4f}" for x in pose.end)
+    what = (
+        f"no equilibrium: the end ({where}) m is {distance:.4f} m "
+        f"from the start, the cable is {length:.4f} m long"
+    )
+    return _no_equilibrium(pose, what, "end in metres? cable.length?")
 
 
 def solve_equilibrium(
@@ -137,24 +134,20 @@ def solve_equilibria(
         `x_init` of each pose.
     """
     given = list(starts) if starts is not None else [None] * len(poses)
-    errors: dict[int, EquilibriumError] = {}
-    for j, pose in enumerate(poses):
-        try:
-            check_pose(model, p, pose)
-        except EquilibriumError as error:
-            errors[j] = error
-    asked = [j for j in range(len(poses)) if j not in errors]
-    reached = _reached(model, p, rest, [poses[j] for j in asked], [given[j] for j in asked])
+    errors = {j: out_of_reach(model, p, pose) for j, pose in enumerate(poses)}
+    asked = [j for j, error in errors.items() if error is None]
+    search = _Search(model, p, rest)
+    reached = search.reached([poses[j] for j in asked], [given[j] for j in asked])
     found: dict[int, Equilibrium] = {}
     sided: list[int] = []
     for j, minima in zip(asked, reached, strict=True):
-        try:
-            found[j] = _chosen(model, poses[j], given[j], minima)
-        except EquilibriumError as error:
-            errors[j] = error
+        chosen = _chosen(model, poses[j], given[j], minima)
+        if isinstance(chosen, EquilibriumError):
+            errors[j] = chosen
             continue
+        found[j] = chosen
         stable = [eq.x for eq in minima if eq.stable and given[j] is None]
-        if stable and on_other_side(model, poses[j], found[j].x, np.array(stable)).any():
+        if stable and on_other_side(model, poses[j], chosen.x, np.array(stable)).any():
             sided.append(j)
     told = [way for j in sided for way in ways_of(model, poses[j])]
     ways = solve_equilibria(model, p, rest, told) if told else []
@@ -166,25 +159,22 @@ def solve_equilibria(
             apart = on_other_side(model, poses[j], found[j].x, other.x[None])[0]
             if same and apart and other.stable:
                 found[j] = replace(found[j], other_side=other)
-    return [found[j] if j in found else errors[j] for j in range(len(poses))]
+    return [one for j, error in errors.items() if (one := found.get(j) or error)]
 
 
 def ways_of(model: CableModel, pose: Pose) -> list[Pose]:
     """A pose with each branch, or way round, that it may tell: first the counter-clockwise one."""
-    if not model.in_space:
+    if pose.node is Heading:
         return [replace(pose, branch=name) for name in SIGNS]
     return [replace(pose, turns=turns) for turns in WAYS_ROUND] if model.tipped_by else []
 
 
 def _chosen(
     model: CableModel, pose: Pose, start: FloatArray | None, found: list[Equilibrium]
-) -> Equilibrium:
+) -> Equilibrium | EquilibriumError:
     """The equilibrium that a pose's first guesses have found, see `solve_equilibrium`.
 
-    Raises
-    ------
-    EquilibriumError
-        If there is none, or none on the branch that the pose names.
+    Or why there is none, or none on the branch that the pose names.
     """
     named = None if start is not None or pose.branch == "previous" else pose.branch
     where = "its end free" if pose.end is None else f"its end at {pose.end} m"
@@ -193,27 +183,22 @@ def _chosen(
         kept = [eq for eq, twist in zip(found, twists, strict=True) if _holds(twist, pose.turns)]
         if not kept:
             left = min(zip(twists, found, strict=True), key=lambda pair: pair[1].energy)[0]
-            raise EquilibriumError(
+            what = (
                 f"the cable does not hold {pose.turns:g} turns of twist with {where}: it loops "
-                f"until {left:.2g} are left.\n"
-                "  Try: fewer turns, or the end farther from the start.",
-                pose.name,
-                pose.end,
+                f"until {left:.2g} are left"
             )
+            return _no_equilibrium(pose, what, "fewer turns, or the end farther from the start.")
         found = kept
     if not found:
-        hint = "a finer mesh (model.n), or check the stiffness and the headings"
-        if model.in_space:
+        hint = "a finer mesh (model.n), or check the stiffness and the headings."
+        if pose.node is Frame:
             where += f" and {pose.turns:g} turns"
             hint = (
                 "fewer turns (a twisted cable loops), a finer mesh (model.n), or check the "
-                "stiffnesses and orientations"
+                "stiffnesses and orientations."
             )
-        raise EquilibriumError(
-            f"no equilibrium found from its first guesses with {where}.\n  Try: {hint}.",
-            pose.name,
-            pose.end,
-        )
+        what = f"no equilibrium found from its first guesses with {where}"
+        return _no_equilibrium(pose, what, hint)
     if named is not None and (model.start, model.end) == ("pinned", "pinned"):
         for eq in found:
             if eq.stable and eq.turns(named):
@@ -225,126 +210,114 @@ def _chosen(
             return eq
     there = next((f"branch {branch}" for branch in SIGNS if lowest.turns(branch)), "neither branch")
     kind = "stable equilibrium" if lowest.stable else "equilibrium"
-    raise EquilibriumError(
+    what = (
         f"no {kind} found on the branch {named} from its first guesses with {where}: the lowest "
         f"one, of {lowest.energy:.4g} J, turns by {lowest.turn:+.3g} rad from start to end "
-        f"({there}).\n"
-        "  Try: the other branch, or none.",
-        pose.name,
-        pose.end,
+        f"({there})"
     )
+    return _no_equilibrium(pose, what, "the other branch, or none.")
 
 
-def _reached(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    poses: Sequence[Pose],
-    starts: Sequence[FloatArray | None],
-) -> list[list[Equilibrium]]:
-    """Equilibria of each pose, in the order of the first guesses that lead to them."""
-    found: list[list[Equilibrium]] = [[] for _ in poses]
-    if model.in_space and model.n > COARSE_MESH:
+@dataclass(frozen=True)
+class _Search:
+    """The equilibria of a cable, from the first guesses of all poses together."""
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+
+    def reached(
+        self, poses: Sequence[Pose], starts: Sequence[FloatArray | None]
+    ) -> list[list[Equilibrium]]:
+        """Equilibria of each pose, in the order of the first guesses that lead to them."""
+        found: list[list[Equilibrium]] = [[] for _ in poses]
         free = [j for j, start in enumerate(starts) if start is None]
-        if free:
-            of, likely = _likely(model, p, rest, [poses[j] for j in free])
+        if free and self.model.in_space and self.model.n > COARSE_MESH:
+            of, likely = self._likely([poses[j] for j in free])
             if len(of):
-                found = _descended(model, p, rest, poses, np.array(free)[of], likely)
-    left = [j for j, minima in enumerate(found) if not any(eq.stable for eq in minima)]
-    if left:
-        others, guesses = [poses[j] for j in left], [starts[j] for j in left]
-        of, shapes = _first(model, p, rest, others, guesses)
-        again = _descended(model, p, rest, others, of, shapes)
-        for j, minima in zip(left, again, strict=True):
-            found[j] += minima
-    return found
+                found = self._descended(poses, np.array(free)[of], likely)
+        left = [j for j, minima in enumerate(found) if not any(eq.stable for eq in minima)]
+        if left:
+            others = [poses[j] for j in left]
+            again = self._descended(others, *self._first(others, [starts[j] for j in left]))
+            for j, minima in zip(left, again, strict=True):
+                found[j] += minima
+        return found
+
+    def _first(
+        self, poses: Sequence[Pose], starts: Sequence[FloatArray | None]
+    ) -> tuple[IntArray, Shapes]:
+        """First guesses of all poses, or what they start from, and of which pose each is."""
+        rows = [
+            first_nodes(self.model, self.p, self.rest, pose) if start is None else [start]
+            for pose, start in zip(poses, starts, strict=True)
+        ]
+        of = np.repeat(np.arange(len(poses)), [len(guesses) for guesses in rows])
+        x = np.array([guess for guesses in rows for guess in guesses])
+        return of, Shapes.declared(x, np.zeros((len(x), self.model.n_border)))
+
+    def _descend(
+        self, poses: Sequence[Pose], of: IntArray, shapes: Shapes
+    ) -> tuple[Inputs, Minima]:
+        given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
+        return given, descend(assembly_of(self.model), shapes, given)
+
+    def _descended(
+        self, poses: Sequence[Pose], of: IntArray, shapes: Shapes
+    ) -> list[list[Equilibrium]]:
+        """Equilibria of each pose to which the energy descends from shapes `of` these poses."""
+        given, minima = self._descend(poses, of, shapes)
+        kept = minima.balanced
+        if not self.model.in_space:
+            bends = np.abs(np.diff(minima.shapes.x[..., 0], axis=1))
+            kept = minima.converged & (bends.max(axis=1) < JOINT_BOUND)
+        equilibria = equilibria_of(
+            self.model,
+            minima.shapes.subset(kept),
+            given.subset(kept),
+            stable=minima.converged[kept],
+            iterations=minima.iterations[kept],
+        )
+        out: list[list[Equilibrium]] = [[] for _ in poses]
+        for k, j in enumerate(of.tolist()):
+            eq = equilibria.pop(0) if kept[k] else None
+            if eq is None and not self.model.in_space:
+                eq = by_ipopt(self.model, self.p, self.rest, poses[j], shapes.x[k, :, 0])
+            if eq is not None:
+                out[j].append(eq)
+        return out
+
+    def _likely(self, poses: Sequence[Pose]) -> tuple[IntArray, Shapes]:
+        """The lowest minima of a coarse mesh that differ, on the model's mesh, of which pose."""
+        model, coarse = self.model, self.model.coarse
+        search = _Search(coarse, self.p, coarse_rest(model, coarse, self.rest))
+        of, shapes = search._first(poses, [None] * len(poses))
+        given, found = search._descend(poses, of, shapes)
+        strains = assembly_of(coarse).strain(found.shapes, given)
+        twists = _twists(coarse, strains[:, : coarse.chain.n_cells])
+        held = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
+        x, kept = found.shapes.x, []
+        for j, pose in enumerate(poses):
+            rows = np.flatnonzero((of == j) & held)
+            rows = rows[np.argsort(found.energy[rows], kind="stable")]
+            mine: list[int] = []
+            for k in rows:
+                differs = all(not model.node.same(x[k], x[other], NEARBY) for other in mine)
+                if differs and len(mine) < FEW:
+                    mine.append(int(k))
+            if mine:
+                there = rows[on_other_side(model, pose, x[mine[0]], x[rows])]
+                mine += [int(k) for k in there[:1] if k not in mine]
+            kept += mine
+        nodes = model.node.interpolated(model.chain.places, coarse.chain.places, x[kept])
+        return of[kept], Shapes.declared(nodes, found.shapes.lam[kept])
 
 
-def _descended(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    poses: Sequence[Pose],
-    of: IntArray,
-    shapes: Shapes,
-) -> list[list[Equilibrium]]:
-    """Equilibria of each pose to which the energy descends from shapes, `of` which pose each."""
-    given = Inputs.of(p, rest, np.array([poses[j].vector for j in of]))
-    minima = descend(assembly_of(model), shapes, given)
-    inside = np.ones(len(of), dtype=bool)
-    if not model.in_space:
-        inside = np.abs(np.diff(minima.shapes.x[..., 0], axis=1)).max(axis=1) < JOINT_BOUND
-    kept = np.flatnonzero(minima.balanced if model.in_space else minima.converged & inside)
-    equilibria = equilibria_of(
-        model,
-        minima.shapes.subset(kept),
-        given.subset(kept),
-        statuses=[Status.STABLE if minima.converged[k] else Status.UNSTABLE for k in kept],
-        iterations=minima.iterations[kept],
-    )
-    found = dict(zip(kept.tolist(), equilibria, strict=True))
-    out: list[list[Equilibrium]] = [[] for _ in poses]
-    for k, j in enumerate(of.tolist()):
-        eq = found.get(k)
-        if eq is None and not model.in_space:
-            eq = by_ipopt(model, p, rest, poses[j], shapes.x[k, :, 0])
-        if eq is not None:
-            out[j].append(eq)
-    return out
-
-
-def _likely(
-    model: CableModel, p: FloatArray, rest: FloatArray, poses: Sequence[Pose]
-) -> tuple[IntArray, Shapes]:
-    """The lowest minima of a coarse mesh that differ, on the model's mesh, and of which pose."""
-    coarse, fine = model.coarse, model.chain
-    edges = np.concatenate([fine.cells[:1, 0], fine.cells[:, 1]])
-    widths = np.diff(edges)
-    means = []
-    for part in fine.by_strain(rest[:, None]):
-        turn = np.concatenate([[0.0], np.cumsum(part[:, 0] * widths)])
-        low, high = (np.interp(side, edges, turn) for side in coarse.chain.cells.T)
-        means.append((high - low) / np.diff(coarse.chain.cells, axis=1).ravel())
-    own = np.concatenate(means)
-    of, shapes = _first(coarse, p, own, poses, [None] * len(poses))
-    given = Inputs.of(p, own, np.array([poses[j].vector for j in of]))
-    found = descend(assembly_of(coarse), shapes, given)
-    twists = _twists(
-        coarse, assembly_of(coarse).strain(found.shapes, given)[:, : coarse.chain.n_cells]
-    )
-    held = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
-    x, kept = found.shapes.x, []
-    for j in range(len(poses)):
-        rows = np.flatnonzero((of == j) & held)
-        rows = rows[np.argsort(found.energy[rows], kind="stable")]
-        mine: list[int] = []
-        for k in rows:
-            differs = all(not model.node.same(x[k], x[other], NEARBY) for other in mine)
-            if differs and len(mine) < FEW:
-                mine.append(int(k))
-        if mine:
-            there = rows[on_other_side(model, poses[j], x[mine[0]], x[rows])]
-            mine += [int(k) for k in there[:1] if k not in mine]
-        kept += mine
-    nodes = model.node.interpolated(fine.places, coarse.chain.places, x[kept])
-    return of[kept], Shapes.declared(nodes, found.shapes.lam[kept])
-
-
-def _first(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    poses: Sequence[Pose],
-    starts: Sequence[FloatArray | None],
-) -> tuple[IntArray, Shapes]:
-    """First guesses of all poses, or what they are to start from, and of which pose each is."""
-    rows = [
-        first_nodes(model, p, rest, pose) if start is None else [start]
-        for pose, start in zip(poses, starts, strict=True)
-    ]
-    of = np.repeat(np.arange(len(poses)), [len(guesses) for guesses in rows])
-    x = np.array([guess for guesses in rows for guess in guesses])
-    return of, Shapes.declared(x, np.zeros((len(x), model.n_border)))
+def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:
+    """Rest strains (n_rests,) of the coarse cells: means of those of the fine ones."""
+    (low, high), (start, end) = model.chain.cells.T, coarse.chain.cells.T[..., None]
+    shares = np.clip(np.minimum(high, end) - np.maximum(low, start), 0.0, None) / (end - start)
+    return np.concatenate([shares @ part for part in np.split(rest, len(model.node.strains))])
 
 
 def _twists(model: CableModel, twist: FloatArray) -> FloatArray:

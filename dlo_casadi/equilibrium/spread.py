@@ -1,4 +1,4 @@
-"""How far the next hanging of a pose may lie from its prediction."""
+"""How far the next hanging of a pose may lie from its prediction, and on which side."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import ways_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import MODES, RestScatter, modes_of
+from dlo_casadi.thresholds import EITHER
 
 FloatArray = NDArray[np.floating]
 
 # Share of the next hangings inside the band, and the standard deviations to its edges.
 COVERED = 0.9
 EDGE = -float(ndtri((1 - COVERED) / 2))
+# Share of a standard deviation over which energies are differentiated.
+_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,15 +71,24 @@ class Uncertainty:
                 by_rest[:, k] = model.rest_basis[:, coefficient]
         return by_p, by_rest
 
-    def scatter_in(self, model: CableModel) -> FloatArray:
-        """Standard deviations of a model's deviations; 0 of pulls, of which nothing is known."""
-        scatter = np.array([self.scatter.get(name, 0.0) for name in model.deviations])
-        return np.where(np.isfinite(scatter), scatter, 0.0)
+    def ways_in(self, model: CableModel) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Independent ways in which the next hanging of a pose may differ, a std of each.
 
-    def rest_modes_in(self, model: CableModel) -> FloatArray:
-        """Rest curvatures (n_rests, axes MODES) of a hanging's own, one standard deviation each."""
+        Of the parameters (n_parameters, q), the rest strains (n_rests, q) and the model's
+        deviations (n_deviations, q); but for pulls, of which nothing is known. The ways are the
+        fitted unknowns, the fixtures, and modes of each hanging's own rest curvature.
+        """
+        by_p, by_rest = (by @ self.root for by in self.unknowns_in(model))
         modes = modes_in(model)
-        return modes * np.tile(self.rest_scatter.sizes, modes.shape[1] // MODES)
+        modes = modes * np.tile(self.rest_scatter.sizes, modes.shape[1] // MODES)
+        n, m = by_p.shape[1], len(model.deviations)
+        count = n + m + modes.shape[1]
+        scatter = np.array([self.scatter.get(name, 0.0) for name in model.deviations])
+        used = [model.deviation_names.index(name) for name in model.deviations]
+        by_deviation = np.zeros((len(model.deviation_names), count))
+        by_deviation[used, n + np.arange(m)] = np.where(np.isfinite(scatter), scatter, 0.0)
+        by_rest = np.hstack([np.pad(by_rest, [(0, 0), (0, m)]), modes])
+        return np.pad(by_p, [(0, 0), (0, count - n)]), by_rest, by_deviation
 
 
 def modes_in(model: CableModel) -> FloatArray:
@@ -99,22 +113,12 @@ def displacements(
     equilibrium; what repeats of one pose differ by, the same all along.
     """
     equilibria = BatchEquilibrium(model, [pose])
-    shapes, size = found.shapes, len(uncertainty.names)
-    by_p, by_rest = uncertainty.unknowns_in(model)
-    along = equilibria.directions(shapes, p, rest, by_p, by_rest)
-    seen = equilibria.observe(shapes, p, rest, along)
-    curve = NodeCurve.of(model.cable.length, seen.z[0])
-    way = curve.moved(s, seen.slopes[0])
-    moved: list[FloatArray] = [
-        way[..., :size] @ uncertainty.root,
-        way[..., size:] * uncertainty.scatter_in(model),
-        np.broadcast_to(uncertainty.hanging * np.eye(curve.d), (len(s), curve.d, curve.d)),
-    ]
-    if uncertainty.rest_scatter.std > 0:
-        modes = uncertainty.rest_modes_in(model)
-        hanging = equilibria.observe(shapes, p, rest, equilibria.by_rest(shapes, p, rest, modes))
-        moved.append(curve.moved(s, hanging.slopes[0]))
-    return curve, np.concatenate(moved, axis=2)
+    by_p, by_rest, by_deviation = uncertainty.ways_in(model)
+    along = equilibria.by_rest(found.shapes, p, rest, by_rest, by_p, by_deviation)
+    ((seen, change),) = equilibria.observe(found.shapes, p, rest, along)
+    curve, d = seen.curve, seen.curve.d
+    alike = np.broadcast_to(uncertainty.hanging * np.eye(d), (len(s), d, d))
+    return curve, np.concatenate([curve.moved(s, change.curve), alike], axis=2)
 
 
 def spread_across(curve: NodeCurve, s: FloatArray, moved: FloatArray) -> FloatArray:
@@ -123,3 +127,75 @@ def spread_across(curve: NodeCurve, s: FloatArray, moved: FloatArray) -> FloatAr
     The noise of a measurement comes on top.
     """
     return np.linalg.norm(np.einsum("knd,kdq->knq", curve.normals(s), moved), axis=2)
+
+
+# ---- on which side -------------------------------------------------------------------------------
+
+
+def tipping(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
+    """Angle [rad] by which the clamp must turn until two sides are equally low, to first order.
+
+    dV/d(angle) of a clamp is the moment on it.
+    """
+    return abs(other.energy - eq.energy) / _lever(model, eq, other)
+
+
+def _lever(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
+    """Difference [N m] of the moments on the clamp that tips the cable."""
+    assert model.tipped_by is not None
+    k = model.border_names.index(model.tipped_by)
+    return max(abs(float(other.multipliers[k] - eq.multipliers[k])), 1e-300)
+
+
+@dataclass(frozen=True)
+class Tipping:
+    """How near a clamp is to the angle at which a cable hangs as low on its other side.
+
+    Parameters
+    ----------
+    angle, std : float [rad]
+        How far the clamp is from there, and how well that is known.
+    """
+
+    angle: float
+    std: float
+
+    @property
+    def either(self) -> bool:
+        """Whether nobody knows which side is the lower one."""
+        return self.angle < EITHER * self.std
+
+
+def tipping_of(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    pose: Pose,
+    eq: Equilibrium,
+    other: Equilibrium,
+    uncertainty: Uncertainty,
+) -> Tipping:
+    """How near a pose is to the other of two equilibria on either side.
+
+    First order, from all that makes a prediction uncertain: the slope of an equilibrium's energy
+    by anything is that of the Lagrangian at fixed nodes and multipliers.
+    """
+    each = uncertainty.ways_in(model)
+    count = each[0].shape[1]
+    p_steps, rest_steps, deviations = (_SHARE * np.hstack([by, -by]).T for by in each)
+    given = Inputs.of(p + p_steps, rest + rest_steps, np.tile(pose.vector, (2 * count, 1)))
+    slopes = []
+    for found in (eq, other):
+        x = np.broadcast_to(found.x, (2 * count, *found.x.shape))
+        lam = np.broadcast_to(found.multipliers, (2 * count, len(found.multipliers)))
+        value = assembly_of(model).balance(Shapes(x, lam, deviations), given)[0]
+        slopes.append((value[:count] - value[count:]) / (2 * _SHARE))
+    std = float(np.linalg.norm(slopes[1] - slopes[0]))
+    return Tipping(tipping(model, eq, other), std / _lever(model, eq, other))
+
+
+def sides_of(model: CableModel, pose: Pose, *pair: Equilibrium) -> list[Pose]:
+    """A pose that tells the side of each of two equilibria on either side."""
+    ways = ways_of(model, pose)
+    turned = [float(model.node.turning(eq.x)) for eq in pair]
+    return ways if turned[0] > turned[1] else ways[::-1]

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.curve import ObservedChange
-from dlo_casadi.equilibrium.ipopt import run_ipopt
+from dlo_casadi.equilibrium.minima import run_ipopt
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.problem import Point, Problem, Values
 from dlo_casadi.model.assembly import Shapes

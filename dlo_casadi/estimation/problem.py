@@ -303,9 +303,8 @@ class Problem:
     def residuals(self, values: Values, along: Tangents) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Residuals (R_j,) of each fitted pose, not whitened, and derivatives along directions."""
         seen = self.equilibria.observe(*self.state(values), along)
-        length = self.unknowns.model.cable.length
         for j, s in zip(self.used, values.projections, strict=True):
-            now, change = seen.pose(j, length)
+            now, change = seen[j]
             yield self.measured[j].linearized(now, s, change)
 
     def evaluate(self, values: Values) -> Point:

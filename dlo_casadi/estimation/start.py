@@ -144,7 +144,7 @@ def _kinematics(
     for iteration in range(steps + 1):
         seen = equilibria.observe(shapes, problem.unknowns.fixed, flat, each)
         for k, (j, item) in enumerate(zip(used, lines, strict=True)):
-            now, change = seen.pose(j, model.cable.length)
+            now, change = seen[j]
             if iteration > 1:
                 projections[k] = item.located(now, projections[k])
             elif not item.has_line:

@@ -20,35 +20,47 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from time import perf_counter
-from typing import Literal
+from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.solve import check_pose
-from dlo_casadi.errors import EquilibriumError, EstimationError, counted
+from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
+from dlo_casadi.equilibrium.guesses import arc_headings
+from dlo_casadi.equilibrium.minima import ipopt, run_ipopt
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.solve import out_of_reach
+from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.paper.inner_problem import WEIGHT, InnerProblem, Target
+from dlo_casadi.rod.chain import Chain
+from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
-Inner = Literal["ipopt", "cobyla"]
 
-# Iterations in a row in which alpha must not change: the paper asks for several.
-CALM = 3
+# Iterations in a row in which alpha must not change, the paper asks for several; and the largest
+# change of ln(k_theta) and of theta_0 [rad] that counts as none.
+CALM, TOLERANCE = 3, 1e-4
 # k_theta beyond this factor of its prior, either way, has run away.
 RUNAWAY = 1e3
 # So is one that has changed the same way so many times in a row, by more than the factor GROWTH
 # in all, and still does so by more than LAST_STEP.
-STEADY = 12
-GROWTH = 3.0
-LAST_STEP = 0.01
+STEADY, GROWTH, LAST_STEP = 12, 3.0, 0.01
 # On rendered sessions the loop converges after 5 iterations or runs away after 1; one that creeps
 # is told after STEADY. Four times that: what still changes then does so without an end.
 ITERATIONS = 50
+# Weight of the distances: beta = WEIGHT n [J/m^2]. The paper's c, chosen there by hand.
+WEIGHT = 1e4
+# Nearest points are frozen while IPOPT runs, then chosen again until they stay, at most so often.
+ASSIGNMENTS = 20
+# IPOPT takes up to 18 iterations for Eq. 13 on the same sessions; ten times that has gone astray.
+IPOPT_ITERATIONS = 200
+# COBYLA: first change of a joint angle [rad], last one, and number of evaluations.
+COBYLA_STEP, COBYLA_TOLERANCE, COBYLA_EVALUATIONS = 0.1, 1e-6, 4000
 
 
 class Algorithm1Status(Enum):
@@ -96,24 +108,167 @@ class Algorithm1Result:
         return self.k_theta * self.model.chain.h
 
     @property
-    def kappa_0(self) -> FloatArray:
-        """Rest curvature theta_0 / h at the interior joints (n - 1,) [1/m]."""
-        return self.theta_0 / self.model.chain.h
-
-    @property
     def p(self) -> FloatArray:
         """Parameter vector of `model`, for `solve_equilibrium`."""
         return np.array([self.EI])
 
     @property
     def rest(self) -> FloatArray:
-        """Rest curvature of the model's bending cells (n - 1,) [1/m]."""
-        return self.kappa_0
+        """Rest curvature theta_0 / h at the interior joints (n - 1,), the bending cells [1/m]."""
+        return self.theta_0 / self.model.chain.h
+
+
+@dataclass(frozen=True)
+class Target:
+    """Measured points of one pose, about its start.
+
+    `points` (K, 2) [m]; `edges` (K,) marks points with a gap beside them; `end` (2,) [m].
+    """
+
+    points: FloatArray
+    edges: BoolArray
+    end: FloatArray
+
+    @classmethod
+    def of(cls, measured: MeasuredPose, gap: float) -> Target:
+        """Take the points of a pose; what is missing over more than `gap` [m] is a gap."""
+        start = np.array(measured.pose.start)
+        points, end = measured.points - start, np.array(measured.pose.end) - start
+        line = np.concatenate([np.zeros((1, 2)), points, end[None]])
+        wide = np.hypot(*np.diff(line, axis=0).T) > gap
+        return cls(points, wide[:-1] | wide[1:], end)
+
+    def nearest(self, nodes: FloatArray) -> tuple[NDArray[np.intp], BoolArray]:
+        """Index of the nearest point of each node, and whether the node is in view.
+
+        A node whose nearest point lies beside a gap is in the gap and is left out of r_p.
+        """
+        square = ((nodes[:, None, :] - self.points[None]) ** 2).sum(axis=-1)
+        index = square.argmin(axis=1)
+        return index, ~self.edges[index]
+
+    def residual(self, nodes: FloatArray) -> float:
+        """r_p of Eq. 9 [m^2]."""
+        index, seen = self.nearest(nodes)
+        return float(((nodes - self.points[index])[seen] ** 2).sum())
+
+
+class InnerProblem:
+    """Eq. 13: the shape of one pose that balances its energy against its measured points.
+
+        min V(theta, alpha) + beta r_p(theta)   s.t.   r(L) = end,   |theta_i| <= pi/2 for i >= 2
+
+    Parameters
+    ----------
+    cable : Cable
+    gravity : (float, float) [m/s^2]
+    n : int
+        Number of links.
+    c : float [J/m^2]
+        beta = c n.
+    """
+
+    def __init__(self, cable: Cable, gravity: tuple[float, ...], n: int, c: float = WEIGHT) -> None:
+        self.chain = Chain(cable.length, n, "link")
+        self.weight = cable.mass / n * np.array(gravity)
+        self.beta = c * n
+        # One solver for all poses and iterations: alpha, end and points are its parameters.
+        phi, k_theta = ca.SX.sym("phi", n), ca.SX.sym("k_theta")
+        theta_0, seen = ca.SX.sym("theta_0", n - 1), ca.SX.sym("seen", n - 1)
+        end, points = ca.SX.sym("end", 2), ca.SX.sym("points", n - 1, 2)
+        steps = self.chain.h * ca.horzcat(ca.cos(phi), ca.sin(phi))
+        nodes = ca.vertcat(ca.SX.zeros(1, 2), ca.cumsum(steps, 0))
+        joints = phi[1:] - phi[:-1]
+        bending = k_theta / 2 * ca.sumsqr(joints - theta_0)
+        middles = (nodes[1:, :] + nodes[:-1, :]) / 2
+        hanging = -ca.dot(ca.DM(self.weight), ca.sum1(middles).T)
+        gaps = ca.dot(seen, ca.sum2((nodes[1:n, :] - points) ** 2))
+        problem = {
+            "x": phi,
+            "p": ca.vertcat(k_theta, theta_0, end, seen, ca.vec(points)),
+            "f": bending + hanging + self.beta * gaps,
+            "g": ca.vertcat(nodes[n, :].T - end, joints),
+        }
+        self._solver = ipopt("algorithm1", problem, 1e-9, IPOPT_ITERATIONS)
+
+    def nodes(self, phi: FloatArray) -> FloatArray:
+        """Nodes (n + 1, 2) [m] from the start, which is the origin."""
+        steps = self.chain.h * np.stack([np.cos(phi), np.sin(phi)], axis=1)
+        return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+
+    def objective(
+        self, phi: FloatArray, target: Target, k_theta: float, theta_0: FloatArray
+    ) -> float:
+        """V + beta r_p with the nearest points of this very shape [J]."""
+        nodes = self.nodes(phi)
+        middles = (nodes[1:] + nodes[:-1]) / 2
+        bending = k_theta / 2 * ((np.diff(phi) - theta_0) ** 2).sum()
+        hanging = -(middles @ self.weight).sum()
+        return float(bending + hanging + self.beta * target.residual(nodes[1:-1]))
+
+    def first_guess(self, pose: Pose, target: Target) -> FloatArray:
+        """Arc through both ends on the pose's branch, or nearer to the measured points."""
+        sides = {"ccw": (1,), "cw": (-1,)}.get(pose.branch or "", (1, -1))
+        places, length = self.chain.places, self.chain.length
+        arcs = [arc_headings(places, length, np.zeros(2), target.end, side) for side in sides]
+        return min(arcs, key=lambda phi: target.residual(self.nodes(phi)[1:-1]))
+
+    def solve_ipopt(
+        self, phi: FloatArray, target: Target, k_theta: float, theta_0: FloatArray
+    ) -> tuple[FloatArray, bool]:
+        """Minimise by IPOPT in absolute headings, the nearest points chosen again in between.
+
+        Headings (n,) [rad], and whether IPOPT converged.
+        """
+        bound = np.concatenate([np.zeros(2), np.full(self.chain.n - 1, JOINT_BOUND)])
+        chosen: tuple[NDArray[np.intp], BoolArray] | None = None
+        for _ in range(ASSIGNMENTS):
+            index, seen = target.nearest(self.nodes(phi)[1:-1])
+            if chosen is not None and all(map(np.array_equal, chosen, (index, seen))):
+                break
+            chosen = (index, seen)
+            points = target.points[index].T.ravel()
+            p = np.concatenate([[k_theta], theta_0, target.end, seen, points])
+            found, stats = run_ipopt(self._solver, x0=phi, p=p, lbg=-bound, ubg=bound)
+            if not stats["success"]:
+                return phi, False
+            phi = np.array(found["x"]).ravel()
+        return phi, True
+
+    def solve_cobyla(
+        self, phi: FloatArray, target: Target, k_theta: float, theta_0: FloatArray
+    ) -> tuple[FloatArray, bool]:
+        """Minimise by COBYLA in relative joint angles, as in the paper.
+
+        Headings (n,) [rad], and whether COBYLA converged.
+        """
+
+        def objective(theta: FloatArray) -> float:
+            return self.objective(np.cumsum(theta), target, k_theta, theta_0)
+
+        def end_gap(theta: FloatArray) -> FloatArray:
+            return self.nodes(np.cumsum(theta))[-1] - target.end
+
+        constraints: Any = [
+            {"type": "ineq", "fun": end_gap},
+            {"type": "ineq", "fun": lambda theta: -end_gap(theta)},
+            {"type": "ineq", "fun": lambda theta: JOINT_BOUND - np.abs(theta[1:])},
+        ]
+        options: Any = {"rhobeg": COBYLA_STEP, "maxiter": COBYLA_EVALUATIONS, "catol": 1e-6}
+        found = minimize(
+            objective,
+            np.concatenate([phi[:1], np.diff(phi)]).astype(np.float64),
+            method="COBYLA",
+            constraints=constraints,
+            tol=COBYLA_TOLERANCE,
+            options=options,
+        )
+        return np.cumsum(found.x), bool(found.success)
 
 
 def applies(model: CableModel) -> bool:
     """Whether the paper's method knows such a cable: in a plane, pinned at both ends."""
-    return not model.in_space and model.start == model.end == "pinned"
+    return model.node is Heading and model.start == model.end == "pinned"
 
 
 def gravity_slopes(phi: FloatArray, weight: FloatArray, h: float) -> FloatArray:
@@ -169,23 +324,17 @@ def best_parameters(
         k_theta, which is kept positive, and theta_0.
     """
     m, joints = angles.shape
-    identity = np.tile(np.eye(joints), (m, 1))
 
     def residual(x: FloatArray) -> FloatArray:
         return (angles - expected_angles(x[0] * k_theta, x[1:], slopes)).ravel()
 
     def jacobian(x: FloatArray) -> FloatArray:
         by_stiffness = -slopes.ravel() / (x[0] ** 2 * k_theta)
-        return np.column_stack([by_stiffness, -identity])
+        return np.column_stack([by_stiffness, -np.tile(np.eye(joints), (m, 1))])
 
-    lower = np.concatenate([[1e-9], np.full(joints, -np.inf)])
-    found = least_squares(
-        residual,
-        np.concatenate([[1.0], theta_0]),
-        jac=jacobian,
-        bounds=(lower, np.inf),
-        method="trf",
-    )
+    start, lower = np.concatenate([[1.0], theta_0]), np.full(joints + 1, -np.inf)
+    lower[0] = 1e-9
+    found = least_squares(residual, start, jac=jacobian, bounds=(lower, np.inf), method="trf")
     return float(found.x[0] * k_theta), found.x[1:]
 
 
@@ -194,9 +343,7 @@ def run_algorithm1(
     poses: Sequence[MeasuredPose],
     gravity: tuple[float, ...],
     n: int = 10,
-    inner: Inner = "ipopt",
-    c: float = WEIGHT,
-    tolerance: float = 1e-4,
+    inner: Literal["ipopt", "cobyla"] = "ipopt",
     max_iterations: int = ITERATIONS,
 ) -> Algorithm1Result:
     """Estimate k_theta and theta_0 by Algorithm 1 of the paper.
@@ -212,10 +359,6 @@ def run_algorithm1(
         Number of links.
     inner : "ipopt" or "cobyla"
         Minimiser of Eq. 13; COBYLA takes about a second a pose and iteration at n = 10.
-    c : float [J/m^2]
-        beta = c n weighs the distances against the energy.
-    tolerance : float
-        Largest change of ln(k_theta) and of theta_0 [rad] that counts as none.
     max_iterations : int
 
     Returns
@@ -230,49 +373,35 @@ def run_algorithm1(
     """
     began = perf_counter()
     used = _usable(cable, poses, gravity, n)
-    problem = InnerProblem(cable, gravity, n, c)
+    problem = InnerProblem(cable, gravity, n)
     solve = {"ipopt": problem.solve_ipopt, "cobyla": problem.solve_cobyla}[inner]
     targets = [Target.of(item, problem.chain.h / 2) for item in used]
-    shapes = [
-        problem.first_guess(item.pose, target) for item, target in zip(used, targets, strict=True)
-    ]
+    shapes = [problem.first_guess(x.pose, target) for x, target in zip(used, targets, strict=True)]
     k_theta = cable.bending_stiffness / problem.chain.h
     theta_0: FloatArray = np.zeros(n - 1)
     history = [k_theta]
     calm, failed = 0, 0
-    status: Algorithm1Status | None = None
-    while status is None and len(history) <= max_iterations:
-        solved, failed = [], 0
-        for phi, target in zip(shapes, targets, strict=True):
-            new, converged = solve(phi, k_theta, theta_0, target)
-            failed += not converged
-            solved.append(new)
-        shapes = solved
+    status = Algorithm1Status.ITERATION_LIMIT
+    while status is Algorithm1Status.ITERATION_LIMIT and len(history) <= max_iterations:
+        solved = [solve(*one, k_theta, theta_0) for one in zip(shapes, targets, strict=True)]
+        shapes = [phi for phi, _ in solved]
+        failed = sum(not converged for _, converged in solved)
         angles = np.diff(shapes, axis=1)
         slopes = np.array([gravity_slopes(phi, problem.weight, problem.chain.h) for phi in shapes])
         last, last_0 = k_theta, theta_0
         k_theta, theta_0 = best_parameters(angles, slopes[:, 1:], k_theta, theta_0)
         history.append(k_theta)
         change = max(abs(np.log(k_theta / last)), float(np.abs(theta_0 - last_0).max()))
-        calm = calm + 1 if change <= tolerance else 0
+        calm = calm + 1 if change <= TOLERANCE else 0
         if _runs_away(history):
             status = Algorithm1Status.RUNAWAY
         elif calm >= CALM:
             status = Algorithm1Status.CONVERGED
-    status = status or Algorithm1Status.ITERATION_LIMIT
     seconds = perf_counter() - began
-    model = CableModel(
-        replace(cable, straight=False), n=n, element="link", gravity=gravity, n_rest=4
-    )
+    message = _message(status, history, seconds, failed, len(shapes))
+    model = CableModel(replace(cable, straight=False), n, "link", gravity=gravity, n_rest=4)
     return Algorithm1Result(
-        model=model,
-        k_theta=k_theta,
-        theta_0=theta_0,
-        iterations=len(history) - 1,
-        status=status,
-        message=_message(status, history, seconds, failed, len(shapes)),
-        history=np.array(history),
-        seconds=seconds,
+        model, k_theta, theta_0, len(history) - 1, status, message, np.array(history), seconds
     )
 
 
@@ -291,11 +420,8 @@ def _usable(
                 f"{pose.name}: the paper's method knows pinned ends only.\n"
                 "  Try: estimation: {algorithm1: false}"
             )
-        try:
-            check_pose(model, model.nominal, pose)
-        except EquilibriumError:
-            continue
-        used.append(item)
+        if out_of_reach(model, model.nominal, pose) is None:
+            used.append(item)
     if not used:
         raise EstimationError("no pose to fit: every pose is held out, unread or out of reach.")
     return used
@@ -314,12 +440,11 @@ def _message(
     status: Algorithm1Status, history: list[float], seconds: float, failed: int, n_poses: int
 ) -> str:
     """Say in words how the loop ended."""
-    count = len(history) - 1
     text = (
-        f"After {counted(count, 'iteration')} ({seconds:.1f} s) {status.value}; "
+        f"After {counted(len(history) - 1, 'iteration')} ({seconds:.1f} s) {status.value}; "
         f"k_theta went from {history[0]:.3g} to {history[-1]:.3g} N m/rad."
     )
     if failed:
-        shapes = f"{failed} of {counted(n_poses, 'pose')}"
-        text += f" The shapes of {shapes} did not converge in the last one."
+        poses = counted(n_poses, "pose")
+        text += f" The shapes of {failed} of {poses} did not converge in the last one."
     return text

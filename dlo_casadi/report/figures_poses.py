@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from dlo_casadi.equilibrium.cable_shape import CableShape
+from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.equilibrium.spread import EDGE
 from dlo_casadi.report.canvas import (
     BLACK,

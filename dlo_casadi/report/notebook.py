@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from dlo_casadi.equilibrium.cable_shape import CableShape
+from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.errors import counted
 from dlo_casadi.report.tables import error_rows, fitted_rows, prediction_rows
 from dlo_casadi.report.words import all_warnings, verdict_lines

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from dlo_casadi.equilibrium.cable_shape import CableShape
+from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.report.words import (
     NOISE_ALONE,
     ON_BRANCH,

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dlo_casadi.config import Config
-from dlo_casadi.equilibrium.cable_shape import CableShape
+from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.errors import counted
 from dlo_casadi.report.tables import (
     fitted_rows,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from scipy.linalg import block_diag
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench, line_or_markers
 
@@ -67,9 +66,8 @@ class MeasuredPose:
         """
         if not readings or not self.readable:
             return self
-        node = Frame if len(self.pose.start) == 3 else Heading
         known = {name: np.array(value, dtype=float) for name, value in readings.items()}
-        return replace(self, sensors=(*self.sensors, Wrench(known, node)))
+        return replace(self, sensors=(*self.sensors, Wrench(known, self.pose.node)))
 
     @property
     def readable(self) -> bool:
@@ -161,17 +159,18 @@ class MeasuredPose:
         Beside them what the residuals of a sensor share. Of what is measured at no point each
         residual is a mode of its own.
         """
-        blocks = [
-            np.hstack([np.kron(modes[points], np.eye(x.per_point)), _scaled(x.together)])
-            for x, points, _ in self.slices
-        ]
+        blocks = []
+        for x, points, _ in self.slices:
+            shared = x.together / np.abs(x.together).max(axis=0, initial=1e-300)
+            blocks.append(np.hstack([np.kron(modes[points], np.eye(x.per_point)), shared]))
         if others := int((~self.on_points).sum()):
             blocks.append(np.eye(others))
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
 
-    def _parts(self, per_point: FloatArray) -> list[FloatArray]:
-        """Values of the points (K, ...), sensor by sensor."""
-        return np.split(per_point, np.cumsum([len(x.points) for x in self.sensors])[:-1])
+    def _each(self, *per_point: FloatArray) -> Iterator[tuple[Any, ...]]:
+        """Each sensor with its part of values of the points (K, ...)."""
+        ends = np.cumsum([len(x.points) for x in self.sensors])[:-1]
+        return zip(self.sensors, *(np.split(values, ends) for values in per_point), strict=True)
 
     def places(self, length: float) -> FloatArray:
         """First guess of the points' arc lengths (K,) [m], without a curve."""
@@ -179,32 +178,28 @@ class MeasuredPose:
 
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] at which the points are compared with this curve."""
-        parts = zip(self.sensors, self._parts(places), strict=True)
-        return np.concatenate([sensor.located(seen, s) for sensor, s in parts])
+        return np.concatenate([x.located(seen, s) for x, s in self._each(places)])
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
-        parts = zip(self.sensors, self._parts(places), self._parts(moved), strict=True)
-        return np.concatenate([sensor.components(curve, s, way) for sensor, s, way in parts])
+        parts = self._each(places, moved)
+        return np.concatenate([x.components(curve, s, way) for x, s, way in parts])
 
     def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Measured minus model (R,)."""
-        parts = zip(self.sensors, self._parts(places), strict=True)
-        return np.concatenate([sensor.residual(seen, s) for sensor, s in parts])
+        return np.concatenate([x.residual(seen, s) for x, s in self._each(places)])
 
     def linearized(
         self, seen: Observed, places: FloatArray, along: ObservedChange
     ) -> tuple[FloatArray, FloatArray]:
         """Residual (R,) and its change (R, q) along directions."""
-        parts = zip(self.sensors, self._parts(places), strict=True)
-        found = [sensor.linearized(seen, s, along) for sensor, s in parts]
+        found = [x.linearized(seen, s, along) for x, s in self._each(places)]
         residual, change = (np.concatenate(part) for part in zip(*found, strict=True))
         return residual, change
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) with W cov W^T = 1; sensors are independent."""
-        parts = zip(self.sensors, self._parts(places), strict=True)
-        blocks = [sensor.whitening(noise, s) for sensor, s in parts]
+        blocks = [x.whitening(noise, s) for x, s in self._each(places)]
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
 
     def nearest(self, curve: NodeCurve) -> FloatArray:
@@ -241,10 +236,4 @@ class MeasuredPose:
 
     def weighing(self, weight: FloatArray) -> Self:
         """The same pose with other relative standard deviations (K,) of its points."""
-        parts = zip(self.sensors, self._parts(weight), strict=True)
-        return replace(self, sensors=tuple(sensor.weighing(w) for sensor, w in parts))
-
-
-def _scaled(columns: FloatArray) -> FloatArray:
-    """Columns (R, c) whose largest entry is one."""
-    return columns / np.abs(columns).max(axis=0, initial=1e-300)
+        return replace(self, sensors=tuple(x.weighing(w) for x, w in self._each(weight)))

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange, chord_places
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.sensing.sensors import OfPoints
+from dlo_casadi.sensing.sensors import Sensor
 from dlo_casadi.vision import ImageCurve, Viewpoint, compare_pixels, nearest_in_order
 
 FloatArray = NDArray[np.floating]
@@ -55,7 +53,7 @@ class ViewInput:
 
 
 @dataclass(frozen=True)
-class Pixels(OfPoints):
+class Pixels(Sensor):
     """Pixels of one photograph, compared with the middle of the outline that a curve would have.
 
         d_k = c n_k . (u_k - m(r(s_k)))                                      [m]
@@ -81,7 +79,7 @@ class Pixels(OfPoints):
         Relative standard deviations.
     size : scalar [m/px]
         Of a pixel at the cable.
-    together : (K, 6) [m]
+    by_camera : (K, 6) [m]
         What a standard deviation of each error of the camera's place does to the residuals.
     correlation_length : scalar [m]
         Length over which the average along the cable correlates the pixels' errors: what else is
@@ -96,16 +94,16 @@ class Pixels(OfPoints):
     points: FloatArray
     weight: FloatArray
     size: float
-    together: FloatArray
+    by_camera: FloatArray
     correlation_length: float = 0.0
     on_line: bool = False
 
-    marked = False
     per_point = 1
 
-    def places(self, pose: Pose, length: float) -> FloatArray:
-        """First guess of the pixels' arc lengths (K,) [m]: running chord length, scaled to L."""
-        return chord_places(self.points, pose, length)
+    @property
+    def together(self) -> FloatArray:
+        """What the errors of the camera's place do to the residuals (K, 6) [m], a std of each."""
+        return self.by_camera
 
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] that are seen nearest to the pixels, near those given."""
@@ -168,13 +166,9 @@ class Pixels(OfPoints):
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (K, K) [1/m] with W cov W^T = 1, errors of the camera's place among them."""
         white = noise.whitening(places, self.weight, self.correlation_length)
-        seen = white @ self.together
+        seen = white @ self.by_camera
         factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
         return np.asarray(solve_triangular(factor, white, lower=True))
-
-    def weighing(self, weight: FloatArray) -> Self:
-        """The same pixels with other relative standard deviations."""
-        return replace(self, weight=weight)
 
 
 def pixel_std(views: Sequence[ViewInput]) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,101 +23,24 @@ from dlo_casadi.sensing.noise import Count, NoiseModel
 FloatArray = NDArray[np.floating]
 
 
-class Sensor(Protocol):
+class Sensor(ABC):
     """One measurement of one pose: `per_point` residuals of each of its K points, point by point.
 
     Or of no point at all (K = 0), but of R residuals beside the curve.
+
+    Attributes
+    ----------
+    points : (K, d) [m]
+        As measured.
+    weight : (K,)
+        Relative standard deviations of the points.
+    marked : bool
+        Whether the arc lengths of all its points are known.
     """
 
-    @property
-    def points(self) -> FloatArray:
-        """As measured (K, d) [m]."""
-        ...
-
-    @property
-    def weight(self) -> FloatArray:
-        """Relative standard deviations (K,) of the points."""
-        ...
-
-    @property
-    def per_point(self) -> int:
-        """Residuals of a point."""
-        ...
-
-    @property
-    def correlation_length(self) -> float:
-        """Length [m] over which points share the errors that are white otherwise."""
-        ...
-
-    @property
-    def count(self) -> Count:
-        """Measured points of which each (K,) of its points is the mean; or one for all."""
-        ...
-
-    @property
-    def kinds(self) -> NDArray[np.str_]:
-        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
-        ...
-
-    @property
-    def marked(self) -> bool:
-        """Whether the arc lengths of all its points are known."""
-        ...
-
-    @property
-    def together(self) -> FloatArray:
-        """Errors (R, c) that its residuals share, a standard deviation of each."""
-        ...
-
-    def places(self, pose: Pose, length: float) -> FloatArray:
-        """First guess of the points' arc lengths (K,) [m], without a curve."""
-        ...
-
-    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
-        """Arc lengths (K,) [m] at which the points are compared with this curve."""
-        ...
-
-    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
-        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
-        ...
-
-    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
-        """Measured minus model (R,)."""
-        ...
-
-    def linearized(
-        self, seen: Observed, places: FloatArray, along: ObservedChange
-    ) -> tuple[FloatArray, FloatArray]:
-        """Residual (R,) and its change (R, q) along directions."""
-        ...
-
-    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
-        """Matrix W (R, R) with W cov W^T = 1."""
-        ...
-
-    def nearest(self, curve: NodeCurve) -> FloatArray:
-        """Arc lengths (K,) [m] at which the points belong on a curve that may be far off."""
-        ...
-
-    def weighing(self, weight: FloatArray) -> Self:
-        """The same with other relative standard deviations."""
-        ...
-
-
-class OfPoints(ABC):
-    """What sensors of points have in common."""
-
     points: FloatArray
-
-    @property
-    def correlation_length(self) -> float:
-        """None: points err by themselves."""
-        return 0.0
-
-    @property
-    def count(self) -> Count:
-        """One: points as they were measured."""
-        return 1.0
+    weight: FloatArray
+    marked = False
 
     @property
     @abstractmethod
@@ -125,13 +48,62 @@ class OfPoints(ABC):
         """Residuals of a point."""
 
     @property
+    def correlation_length(self) -> float:
+        """Length [m] over which points share the errors that are white otherwise."""
+        return 0.0
+
+    @property
+    def count(self) -> Count:
+        """Measured points of which each (K,) of its points is the mean; or one for all."""
+        return 1.0
+
+    @property
     def kinds(self) -> NDArray[np.str_]:
-        """What each residual (R,) is of: a point."""
+        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
         return np.full(len(self.points) * self.per_point, "point")
+
+    @property
+    def together(self) -> FloatArray:
+        """Errors (R, c) that its residuals share, a standard deviation of each; none by default."""
+        return np.zeros((len(self.kinds), 0))
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L."""
+        return chord_places(self.points, pose, length)
+
+    @abstractmethod
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] at which the points are compared with this curve, near those."""
+
+    @abstractmethod
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """Arc lengths (K,) [m] at which the points belong on a curve that may be far off."""
+
+    @abstractmethod
+    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
+        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
+
+    @abstractmethod
+    def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """Measured minus model (R,)."""
+
+    @abstractmethod
+    def linearized(
+        self, seen: Observed, places: FloatArray, along: ObservedChange
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residual (R,) and its change (R, q) along directions."""
+
+    @abstractmethod
+    def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
+        """Matrix W (R, R) with W cov W^T = 1."""
+
+    def weighing(self, weight: FloatArray) -> Self:
+        """The same with other relative standard deviations of the points."""
+        return replace(self, weight=weight)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
-class _Points(OfPoints):
+class _Points(Sensor):
     """Points in the board's or the world's frame, compared where they are on the curve."""
 
     points: FloatArray
@@ -152,23 +124,10 @@ class _Points(OfPoints):
         both = self.components(seen.curve, places, np.dstack([gap, moved]))
         return both[:, 0], both[:, 1:]
 
-    @abstractmethod
-    def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
-        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
-
-    @property
-    def together(self) -> FloatArray:
-        """None: the errors of points have no common cause."""
-        return np.zeros((len(self.points) * self.per_point, 0))
-
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) [1/m] with W cov W^T = 1; the errors of a point are independent."""
         own = noise.whitening(places, self.weight, count=self.count)
         return np.kron(own, np.eye(self.per_point))
-
-    def weighing(self, weight: FloatArray) -> Self:
-        """The same points with other relative standard deviations."""
-        return replace(self, weight=weight)
 
 
 @dataclass(frozen=True)
@@ -186,16 +145,10 @@ class Centerline(_Points):
         Relative standard deviations.
     """
 
-    marked = False
-
     @property
     def per_point(self) -> int:
         """Residuals of a point."""
         return self.points.shape[1] - 1
-
-    def places(self, pose: Pose, length: float) -> FloatArray:
-        """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L."""
-        return chord_places(self.points, pose, length)
 
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] of the closest points, near those given."""
@@ -268,7 +221,7 @@ def line_or_markers(
 
 
 @dataclass(frozen=True)
-class Wrench:
+class Wrench(Sensor):
     """Forces and moments on the fixtures, component by component: R residuals [N], [N m].
 
     Parameters
@@ -283,8 +236,8 @@ class Wrench:
     node: type[Node]
     per_point = 0
     marked = True
-    correlation_length = 0.0
-    count = 1.0
+    points = np.zeros((0, 1))
+    weight = np.zeros(0)
 
     @property
     def _rows(self) -> dict[str, slice]:
@@ -301,21 +254,6 @@ class Wrench:
         return np.concatenate(
             [np.full(at.stop - at.start, name.split("_")[1]) for name, at in self._rows.items()]
         )
-
-    @property
-    def points(self) -> FloatArray:
-        """None."""
-        return np.zeros((0, 1))
-
-    @property
-    def weight(self) -> FloatArray:
-        """None."""
-        return np.zeros(0)
-
-    @property
-    def together(self) -> FloatArray:
-        """None: their bias is the session's."""
-        return np.zeros((len(self.kinds), 0))
 
     def places(self, pose: Pose, length: float) -> FloatArray:
         """None (0,)."""
@@ -347,7 +285,3 @@ class Wrench:
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) with W cov W^T = 1; all components are independent."""
         return np.diag(noise.units(self.kinds) / noise.std)
-
-    def weighing(self, weight: FloatArray) -> Self:
-        """The same readings."""
-        return self

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from dlo_casadi.equilibrium.pose import PoseBranch
-from dlo_casadi.equilibrium.spread import COVERED
-from dlo_casadi.equilibrium.tipping import Tipping
+from dlo_casadi.equilibrium.spread import COVERED, Tipping
 
 FloatArray = NDArray[np.floating]
 

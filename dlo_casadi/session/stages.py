@@ -10,8 +10,13 @@ from numpy.typing import NDArray
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.solve import on_other_side
-from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
-from dlo_casadi.equilibrium.tipping import sides_of, tipping_of
+from dlo_casadi.equilibrium.spread import (
+    Uncertainty,
+    displacements,
+    sides_of,
+    spread_across,
+    tipping_of,
+)
 from dlo_casadi.estimation.constrained import EnergyGap, Interval
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,

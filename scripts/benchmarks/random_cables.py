@@ -22,7 +22,7 @@ from dlo_casadi.codegen.shapes import pose_table, records_of
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses, limited
-from dlo_casadi.equilibrium.ipopt import by_ipopt
+from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel, EndKind, StartKind

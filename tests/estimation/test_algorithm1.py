@@ -17,6 +17,8 @@ from dlo_casadi.io.points import read_points
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.paper.algorithm1 import (
     Algorithm1Status,
+    InnerProblem,
+    Target,
     _runs_away,
     applies,
     best_parameters,
@@ -24,7 +26,6 @@ from dlo_casadi.paper.algorithm1 import (
     gravity_slopes,
     run_algorithm1,
 )
-from dlo_casadi.paper.inner_problem import InnerProblem, Target
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
@@ -147,7 +148,7 @@ def test_both_minimisers_reach_the_same_minimum():
     (item,) = measured(0.3, ENDS[1:2])
     target = Target.of(item, problem.chain.h / 2)
     guess = problem.first_guess(item.pose, target)
-    arguments = (2.0, np.zeros(4), target)
+    arguments = (target, 2.0, np.zeros(4))
     smooth, converged = problem.solve_ipopt(guess, *arguments)
     linear, _ = problem.solve_cobyla(guess, *arguments)
     assert converged
@@ -219,10 +220,10 @@ def test_rest_angles_of_a_stiff_cable_near_its_rest_shape():
     result = run_algorithm1(stiff, measured(77.0, ends, kappa_0, cable=stiff), GRAVITY)
     # Noise of 0.3 mm on nodes 81 mm apart tilts a link by 5 mrad: 9 mrad a joint, over 6 poses
     # 3.7 mrad or 0.045 1/m, two of them for the largest of seven joints.
-    np.testing.assert_allclose(result.kappa_0[1:-1], kappa_0, atol=0.1)
+    np.testing.assert_allclose(result.rest[1:-1], kappa_0, atol=0.1)
     # Ten chords of this arc are L (kappa_0 h)^2 / 24 = 0.5 mm shorter than it; the chain hides
     # this length at its ends, whose joints bend by 0.12 1/m more even without noise.
-    np.testing.assert_allclose(result.kappa_0[[0, -1]], kappa_0, atol=0.25)
+    np.testing.assert_allclose(result.rest[[0, -1]], kappa_0, atol=0.25)
 
 
 def test_loop_converges_in_several_calm_iterations():
@@ -271,7 +272,7 @@ def test_parameters_are_those_of_the_model():
     shape = solve_equilibrium(result.model, result.p, result.rest, Pose((0.0, 0.0), ENDS[0]))
     line = MeasuredPose.of_points(Pose((0.0, 0.0), ENDS[0]), shape.points[1:-1])
     by_paper = problem.objective(
-        shape.phi, result.k_theta, result.theta_0, Target.of(line, gap=1.0)
+        shape.phi, Target.of(line, gap=1.0), result.k_theta, result.theta_0
     )
     assert shape.energy == pytest.approx(by_paper, rel=1e-10)  # rounding of a few dozen terms
 

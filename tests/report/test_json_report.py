@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.equilibrium.tipping import Tipping
+from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.report.json_report import finite, report_dict, report_text
 from dlo_casadi.report.page import page_data
 from dlo_casadi.report.words import all_warnings, verdict_lines

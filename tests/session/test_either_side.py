@@ -10,11 +10,9 @@ from scipy.spatial.transform import Rotation
 import dlo_casadi as dlo
 from dlo_casadi.config import dump_yaml
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.equilibrium import tipping
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
-from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.equilibrium.tipping import tipping_of
+from dlo_casadi.equilibrium.spread import Uncertainty, tipping, tipping_of
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import RestScatter

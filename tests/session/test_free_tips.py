@@ -7,11 +7,9 @@ import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.equilibrium import tipping
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
-from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.equilibrium.tipping import tipping_of
+from dlo_casadi.equilibrium.spread import Uncertainty, tipping, tipping_of
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses

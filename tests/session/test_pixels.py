@@ -100,7 +100,7 @@ def test_errors_are_correlated_over_the_average_along_the_cable():
     pixels = replace(sensor(0.4, curve()), correlation_length=0.02)
     places = np.array([0.1, 0.14, 0.5])
     noise, together = NoiseModel(1e-4, 0.5, 0.01, "exponential"), np.zeros((3, 6))
-    pixels = replace(pixels, weight=np.ones(3), together=together)
+    pixels = replace(pixels, weight=np.ones(3), by_camera=together)
     white = pixels.whitening(noise, places)
     inverse = np.linalg.inv(white.T @ white) / 1e-8
     assert inverse[0, 1] == pytest.approx(0.5 * (np.exp(-2) + np.exp(-4)), rel=1e-6)

@@ -1,0 +1,305 @@
+"""Minima of the energy from far away: by Newton's method on many poses at once, and by IPOPT.
+
+Each step of Newton's method on many poses or first guesses solves
+
+    [ A + tau I   B ] [ dx   ]     [ dL/dx   ]
+    [ B^T         C ] [ dlam ] = - [ dL/dlam ]
+
+with the least tau found for which the matrix has as many negative eigenvalues as there are
+multipliers: dx then lowers the energy along the end conditions, and a converged shape of tau = 0
+is a strict minimum under them. IPOPT minimises what it does not bring to one within the bounds of
+the joints.
+
+References
+----------
+Inertia-corrected Newton steps: Nocedal and Wright, Numerical Optimization, 2006, section 18.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.equilibrium.equilibrium import (
+    BALANCE,
+    END_TOLERANCE,
+    JOINT_BOUND,
+    NEARBY,
+    Equilibrium,
+    equilibria_of,
+)
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.whole_pose import potential
+from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
+from dlo_casadi.rod.node import Node
+from dlo_casadi.runtime.executors import interrupts_held
+
+FloatArray = NDArray[np.floating]
+BoolArray = NDArray[np.bool_]
+
+# Longest step of a node [rad].
+LONGEST_STEP = 0.5
+# A step below this has converged [rad].
+TOLERANCE = 1e-10
+# First shift of the diagonal over its largest entry, how fast it grows and shrinks, and below
+# what it is dropped.
+FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
+# A tangent matrix larger than the first guess's by this factor is made of multipliers that run
+# away: nothing of the cable's own stiffness is left in double precision. Four of 336 descents of
+# very soft cables with a tether came back from beyond 1e6.
+RUNAWAY = 1e16
+# Newton's method after IPOPT.
+NEWTON_STEPS = 8
+# In 690 solves of random problems of all boundaries IPOPT took 7 iterations (median), at most 84.
+IPOPT_ITERATIONS = 300
+# A joint so near to its bound is at it [rad].
+AT_BOUND = 1e-6
+
+
+@dataclass(frozen=True)
+class Minima:
+    """Where the descents have led.
+
+    Parameters
+    ----------
+    shapes : Shapes
+    balanced : (m,) bool
+        Whether the forces balance.
+    converged : (m,) bool
+        Whether the shape is a strict minimum, too; a neutral one is none.
+    energy : (m,) [J]
+    iterations : (m,) int
+    """
+
+    shapes: Shapes
+    balanced: BoolArray
+    converged: BoolArray
+    energy: FloatArray
+    iterations: NDArray[np.intp]
+
+
+def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
+    """Minimise the energy of each of m shapes under its end conditions.
+
+    Parameters
+    ----------
+    shapes : Shapes
+        First guesses; deviations are kept.
+    given : Inputs
+        What each of them depends on.
+    """
+    m = len(shapes.x)
+    node, wanted = assembly.node, assembly.model.n_multipliers
+    now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
+    balanced, iterations = np.zeros(m, dtype=bool), np.full(m, max_iterations)
+    shift, first = np.zeros(m), np.full(m, np.inf)
+    active = np.arange(m)
+    for iteration in range(max_iterations):
+        here = now.subset(active)
+        _, force, matrix = assembly.balance(here, given.subset(active))
+        if not iteration:
+            first = RUNAWAY * matrix.scale
+        bounded = np.flatnonzero(matrix.scale <= first[active])
+        if len(bounded) < len(active):
+            active, here = active[bounded], here.subset(bounded)
+            force = Vector(force.x[bounded], force.y[bounded])
+            matrix = matrix.subset(bounded)
+        if not len(active):
+            break
+        factor, shift[active] = _convex(matrix, wanted, shift[active])
+        step = factor.solve(Vector(-force.x, -force.y))
+        size = np.abs(step.x).max(axis=(1, 2, 3))
+        now.x[active], now.lam[active] = stepped(node, here, step, size)
+        # A shift makes steps small where forces do not balance, too.
+        done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
+        balanced[active[done]] = True
+        iterations[active[done]] = iteration + 1
+        active = active[~done & np.isfinite(size)]
+        if not len(active):
+            break
+    total, force, matrix = assembly.balance(now, given)
+    with np.errstate(invalid="ignore"):
+        energy = total - assembly.work(now, force)
+    there = np.flatnonzero(balanced)
+    converged = np.zeros(m, dtype=bool)
+    converged[there] = matrix.subset(there).negative() == wanted
+    return Minima(now, balanced, converged, energy, iterations)
+
+
+def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFactor, FloatArray]:
+    """Elimination of the matrices shifted until their inertia is a minimum's, and the shifts.
+
+    No shift exceeds what makes the nodes' part positive definite: where the inertia is wrong
+    still, the conditions are the cause.
+    """
+    scale, most = matrix.scale, matrix.row_sum
+    shift = np.where(before > LEAST_SHIFT * scale, before / SHRINKAGE, 0.0)
+    unit = np.eye(matrix.diagonal.shape[2])
+
+    def shifted(index: NDArray[np.intp]) -> BandFactor:
+        part = matrix.subset(index)
+        diagonal = part.diagonal + shift[index, None, None, None] * unit
+        return replace(part, diagonal=diagonal).factor()
+
+    everyone = np.arange(len(scale))
+    factor = shifted(everyone)
+    wrong = np.flatnonzero(factor.negative != wanted)
+    if not len(wrong):
+        return factor, shift
+    while len(wrong):
+        larger = np.maximum(GROWTH * shift[wrong], FIRST_SHIFT * scale[wrong])
+        shift[wrong] = np.minimum(larger, most[wrong])
+        wrong = wrong[(shifted(wrong).negative != wanted) & (larger < most[wrong])]
+    return shifted(everyone), shift
+
+
+def stepped(
+    node: type[Node], shapes: Shapes, step: Vector, size: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Nodes and border of shapes after a step of one column, none of them beyond LONGEST_STEP.
+
+    `size` (m,) [rad] is the longest step of each shape's nodes.
+    """
+    share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
+    x = node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
+    return x, shapes.lam + share[:, None] * step.y[..., 0]
+
+
+# ---- by IPOPT ------------------------------------------------------------------------------------
+
+
+def ipopt(name: str, problem: dict[str, ca.SX], tolerance: float, iterations: int) -> ca.Function:
+    """A silent IPOPT solver."""
+    options: dict[str, Any] = {
+        "print_time": False,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.tol": tolerance,
+        "ipopt.max_iter": iterations,
+    }
+    return ca.nlpsol(name, "ipopt", problem, options)
+
+
+@lru_cache(maxsize=32)
+def _solver(model: CableModel) -> ca.Function:
+    problem, count = potential(model), model.chain.n_nodes
+    x = problem.coordinates
+    conditions = ca.vertcat(problem.conditions, x[1:count] - x[: count - 1])
+    stated = {"x": x, "p": problem.parameters, "f": problem.energy, "g": conditions}
+    return ipopt("equilibrium", stated, 1e-11, IPOPT_ITERATIONS)
+
+
+def run_ipopt(solver: ca.Function, **given: Any) -> tuple[dict[str, ca.DM], dict[str, Any]]:
+    """Outputs and statistics of one run of an IPOPT solver.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After a run that was interrupted: CasADi would take the signal for a failure of the solver.
+    """
+    with interrupts_held():
+        out = solver(**given)
+    return out, solver.stats()
+
+
+def by_ipopt(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, phi: FloatArray
+) -> Equilibrium | None:
+    """Equilibrium of a planar cable that IPOPT reaches from one first guess; None if there is none.
+
+    IPOPT minimises the potential under the end conditions and the bounds of the joints: the same
+    functions of segments as everywhere, stated as one problem of the whole pose. Newton's method on
+    the Lagrangian settles the shape to rounding.
+
+    Parameters
+    ----------
+    p, rest
+        As in `solve.solve_equilibrium`.
+    pose : Pose
+    phi : (n_nodes,) [rad]
+    """
+    count, conditions = model.chain.n_nodes, model.n_multipliers
+    solver = _solver(model)
+    deviation = np.zeros(len(model.deviation_names))
+    x0 = np.concatenate([phi, np.zeros(solver.size1_in("x0") - len(phi))])
+    bounds = np.zeros(conditions + count - 1)
+    bounds[conditions:] = JOINT_BOUND
+    parameters = np.concatenate([p, rest, pose.vector, deviation])
+    out, stats = run_ipopt(solver, x0=x0, p=parameters, lbg=-bounds, ubg=bounds)
+    multipliers, coordinates = (np.array(out[name]).ravel() for name in ("lam_g", "x"))
+    border = np.zeros(model.n_border)
+    border[model.are_multipliers] = multipliers[:conditions]
+    border[~model.are_multipliers] = coordinates[count : count + 2 * model.n_springs]
+    start = Shapes(coordinates[None, :count, None], border[None], deviation[None])
+    given = Inputs.of(p, rest, pose.vector[None])
+    return _balanced(model, start, multipliers[conditions:], given, stats["iter_count"])
+
+
+def _balanced(
+    model: CableModel, start: Shapes, bound_multipliers: FloatArray, given: Inputs, iterations: int
+) -> Equilibrium | None:
+    """Newton's method from the potential's minimum, whose bows are stiff under compression too.
+
+    Joints at their bound are held there; one whose multiplier pulls it back is let go. Whatever
+    IPOPT says of its end (on fine meshes of stiff cables its tolerance lies below rounding), what
+    counts is whether the shape that is returned balances: None if it does not.
+    """
+    assembly, node = assembly_of(model), model.node
+
+    def bends(shapes: Shapes) -> FloatArray:
+        """Angles (n_nodes - 1,) [rad] between neighbouring nodes."""
+        return node.difference(shapes.x[0, :-1], shapes.x[0, 1:])[:, 0]
+
+    def linearized(shapes: Shapes, pulls: FloatArray) -> tuple[Vector, BandMatrix]:
+        """Imbalance and tangent with the joints that are held as further conditions."""
+        _, force, matrix = assembly.balance(shapes, given)
+        arms = np.zeros((1, model.chain.n_nodes, 1, len(held)))
+        arms[0, held, 0, np.arange(len(held))] = -1.0
+        arms[0, held + 1, 0, np.arange(len(held))] = 1.0
+        gap = (bends(shapes)[held] - bound)[None, :, None]
+        whole = Vector(force.x + (arms @ pulls)[..., None], np.concatenate([force.y, gap], axis=1))
+        return whole, matrix.with_border(arms)
+
+    bent = bends(start)
+    held = np.flatnonzero(np.abs(bent) > JOINT_BOUND - AT_BOUND)
+    while True:
+        bound, pulls, now = np.copysign(JOINT_BOUND, bent[held]), bound_multipliers[held], start
+        for _ in range(NEWTON_STEPS):
+            force, matrix = linearized(now, pulls)
+            step = matrix.factor().solve(Vector(-force.x, -force.y))
+            size = float(np.abs(step.x).max())
+            if not size < NEARBY:
+                break
+            x, lam = node.moved(now.x, step.x[..., 0]), step.y[:, : model.n_border, 0]
+            now = replace(now, x=x, lam=now.lam + lam)
+            pulls = pulls + step.y[0, model.n_border :, 0]
+            if size < 1e-12:
+                break
+        if not np.any(pulls * np.sign(bound) < 0):
+            break
+        held = held[pulls * np.sign(bound) >= 0]
+    force, matrix = linearized(now, pulls)
+    residual = float(np.abs(force.y).max(initial=0.0))
+    imbalance = float(np.abs(force.x).max())
+    inside = bool(np.abs(bends(now)).max() < JOINT_BOUND + AT_BOUND)
+    balanced = imbalance <= BALANCE * float(matrix.scale[0]) < np.inf
+    if not (inside and balanced and residual <= END_TOLERANCE):
+        return None
+    stable = int(matrix.negative()[0]) == model.n_multipliers + len(held)
+    bound_lam = np.zeros((1, len(bent)))
+    bound_lam[0, held] = pulls
+    return equilibria_of(
+        model,
+        now,
+        given,
+        stable=np.array([stable]),
+        iterations=np.array([iterations]),
+        bound_multipliers=bound_lam,
+    )[0]
