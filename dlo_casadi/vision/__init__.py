@@ -8,12 +8,11 @@ from dlo_casadi.vision.camera import (
     Viewpoint,
     compare_pixels,
     from_reference,
-    project_outline,
 )
 from dlo_casadi.vision.centerline import Centerline, extract_centerline
 from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.image import draw_steps, encoded, read_image
-from dlo_casadi.vision.image_curve import ImageCurve, nearest_in_order, places_along, see_cable
+from dlo_casadi.vision.image_curve import ImageCurve, nearest_in_order, see_cable
 from dlo_casadi.vision.space_line import SpaceLine, Views, measure_views
 from dlo_casadi.vision.workplane import KnownCable
 
@@ -39,8 +38,6 @@ __all__ = [
     "locate_camera",
     "measure_views",
     "nearest_in_order",
-    "places_along",
-    "project_outline",
     "read_image",
     "see_cable",
 ]

@@ -104,12 +104,6 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
         If fewer than three of the board's markers are seen where they are declared.
     """
     fit, seen = _located(image, board, camera, LEAST_MARKERS)
-    if len(fit.found) < LEAST_MARKERS:
-        raise VisionError(
-            f"the camera's place needs {LEAST_MARKERS} markers of the board where they are "
-            f"declared, and only {sorted(fit.found)} of {sorted(fit.seen)} are. Try: "
-            "marker_centers?"
-        )
     rotation, shift = np.column_stack([fit.plane[:, :2], fit.normal]), fit.plane[:, 2]
     at = np.vstack([board.corners(n) for n in fit.found]) @ rotation[:, :2].T + shift
     # Corners of a marker err together: 4 (J^T J)^-1 s^2 with the corners' own scatter s^2 = sum /
@@ -131,8 +125,7 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
 class _Fit:
     """The board's plane as markers show it."""
 
-    seen: dict[int, Array]  # corners (4, 2) [px] of each marker that is seen once
-    found: dict[int, Array]  # of them, those that are where they are declared
+    found: dict[int, Array]  # corners (4, 2) [px] of each marker
     plane: Array  # (3, 3), homography to pixels; with a camera [r_1, r_2, t]
     errors: Array  # (n,) [px], RMS of each marker
 
@@ -172,13 +165,17 @@ def _located(
         raise VisionError(text)
     while fit.errors.max() > MAX_ERROR_PX and len(fit.found) > len(seen) // 2 + 1:
         rests = [{n: q for n, q in fit.found.items() if n != left_out} for left_out in fit.found]
-        trials = [_fit(rest, board, camera) for rest in rests]
-        fit = replace(min(trials, key=lambda trial: trial.errors.max()), seen=seen)
+        fit = min((_fit(rest, board, camera) for rest in rests), key=lambda fit: fit.errors.max())
     if fit.rms > MAX_ERROR_PX:
         raise VisionError(
             f"the markers {sorted(fit.found)} are {fit.rms:.1f} px RMS off their declared places. "
             "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
             f"The picture is {width} x {height} px.{_other_axes(seen, board, camera)}"
+        )
+    if len(fit.found) < least:
+        raise VisionError(
+            f"the camera's place needs {least} markers of the board where they are declared, and "
+            f"only {sorted(fit.found)} of {sorted(seen)} are. Try: marker_centers?"
         )
     used = f"{len(fit.found)} of {len(board.marker_centers)} are used"
     lost = sorted(set(board.marker_centers) - set(fit.found) - repeated)
@@ -212,7 +209,7 @@ def _fit(found: dict[int, Array], board: Board, camera: Camera | None) -> _Fit:
         rotation, shift, projected = min(trials, key=lambda t: np.mean((t[2] - pixels) ** 2))
         plane = np.column_stack([cv2.Rodrigues(rotation)[0][:, :2], shift.ravel()])
     miss = np.sum((projected - pixels) ** 2, axis=1).reshape(-1, 4)
-    return _Fit(found, found, plane, np.sqrt(miss.mean(axis=1)))
+    return _Fit(found, plane, np.sqrt(miss.mean(axis=1)))
 
 
 def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, int]) -> str:

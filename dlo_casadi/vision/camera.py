@@ -243,22 +243,14 @@ def project_outline(
 
     Parameters
     ----------
-    viewpoint : Viewpoint
-        Where the camera stands.
     points, tangents : (K, 3) [m], [-]
         Of its axis, in the board frame; unit tangents.
-    diameter : scalar [m]
-        Of the cable.
 
     Returns
     -------
-    pixels : (K, 2) [px]
-        Middle between the two edges, across the projected axis.
-    normals : (K, 2)
-        Unit vectors across the projected axis.
-    slopes : (K, 2, 3) [px/m]
-        d(pixel)/d(point) in the board frame, that of the axis: the middle follows it to a part in
-        1e-4.
+    Middles (K, 2) [px] between the two edges, unit vectors (K, 2) across the projected axis, and
+    d(pixel)/d(point) (K, 2, 3) [px/m] in the board frame, that of the axis: the middle follows it
+    to a part in 1e-4.
 
     The two planes through the camera that touch a straight cylinder of radius r about the axis
     through p (in the camera's frame) along t are at +-a from the plane of the axis, with sin a =
@@ -310,8 +302,6 @@ def compare_pixels(
     points, tangents : (K, 3) [m], [-]
         Of the curve, at the nearest place to each pixel in the picture: there the distance does
         not change to first order with the place.
-    viewpoint, diameter
-        As `project_outline` takes them.
 
     Returns
     -------

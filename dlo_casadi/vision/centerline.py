@@ -136,14 +136,9 @@ def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BS
 
 def _is_usual(found: Crossings, usual: Flags, diameter: float) -> Flags:
     """Profiles that are usual in height, width and place of the cable."""
-    height = float(np.median(found.height[usual]))
-    width = float(np.median(found.width[usual]))
-    return (
-        (found.height / height > 0.35)
-        & (found.height / height < 2.5)
-        & (np.abs(found.width / width - 1) < 0.3)
-        & (np.abs(found.offset) < 0.4 * diameter)
-    )
+    tall, wide = (part / np.median(part[usual]) for part in (found.height, found.width))
+    alike = (tall > 0.35) & (tall < 2.5) & (np.abs(wide - 1) < 0.3)
+    return alike & (np.abs(found.offset) < 0.4 * diameter)
 
 
 def _beside_end(found: Crossings, t: Array, sound: Flags, diameter: float) -> Flags:
@@ -264,7 +259,7 @@ def extract_centerline(
         min(1.0, line.seen / length),
         line.gaps,
         line.confidence,
-        (*_gap_messages(line, length), *_fit_messages(points, line.seen, expected), *line.messages),
+        (*_remarks(line, expected), *line.messages),
     )
 
 
@@ -331,9 +326,12 @@ def measure_line(
     return MeasuredLine(trace, kept, gaps, seen, confidence, tuple(messages), unreached)
 
 
-def _gap_messages(line: MeasuredLine, length: float) -> Iterator[str]:
-    """Sentences on what is missing along the line: how much, where and why."""
-    trace = line.trace
+def _remarks(line: MeasuredLine, expected: ExpectedLine) -> Iterator[str]:
+    """Sentences on what is missing along the line, and on how it fits the fixtures and the length.
+
+    Of a gap: how much, where and why.
+    """
+    trace, length = line.trace, expected.typical
     for i in line.gaps:
         missing = slice(line.kept[i], line.kept[i + 1])
         before, after = trace.t[line.kept[i : i + 2]]
@@ -345,12 +343,8 @@ def _gap_messages(line: MeasuredLine, length: float) -> Iterator[str]:
             yield f"glare hides {share}, {where}: a lamp from the side or a softer one would help"
         else:
             yield f"{share}, {where}, are hidden or do not look like it"
-
-
-def _fit_messages(points: Array, seen: float, expected: ExpectedLine) -> Iterator[str]:
-    """Sentences on how the line fits the fixtures and the length."""
-    length, whole = expected.typical, length_of(points)
-    held = len(expected.fixtures) == 2
+    points, held = trace.points[line.kept], len(expected.fixtures) == 2
+    whole = length_of(points)
     for name, _, _, away in expected.tips(points):
         if away > max(0.03 * length, 0.01):
             yield f"the measured line stops {away:.3f} m before the {name} fixture"
@@ -361,5 +355,5 @@ def _fit_messages(points: Array, seen: float, expected: ExpectedLine) -> Iterato
         yield f"{off} longer {than}): check the scale and the length"
     elif held and whole < _SHORT * length:
         yield f"{off} shorter {than}, up to both fixtures): check the scale and the length"
-    elif not held and seen < 0.9 * length:
-        yield f"only {seen:.3f} m of {length:g} m were measured"
+    elif not held and line.seen < 0.9 * length:
+        yield f"only {line.seen:.3f} m of {length:g} m were measured"

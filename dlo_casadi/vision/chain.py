@@ -89,13 +89,13 @@ def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> 
             "no cable found: almost nothing of the place that it can reach is in the picture. "
             "Try: start, end and length in metres and in the board frame?"
         )
-    contrast = local_contrast(plane.image, plane.reachable, diameter / plane.pixel)
+    contrast = local_contrast(plane, diameter / plane.pixel)
     best: Chain | None = None
     longest = 0.0
     for candidate in candidate_maps(contrast, area_px):
         for cut in thresholds(candidate[plane.reachable], area_px):
             mask = (candidate > cut) & plane.reachable
-            strands = _strands(mask, candidate, plane, contrast, expected)
+            strands = _strands(mask, candidate, contrast, expected)
             longest = max([longest, *(strand.length for strand in strands)])
             chain = order_strands(strands, expected)
             if chain is not None and scene.varied:
@@ -128,17 +128,13 @@ def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> 
 
 
 def _strands(
-    mask: Flags,
-    candidate: NDArray[np.float32],
-    plane: WorkPlane,
-    contrast: Contrast,
-    expected: ExpectedLine,
+    mask: Flags, candidate: NDArray[np.float32], contrast: Contrast, expected: ExpectedLine
 ) -> list[Strand]:
     """Strands of a mask in metres, without their staircase, cut where they pass a fixture.
 
     What lies beyond a fixture, a tail of the cable, is then not taken for the measured part.
     """
-    width_px = expected.diameter / plane.pixel
+    plane, width_px = contrast.plane, expected.diameter / contrast.plane.pixel
     margin = max(2, round(width_px))
     strands = []
     for pixels, strand_px in find_strands(mask, width_px):
@@ -301,8 +297,7 @@ def _refuse_twins(
     anyway, only one long strand does.
     """
     diameter, length = expected.diameter, expected.typical
-    plane, candidate = workings.plane, workings.candidate
-    assert plane is not None
+    plane, candidate = contrast.plane, workings.candidate
     assert candidate is not None
     rest = ((candidate > workings.cut) & plane.inside).astype(np.uint8)
     for line in chain.strands:
@@ -314,7 +309,7 @@ def _refuse_twins(
     level = float(np.median([strand.level for strand in ours]))
     width = float(np.median([strand.width for strand in ours]))
     near, far = 0.0, 0.0
-    strands = _strands(rest > 0, candidate, plane, contrast, expected)
+    strands = _strands(rest > 0, candidate, contrast, expected)
     for strand in _of_one_colour(strands, ours) if expected.scene.varied else strands:
         alike = strand.level > _TWIN_CONTRAST * level and 0.6 < strand.width / width < 1.6
         if not alike or strand.length < 5 * diameter:

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array, diags_array
 from dlo_casadi.vision.camera import Array
 
 DEGREE = 3
-_FINE = np.linspace(0.0, 1.0, 1001)
+FINE_GRID = np.linspace(0.0, 1.0, 1001)  # places along a line in space, closely spaced
 
 
 def normals(steps: Array) -> Array:
@@ -91,7 +91,7 @@ class SpaceCurve:
     @property
     def length(self) -> float:
         """Arc length [m]."""
-        return length_of(self.position(_FINE))
+        return length_of(self.position(FINE_GRID))
 
     def away_from(self, fixtures: Array) -> Array:
         """Distances [m] of its ends from the fixtures: one of the start alone, or both."""
@@ -100,7 +100,7 @@ class SpaceCurve:
 
     def evenly(self) -> SpaceCurve:
         """Give the same curve with t proportional to its arc length."""
-        s = chord_length(self.position(_FINE))
-        at = np.interp(_FINE * s[-1], s, _FINE)
-        even = np.linalg.lstsq(self.design(_FINE), self.position(at), rcond=None)[0]
+        s = chord_length(self.position(FINE_GRID))
+        at = np.interp(FINE_GRID * s[-1], s, FINE_GRID)
+        even = np.linalg.lstsq(self.design(FINE_GRID), self.position(at), rcond=None)[0]
         return SpaceCurve(np.asarray(even, float))

@@ -239,17 +239,8 @@ def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Indices, Indices, f
 def places_along(curve: ImageCurve, points: Array) -> Array:
     """Where along a line in space the pixels of a photograph lie, in order.
 
-    Parameters
-    ----------
-    curve : ImageCurve
-        What is seen.
-    points : (M, 3) [m]
-        Along the line in space, evenly and closely spaced.
-
-    Returns
-    -------
-    (K,) share of the way along the curve, 0 to 1, of the point that is seen nearest to each pixel;
-    nan where none is near.
+    (K,) share, 0 to 1, of the way along the points (M, 3) [m] of the line, evenly and closely
+    spaced, of the one that is seen nearest to each pixel; nan where none is near.
     """
     seen = curve.viewpoint.to_pixels(points)
     away = np.linalg.norm(curve.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
@@ -12,7 +11,7 @@ from scipy.ndimage import find_objects, label
 
 from dlo_casadi.vision.camera import Array, Picture, Viewpoint, compare_pixels
 from dlo_casadi.vision.centerline import FINE
-from dlo_casadi.vision.curves import DEGREE, SpaceCurve, chord_length, fit_curve, normals
+from dlo_casadi.vision.curves import DEGREE, FINE_GRID, SpaceCurve, chord_length, fit_curve, normals
 from dlo_casadi.vision.image_curve import ImageCurve, other_stretches, places_along
 from dlo_casadi.vision.profiles import EdgeShape, find_edges, sample_profiles
 
@@ -38,12 +37,10 @@ class CurveFit:
     @property
     def places(self) -> list[Array]:
         """Places (K, 3) [m] of the pixels of each photograph; nan where it does not belong."""
-        places = []
-        for params in self.params:
-            known = np.isfinite(params)
-            places.append(np.full((len(params), 3), np.nan))
-            places[-1][known] = self.curve.position(params[known])
-        return places
+        return [
+            np.where(np.isfinite(t)[:, None], self.curve.position(np.nan_to_num(t)), np.nan)
+            for t in self.params
+        ]
 
     def std(self, t: Array) -> Array:
         """Largest standard deviation (K,) [m], in any direction across the curve, at t."""
@@ -117,46 +114,38 @@ def fit_curve_to_images(
             errors.append(scaled * weight)
         A, e = np.vstack(rows), np.concatenate(errors)
         x = np.concatenate([curve.coefficients.ravel(), motions.ravel()])
-        solved = _solve(A, e, x, rough, prior, wander)
-        wander = solved.q * _WANDER_NEXT
-        x = x + solved.step
-        change = SpaceCurve(solved.step[: 3 * n].reshape(n, 3))
-        moved = float(np.abs(change.position(np.linspace(0.0, 1.0, 1001))).max())
+        surprise, q, step, factor = _solve(A, e, x, rough, prior, wander)
+        wander = q * _WANDER_NEXT
+        x = x + step
+        change = SpaceCurve(step[: 3 * n].reshape(n, 3))
+        moved = float(np.abs(change.position(FINE_GRID)).max())
         motions = x[3 * n :].reshape(m, 6)
         curve = SpaceCurve(x[: 3 * n].reshape(n, 3)).evenly()
         if loop > 2 and moved < _SETTLED:
             break
-    covariance = cho_solve(solved.factor, np.eye(len(x)))[: 3 * n, : 3 * n].reshape(n, 3, n, 3)
-    return CurveFit(curve, covariance, tuple(params), tuple(residuals), solved.surprise)
+    covariance = cho_solve(factor, np.eye(len(x)))[: 3 * n, : 3 * n].reshape(n, 3, n, 3)
+    return CurveFit(curve, covariance, tuple(params), tuple(residuals), surprise)
 
 
-class _Step(NamedTuple):
-    """A Gauss-Newton step under a prior."""
-
-    step: Array
-    factor: tuple[Array, bool]
-    surprise: float
-    q: float
-
-
-def _solve(A: Array, e: Array, x: Array, rough: Array, prior: Array, wander: Array) -> _Step:
-    """Gauss-Newton step with the likeliest of the densities `wander`.
+def _solve(
+    A: Array, e: Array, x: Array, rough: Array, prior: Array, wander: Array
+) -> tuple[float, float, Array, tuple[Array, bool]]:
+    """Gauss-Newton step with the likeliest of the densities `wander`: -2 log p, q, dx, factor of H.
 
     -2 log p(e | q) = |e - A dx|^2 + x^T (P + K / q) x + log det(H) + m log q, with the normal
     matrix H = A^T A + P + K / q and m the rank of K across the curve.
     """
     n = int(np.count_nonzero(np.diag(rough))) // 3
     fixed, gradient = A.T @ A + prior, A.T @ e - prior @ x
-
-    def step_of(q: float) -> _Step:
+    trials = []
+    for q in wander.tolist():
         factor = cho_factor(fixed + rough / q)
         step = cho_solve(factor, gradient - rough @ x / q)
         y = x + step
         surprise = np.sum((e - A @ step) ** 2) + y @ prior @ y + y @ rough @ y / q
         surprise += 2.0 * np.log(np.diag(factor[0])).sum() + 2 * (n - DEGREE) * np.log(q)
-        return _Step(step, factor, float(surprise), q)
-
-    return min(map(step_of, wander.tolist()), key=lambda found: found.surprise)
+        trials.append((float(surprise), q, step, factor))
+    return min(trials, key=lambda trial: trial[0])
 
 
 def _linearise(
@@ -197,21 +186,20 @@ def measure_shared_outlines(
     Whether they cross in it is what makes the line in space likelier; then once more with the
     sides of that line.
     """
-    t = np.linspace(0.0, 1.0, 1001)
-    points = fit.curve.position(t)
     shared = []
     for curve in curves:
-        pixels = curve.viewpoint.to_pixels(points)
+        pixels = curve.viewpoint.to_pixels(fit.curve.position(FINE_GRID))
         beside = other_stretches(pixels, chord_length(pixels), curve.width)
         shared.append(bool(np.isfinite(beside).any()))
     if not any(shared):
         return fit, curves
 
     def measure(crossed: bool | None, guess: CurveFit) -> tuple[CurveFit, list[ImageCurve]]:
-        points = guess.curve.position(t)
         seen, params = list(curves), list(guess.params)
         for v in np.flatnonzero(shared):
-            seen[v], params[v] = see_beside(images[v], curves[v], points, t, fit.params[v], crossed)
+            seen[v], params[v] = see_beside(
+                images[v], curves[v], guess.curve, fit.params[v], crossed
+            )
         return fit_curve_to_images(seen, guess.curve, params), seen
 
     either = [measure(crossed, fit)[0] for crossed in (False, True)]
@@ -219,27 +207,22 @@ def measure_shared_outlines(
 
 
 def see_beside(
-    image: Picture,
-    seen: ImageCurve,
-    curve: Array,
-    params: Array,
-    params_seen: Array,
-    crossed: bool | None = None,
+    image: Picture, seen: ImageCurve, line: SpaceCurve, params_seen: Array, crossed: bool | None
 ) -> tuple[ImageCurve, Array]:
     """Measure the stretches that share an outline, given on which side each of them lies.
 
     An outline of width W holds two stretches of the width w, known from the rest of the line and
     the distance from the camera: their middles lie (W - w) / 2 beside its own, to either side.
 
-    `curve` (M, 3) [m] is the line in space, closely spaced, with `params` (M,) increasing along it;
-    `params_seen` (K,) are those of the pixels, nan where they do not belong to it. `crossed` tells
-    whether two stretches change sides where their outline is narrowest, or keep the sides on which
-    they lie where it is widest; None takes the sides of the curve.
+    `params_seen` (K,) tell where on the line the pixels lie, nan where they do not belong to it.
+    `crossed` tells whether two stretches change sides where their outline is narrowest, or keep
+    the sides on which they lie where it is widest; None takes the sides of the line.
 
     Returns
     -------
-    What is seen, in the order of the curve, and the parameters of its pixels.
+    What is seen, in the order of the line, and the parameters of its pixels.
     """
+    params, curve = FINE_GRID, line.position(FINE_GRID)
     viewpoint, distance = seen.viewpoint, seen.distance
     view = viewpoint.facing(distance)
     pixel = 1.0 / view.scale
@@ -259,8 +242,8 @@ def see_beside(
         if np.ptp(t[run]) < usual or len(t[run]) < 4:
             continue
         middle = flat[run] + 0.5 * beside[run, None] * normals(np.gradient(flat[run], axis=0))
-        line = fit_curve(t[run], middle, np.ones(len(middle)), usual, 0.3 * usual)
-        profiles = sample_profiles(bright, view, line, t[run], usual)
+        middles = fit_curve(t[run], middle, np.ones(len(middle)), usual, 0.3 * usual)
+        profiles = sample_profiles(bright, view, middles, t[run], usual)
         smooth = profiles.average(profiles.inside, FINE * usual)
         both = EdgeShape(usual + float(np.abs(beside[run]).max()), seen.blur * pixel)
         found = find_edges(smooth, seen.direction, both)
@@ -273,7 +256,7 @@ def see_beside(
             beyond = slice(None, narrowest) if widest_last else slice(narrowest, None)
             side[beyond] *= -1 if crossed else 1
         offset = (found.offset - 0.5 * side * apart)[:, None]
-        points = line(t[run]) + offset * normals(line(t[run], 1))
+        points = middles(t[run]) + offset * normals(middles(t[run], 1))
         good = profiles.inside & (np.abs(apart - np.abs(beside[run])) < 0.5 * usual)
         good &= np.diff(np.floor(t[run] / spacing), prepend=-1.0) > 0
         if not good.any():

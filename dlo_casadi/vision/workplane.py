@@ -197,21 +197,21 @@ def _sources(view: View, origin: Array, pixel: float, rows: int, columns: int) -
 class Contrast:
     """Difference of a picture from its local background, in units of the background's noise."""
 
+    plane: WorkPlane
     difference: NDArray[np.float32]  # (h, w, 3), (pixel - background) / noise, per channel
-    reachable: Flags  # (h, w), pixels that count
     noise: Array  # (3,) [grey levels], robust standard deviation per channel
 
 
-def local_contrast(image: Picture, reachable: Flags, width_px: float) -> Contrast:
+def local_contrast(plane: WorkPlane, width_px: float) -> Contrast:
     """Subtract the median over a window of four cable widths, which sees no cable.
 
     Slow changes of the light and steps at the rims of larger objects remain in the median and so
     cancel; a cable, whether darker, brighter or of another colour, does not.
     """
-    background = cv2.medianBlur(image, 2 * round(2.0 * width_px) + 1)
-    difference = image.astype(np.float32) - background.astype(np.float32)
-    noise = np.maximum(1.4826 * np.median(np.abs(difference[reachable]), axis=0), 1.0)
-    return Contrast(difference / noise.astype(np.float32), reachable, noise)
+    background = cv2.medianBlur(plane.image, 2 * round(2.0 * width_px) + 1)
+    difference = plane.image.astype(np.float32) - background.astype(np.float32)
+    noise = np.maximum(1.4826 * np.median(np.abs(difference[plane.reachable]), axis=0), 1.0)
+    return Contrast(plane, difference / noise.astype(np.float32), noise)
 
 
 def candidate_maps(contrast: Contrast, area_px: float) -> Iterator[NDArray[np.float32]]:
@@ -222,8 +222,8 @@ def candidate_maps(contrast: Contrast, area_px: float) -> Iterator[NDArray[np.fl
     difference: it finds a cable that changes its colour on the way.
     """
     strength = np.linalg.norm(contrast.difference, axis=2)
-    level = _upper_level(strength[contrast.reachable], 3.0 * area_px)
-    strong = contrast.reachable & (strength > max(level, _SIGNIFICANT))
+    level = _upper_level(strength[contrast.plane.reachable], 3.0 * area_px)
+    strong = contrast.plane.reachable & (strength > max(level, _SIGNIFICANT))
     vectors = contrast.difference[strong].astype(float)
     weight = strength[strong].astype(float)
     total = weight.sum()

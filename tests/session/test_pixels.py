@@ -13,7 +13,8 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.pixels import Pixels, ViewInput, pixel_std, pixels_of
 from dlo_casadi.sensing.sensors import line_or_markers
-from dlo_casadi.vision import Camera, ImageCurve, Viewpoint, project_outline
+from dlo_casadi.vision import Camera, ImageCurve, Viewpoint
+from dlo_casadi.vision.camera import project_outline
 
 LENGTH, DIAMETER = 0.9, 0.008
 CAMERA = Camera(

@@ -15,11 +15,10 @@ from dlo_casadi.vision import (
     compare_pixels,
     locate_camera,
     measure_views,
-    places_along,
-    project_outline,
     see_cable,
 )
-from dlo_casadi.vision.image_curve import loops_either_way
+from dlo_casadi.vision.camera import project_outline
+from dlo_casadi.vision.image_curve import loops_either_way, places_along
 from dlo_casadi.vision.space_line import _unsure, agreeing_fit
 
 CURVES = {"bow": bow(), "loop": loop()}
