@@ -6,43 +6,22 @@ import argparse
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK
-from dlo_casadi.cli.options import (
-    CONFIG,
-    WARNING,
-    command,
-    configuration,
-    console,
-    option,
-    print_json,
-    say,
-)
+from dlo_casadi.cli.options import CONFIG, Page, command, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.report.json_report import check_dict
 from dlo_casadi.report.terminal import check_table
-from dlo_casadi.session.measure import (
-    calibrate_session,
-    calibrated,
-    draw_steps,
-    read_inputs,
-    summary,
-)
+from dlo_casadi.session import measure
 from dlo_casadi.session.plausibility import find_suspicions
 from dlo_casadi.vision import encoded
 
 
 @command(
-    """\
-Check a configuration and its photographs or centre-lines in seconds, without fitting:
-what the camera finds in each pose, and whether units, axes, ends and files agree.
-
-dlo check configs/cable.yaml
-dlo check rope.yaml --show look/                 pictures of each step of the camera
-dlo check rope.yaml --json""",
     CONFIG,
     option(
         "--show",
@@ -54,35 +33,38 @@ dlo check rope.yaml --json""",
     codes="2 is also a mistake that was found",
 )
 def check(chosen: argparse.Namespace) -> int:
-    """Run `dlo check CONFIG [--show DIR] [...]`."""
-    config = configuration(chosen.config)
+    """Check a configuration and its photographs or centre-lines in seconds, without fitting:
+    what the camera finds in each pose, and whether units, axes, ends and files agree.
+
+    dlo check configs/cable.yaml
+    dlo check rope.yaml --show look/                 pictures of each step of the camera
+    dlo check rope.yaml --json
+    """
     with Watch(quiet=chosen.quiet) as watch:
-        config = calibrated(
-            config, lambda name, k, m: watch.step(f"calibrate {name}".strip(), k, m)
+        config = measure.calibrated(
+            chosen.config, lambda name, k, m: watch.step(f"calibrate {name}".strip(), k, m)
         )
-        inputs = read_inputs(config, lambda name, k, m: watch.step(f"read {name}", k, m))
+        inputs = measure.read_inputs(config, lambda name, k, m: watch.step(f"read {name}", k, m))
         pictures = [] if chosen.show is None else _show(config, chosen.show, watch)
         watch.step("compare with what is declared", 0, 1)
         result = check_dict(config, inputs, find_suspicions(config, inputs))
         watch.step("compare with what is declared", 1, 1)
-    code = OK if result["ok"] else BAD_INPUT
-    if chosen.json:
-        print_json({**result, "pictures": [str(path) for path in pictures]})
-        return code
-    page = console(chosen.quiet)
+    page, errors = Page(chosen), Console(stderr=True, highlight=False, quiet=chosen.json)
+    page.data({**result, "pictures": [str(path) for path in pictures]})
     page.print(check_table(config, result["poses"]))
     for row in result["poses"]:
         for advice in row["advice"]:
-            say(page, f"{row['name']}: {advice}")
+            page.say(f"{row['name']}: {advice}")
     for warning in result["warnings"]:
-        say(page, warning, WARNING)
+        page.warn(warning)
     for path in sorted({path.parent for path in pictures}):
-        say(page, f"Pictures: {path}")
+        page.say(f"Pictures: {path}")
     for mistake in result["mistakes"]:
-        say(Console(stderr=True, highlight=False), mistake, "[bold red]mistake:[/] ")
-    if result["ok"]:
-        say(page, "Nothing contradicts the configuration.")
-    return code
+        errors.print(f"[bold red]mistake:[/] {escape(mistake)}", soft_wrap=True)
+    if not result["ok"]:
+        return BAD_INPUT
+    page.say("Nothing contradicts the configuration.")
+    return OK
 
 
 def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
@@ -95,7 +77,7 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
     for k, pose in enumerate(poses):
         watch.step("draw the steps", k, len(poses))
         try:
-            pictures = draw_steps(config, pose)
+            pictures = measure.draw_steps(config, pose)
         except MeasurementError:  # no photograph; the table says so
             continue
         for name, picture in pictures.items():
@@ -106,41 +88,38 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
 
 
 @command(
-    """\
-Find matrix and lens of the camera from a session's own photographs of the board
-(Zhang's method), tell how well they are known and how to do better. Nothing is written.
-
-dlo calibrate rope.yaml
-dlo calibrate rope.yaml --json""",
     CONFIG,
     json="print JSON instead of text",
 )
 def calibrate(chosen: argparse.Namespace) -> None:
-    """Run `dlo calibrate CONFIG [...]`."""
-    config = configuration(chosen.config)
+    """Find matrix and lens of the camera from a session's own photographs of the board
+    (Zhang's method), tell how well they are known and how to do better. Nothing is written.
+
+    dlo calibrate rope.yaml
+    dlo calibrate rope.yaml --json
+    """
     with Watch(quiet=chosen.quiet) as watch:
-        found = calibrate_session(config, lambda name, k, m: watch.step(f"read {name}", k, m))
-    matrix, lens = found.camera.matrix.tolist(), found.camera.distortion.tolist()
-    if chosen.json:
-        names = ("fx", "fy", "cx", "cy")
-        print_json(
-            {
-                "matrix": matrix,
-                "distortion": lens,
-                "matrix_std": dict(zip(names, found.matrix_std.tolist(), strict=True)),
-                "reprojection_error_px": found.reprojection_error,
-                "errors_px": dict(found.errors),
-                "problems": dict(found.problems),
-                "advice": list(found.advice),
-            }
+        found = measure.calibrate_session(
+            chosen.config, lambda name, k, m: watch.step(f"read {name}", k, m)
         )
-        return
-    page = console(chosen.quiet)
-    say(page, f"{summary(found)}. For the configuration:")
-    say(page, f"    camera:\n      matrix: {[[round(x, 3) for x in row] for row in matrix]}")
-    say(page, f"      distortion: {[round(x, 6) for x in lens]}")
+    page, names = Page(chosen), ("fx", "fy", "cx", "cy")
+    matrix, lens = found.camera.matrix.tolist(), found.camera.distortion.tolist()
+    page.data(
+        {
+            "matrix": matrix,
+            "distortion": lens,
+            "matrix_std": dict(zip(names, found.matrix_std.tolist(), strict=True)),
+            "reprojection_error_px": found.reprojection_error,
+            "errors_px": dict(found.errors),
+            "problems": dict(found.problems),
+            "advice": list(found.advice),
+        }
+    )
+    page.say(f"{measure.summary(found)}. For the configuration:")
+    page.say(f"    camera:\n      matrix: {[[round(x, 3) for x in row] for row in matrix]}")
+    page.say(f"      distortion: {[round(x, 6) for x in lens]}")
     worst = sorted(found.errors, key=lambda name: -found.errors[name])[:3]
     told = ", ".join(f"{name} {found.errors[name]:.2f} px" for name in worst)
-    say(page, f"largest errors: {told}")
+    page.say(f"largest errors: {told}")
     for text in (*found.problems.values(), *found.advice):
-        say(page, text, WARNING)
+        page.warn(text)

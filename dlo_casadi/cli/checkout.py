@@ -11,41 +11,34 @@ import dlo_casadi
 from dlo_casadi.cli.options import command, option
 from dlo_casadi.errors import DloError
 
-OPTION = option("option", nargs="*", help="passed on to the script")
-CODES = "others are the script's own"
-
-
-@command(
-    """\
-Compare with the paper of Quartaro et al.; runs scripts/reproduce_paper.py of a checkout.
-
-dlo reproduce
-dlo reproduce -- --help                         options of the script, which follow --""",
-    OPTION,
-    codes=CODES,
+_script = command(
+    option("option", nargs="*", help="passed on to the script"),
+    codes="others are the script's own",
     json=None,
 )
+
+
+@_script
 def reproduce(chosen: argparse.Namespace) -> int:
-    """Run `dlo reproduce [-- OPTION ...]`."""
-    return _run_script("reproduce_paper.py", chosen)
+    """Compare with the paper of Quartaro et al.; runs scripts/reproduce_paper.py of a checkout.
+
+    dlo reproduce
+    dlo reproduce -- --help                         options of the script, which follow --
+    """
+    return _run("reproduce_paper.py", chosen)
 
 
-@command(
-    """\
-Time the C solver beside other solvers: runs scripts/benchmark.py of the checkout.
-
-dlo benchmark
-dlo benchmark -- --help                         options of the script, which follow --""",
-    OPTION,
-    codes=CODES,
-    json=None,
-)
+@_script
 def benchmark(chosen: argparse.Namespace) -> int:
-    """Run `dlo benchmark [-- OPTION ...]`."""
-    return _run_script("benchmark.py", chosen)
+    """Time the C solver beside other solvers: runs scripts/benchmark.py of the checkout.
+
+    dlo benchmark
+    dlo benchmark -- --help                         options of the script, which follow --
+    """
+    return _run("benchmark.py", chosen)
 
 
-def _run_script(name: str, chosen: argparse.Namespace) -> int:
+def _run(name: str, chosen: argparse.Namespace) -> int:
     path = Path(dlo_casadi.__file__).parents[1] / "scripts" / name
     if not path.is_file():
         raise DloError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -10,19 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK
-from dlo_casadi.cli.options import (
-    CONFIG,
-    NO_DIAGNOSIS,
-    SCHEDULER,
-    command,
-    configuration,
-    console,
-    jobs,
-    option,
-    print_json,
-    say,
-    session_jobs,
-)
+from dlo_casadi.cli.options import CONFIG, SCHEDULER, Page, command, jobs, option
 from dlo_casadi.config import Config
 from dlo_casadi.errors import counted
 from dlo_casadi.io.files import make_folder
@@ -33,15 +22,22 @@ from dlo_casadi.runtime.parallel import begin, open_executor
 DIAGNOSIS = ("config", "verdict", "effects", "candidates", "unexplained", "next_pose", "warnings")
 
 
-@command(
-    """\
-Fit a cable to its photographs or centre-lines and report what was found.
+def session_jobs() -> int:
+    """Processes of a single session by default: two where there are two processors.
 
-dlo fit configs/cable.yaml                       writes results/cable/
-dlo fit rope.yaml --output results/monday        to a folder of your choice
-dlo fit rope.yaml --no-diagnosis                 only the declared model: much faster
-dlo fit rope.yaml --jobs 1                       in one process: slower, and lighter
-dlo fit rope.yaml --quiet --json > rope.json     report.json to a program""",
+    A third saves little. One where other processes cannot be started.
+    """
+    if multiprocessing.current_process().daemon:
+        return 1
+    return min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
+
+
+NO_DIAGNOSIS = option(
+    "--no-diagnosis", action="store_true", help="do not search for missing effects"
+)
+
+
+@command(
     CONFIG,
     option(
         "--output",
@@ -55,43 +51,47 @@ dlo fit rope.yaml --quiet --json > rope.json     report.json to a program""",
     json="print report.json instead of tables",
 )
 def fit(chosen: argparse.Namespace) -> None:
-    """Run `dlo fit CONFIG [...]`."""
-    config = configuration(chosen.config)
+    """Fit a cable to its photographs or centre-lines and report what was found.
+
+    dlo fit configs/cable.yaml                       writes results/cable/
+    dlo fit rope.yaml --output results/monday        to a folder of your choice
+    dlo fit rope.yaml --no-diagnosis                 only the declared model: much faster
+    dlo fit rope.yaml --jobs 1                       in one process: slower, and lighter
+    dlo fit rope.yaml --quiet --json > rope.json     report.json to a program
+    """
+    chosen.output = chosen.output or Path("results") / chosen.config.name
     if chosen.no_diagnosis:
-        config = _with_diagnosis(config, False)
-    _fit_and_show(chosen, config, chosen.output or Path("results") / config.name)
+        chosen.config = _with_diagnosis(chosen.config, False)
+    _fit_and_show(chosen)
 
 
 @command(
-    """\
-Fit a cable and search for what the declared model lacks, whether or not the
-configuration asks for it; print every effect that was tried, ranked.
-
-dlo diagnose configs/cable.yaml                  prints; writes nothing
-dlo diagnose rope.yaml --output results/rope     writes the results of a fit, too
-dlo diagnose rope.yaml --quiet --json            effects, candidates, verdict and next pose""",
     CONFIG,
     option("--output", type=Path, metavar="DIR", help="write the results there"),
     jobs(session_jobs()),
 )
 def diagnose(chosen: argparse.Namespace) -> None:
-    """Run `dlo diagnose CONFIG [...]`."""
-    config = _with_diagnosis(configuration(chosen.config), True)
-    _fit_and_show(chosen, config, chosen.output, DIAGNOSIS)
+    """Fit a cable and search for what the declared model lacks, whether or not the
+    configuration asks for it; print every effect that was tried, ranked.
+
+    dlo diagnose configs/cable.yaml                  prints; writes nothing
+    dlo diagnose rope.yaml --output results/rope     writes the results of a fit, too
+    dlo diagnose rope.yaml --quiet --json            effects, candidates, verdict and next pose
+    """
+    chosen.config = _with_diagnosis(chosen.config, True)
+    _fit_and_show(chosen, DIAGNOSIS)
 
 
 def _with_diagnosis(config: Config, enabled: bool) -> Config:
     return replace(config, diagnosis=config.diagnosis.model_copy(update={"enabled": enabled}))
 
 
-def _fit_and_show(
-    chosen: argparse.Namespace, config: Config, output: Path | None, keys: Sequence[str] = ()
-) -> None:
-    """Fit a session here and in `--jobs` - 1 processes; write to `output`, if given; print.
+def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:
+    """Fit a session here and in `--jobs` - 1 processes; write to the output, if given; print.
 
-    Of `keys`, if given, `--json` prints these of report.json alone, and text lists all effects that
-    were tried.
+    With `keys`, `--json` prints these of report.json alone, and text lists all that was tried.
     """
+    config, output = chosen.config, chosen.output
     libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
     with open_executor(chosen.jobs, here=True, libraries=libraries) as executor:
         begin(executor, os.getpid)
@@ -110,28 +110,16 @@ def _fit_and_show(
                 watch.step("write the results", 0, 1)
                 folder.write(outcome, executor)
                 watch.step("write the results", 1, 1)
-    if chosen.json:
-        report = report_dict(outcome)
-        print_json({key: report[key] for key in keys or report})
-        return
-    page = console(chosen.quiet)
+    page, report = Page(chosen), report_dict(outcome)
+    page.data({key: report[key] for key in keys or report})
     print_summary(page, outcome)
     if keys:
         page.print(candidate_table(outcome))
     if output is not None:
-        say(page, f"Results: {output}")
+        page.say(f"Results: {output}")
 
 
 @command(
-    """\
-Fit many sessions: a table (table.parquet) with one row each, a page (index.html) that
-shows the odd ones first, and the results of each. The same command goes on after an
-interruption; what is finished and unchanged is not repeated.
-
-dlo fit-many cables/                                  all configurations in it and below
-dlo fit-many 'cables/*/session.yaml' --jobs 8         on eight cores
-dlo fit-many cables/ --scheduler tcp://10.0.0.5:8786  on a Dask cluster
-dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast""",
     option("where", metavar="FOLDER", help="folder, or a pattern in quotes"),
     jobs(),
     SCHEDULER,
@@ -145,7 +133,15 @@ dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast""",
     json="print the rows as JSON",
 )
 def fit_many(chosen: argparse.Namespace) -> int:
-    """Run `dlo fit-many FOLDER [...]`."""
+    """Fit many sessions: a table (table.parquet) with one row each, a page (index.html) that
+    shows the odd ones first, and the results of each. The same command goes on after an
+    interruption; what is finished and unchanged is not repeated.
+
+    dlo fit-many cables/                                  all configurations in it and below
+    dlo fit-many 'cables/*/session.yaml' --jobs 8         on eight cores
+    dlo fit-many cables/ --scheduler tcp://10.0.0.5:8786  on a Dask cluster
+    dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast
+    """
     from dlo_casadi.cli.watch import Counter
     from dlo_casadi.fleet.discover import find_sessions
     from dlo_casadi.fleet.overview import judge
@@ -175,22 +171,16 @@ def fit_many(chosen: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         counter.message("What is finished is kept: the same command goes on.")
         raise
-    code = BAD_INPUT if result.failed else OK
-    if chosen.json:
-        print_json(list(result.rows))
-        return code
-    page = console(chosen.quiet)
+    page = Page(chosen)
+    page.data(list(result.rows))
     odd = [item for item in judge(result.rows) if item.reasons]
     for item in odd[:10]:
         heading = str(item.row["message"]).partition("\n")[0]
-        say(
-            page, f"{item.row['session']}: {', '.join(item.reasons)}{': ' * bool(heading)}{heading}"
-        )
+        page.say(": ".join(filter(None, [item.row["session"], ", ".join(item.reasons), heading])))
     if len(odd) > 10:
-        say(page, f"and {len(odd) - 10} more")
-    say(
-        page,
+        page.say(f"and {len(odd) - 10} more")
+    page.say(
         f"{counted(len(result.rows), 'session')}, {len(result.failed)} without results: "
-        f"{output / 'index.html'}, {output / 'table.parquet'}",
+        f"{output / 'index.html'}, {output / 'table.parquet'}"
     )
-    return code
+    return BAD_INPUT if result.failed else OK

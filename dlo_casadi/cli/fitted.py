@@ -6,17 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from dlo_casadi.cli.options import (
-    PARAMETERS,
-    SCHEDULER,
-    command,
-    console,
-    jobs,
-    one_of,
-    option,
-    print_json,
-    say,
-)
+from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, one_of, option
 from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
@@ -47,14 +37,6 @@ HELD = (
 
 
 @command(
-    """\
-Predict the shape of a fitted cable from where its ends are held.
-
-dlo predict results/cable --end 0.3 -0.1
-dlo predict results/cable --end 0.3 -0.1 --figure shape.png
-dlo predict results/cable --start 0.1 0 --end 0.3 -0.1 --branch cw --json
-dlo predict results/wire --end -0.12 0 --start-heading 0 --end-heading -6.2832
-dlo predict results/loom --end 0.6 0.1 0.3 --end-orientation 0 0 0 1 --turns 1""",
     PARAMETERS,
     *(
         option(
@@ -84,7 +66,14 @@ dlo predict results/loom --end 0.6 0.1 0.3 --end-orientation 0 0 0 1 --turns 1""
     codes="2 is also a pose without an equilibrium",
 )
 def predict(chosen: argparse.Namespace) -> None:
-    """Run `dlo predict PARAMETERS --end X Y [Z] [...]`."""
+    """Predict the shape of a fitted cable from where its ends are held.
+
+    dlo predict results/cable --end 0.3 -0.1
+    dlo predict results/cable --end 0.3 -0.1 --figure shape.png
+    dlo predict results/cable --start 0.1 0 --end 0.3 -0.1 --branch cw --json
+    dlo predict results/wire --end -0.12 0 --start-heading 0 --end-heading -6.2832
+    dlo predict results/loom --end 0.6 0.1 0.3 --end-orientation 0 0 0 1 --turns 1
+    """
     from dlo_casadi import api
     from dlo_casadi.report.canvas import save_figure
     from dlo_casadi.report.figures_poses import prediction_figure
@@ -96,9 +85,6 @@ def predict(chosen: argparse.Namespace) -> None:
     shape = api.predict(chosen.parameters, **{name: getattr(chosen, name) for name in HELD})
     if figure is not None:
         save_figure(figure, prediction_figure(shape))
-    if chosen.json:
-        print_json(shape.as_dict())
-        return
     # What a reader of the prediction should know of the file it came from.
     notes = []
     if shape.cable.metadata.edited:
@@ -108,21 +94,14 @@ def predict(chosen: argparse.Namespace) -> None:
             "note: the shapes did not determine the bending stiffness; the shape is more certain "
             "than forces and energy"
         )
-    page = console(chosen.quiet)
+    page = Page(chosen)
+    page.data(shape.as_dict())
     page.print(prediction_table(shape, notes))
     if figure is not None:
-        say(page, f"Figure: {figure}")
+        page.say(f"Figure: {figure}")
 
 
 @command(
-    """\
-Predict the shapes of a fitted cable over a grid or a list of end poses with the
-compiled solver. The same command goes on after an interruption. Poses without a shape
-say why in the column `status`.
-
-dlo shape-table results/cable --grid -0.8 0.8 200 -0.8 0.8 200 --output shapes.parquet
-dlo shape-table results/cable --list ends.csv --output shapes.parquet --jobs 4
-dlo shape-table results/wire --grid -0.2 0 50 0 0.1 50 --end-heading -6.28 --output wire.parquet""",
     PARAMETERS,
     one_of(
         option(
@@ -149,7 +128,14 @@ dlo shape-table results/wire --grid -0.2 0 50 0 0.1 50 --end-heading -6.28 --out
     json="print the counts as JSON",
 )
 def shape_table(chosen: argparse.Namespace) -> None:
-    """Run `dlo shape-table PARAMETERS --grid|--list ... --output FILE [...]`."""
+    """Predict the shapes of a fitted cable over a grid or a list of end poses with the
+    compiled solver. The same command goes on after an interruption. Poses without a shape
+    say why in the column `status`.
+
+    dlo shape-table results/cable --grid -0.8 0.8 200 -0.8 0.8 200 --output shapes.parquet
+    dlo shape-table results/cable --list ends.csv --output shapes.parquet --jobs 4
+    dlo shape-table results/wire --grid -0.2 0 50 0 0.1 50 --end-heading -6.28 --output wire.parquet
+    """
     if chosen.output.suffix.lower() != ".parquet":
         raise DloError(
             f"--output {chosen.output}: the table is a Parquet file.\n"
@@ -181,11 +167,10 @@ def shape_table(chosen: argparse.Namespace) -> None:
             restart=chosen.restart,
             progress=counter.show,
         )
-    if chosen.json:
-        print_json({"output": str(output), "solver_hash": plan.digest, "poses": counts})
-    else:
-        said = ", ".join(f"{n} {status.replace('_', ' ')}" for status, n in counts.items())
-        say(console(chosen.quiet), f"{output}: {said or 'complete already'}")
+    page = Page(chosen)
+    page.data({"output": str(output), "solver_hash": plan.digest, "poses": counts})
+    said = ", ".join(f"{n} {status.replace('_', ' ')}" for status, n in counts.items())
+    page.say(f"{output}: {said or 'complete already'}")
 
 
 def _ends(
@@ -228,12 +213,6 @@ def _grid(
 
 
 @command(
-    """\
-Write the C solver of a fitted cable for planners to embed: <prefix>_solver.h,
-<prefix>_solver.c, <prefix>_solver.hpp for C++, CMakeLists.txt, <prefix>_solver.pc.in and example.c.
-
-dlo generate-solver results/cable/parameters.yaml --output solver
-dlo generate-solver results/cable --output solver --prefix rope --elements 40""",
     PARAMETERS,
     option("--output", type=Path, required=True, help="folder for the C files"),
     option("--prefix", default="dlo", help="begins all public names (dlo)"),
@@ -241,14 +220,20 @@ dlo generate-solver results/cable --output solver --prefix rope --elements 40"""
     json="print files and hash as JSON",
 )
 def generate_solver(chosen: argparse.Namespace) -> None:
-    """Run `dlo generate-solver PARAMETERS --output DIR [...]`."""
+    """Write the C solver of a fitted cable for planners to embed: <prefix>_solver.h,
+    <prefix>_solver.c, <prefix>_solver.hpp for C++, CMakeLists.txt, <prefix>_solver.pc.in and
+    example.c.
+
+    dlo generate-solver results/cable/parameters.yaml --output solver
+    dlo generate-solver results/cable --output solver --prefix rope --elements 40
+    """
     model, p, rest, _ = with_mesh(load_parameters(chosen.parameters), chosen)
     solver = generate(model, p, rest, chosen.prefix)
     written = solver.write(chosen.output)
-    if chosen.json:
-        print_json({"files": [str(path) for path in written], "solver_hash": solver.hash})
-    elif not chosen.quiet:
-        print(*written, f"model hash {solver.hash}", sep="\n")
+    page = Page(chosen)
+    page.data({"files": [str(path) for path in written], "solver_hash": solver.hash})
+    for text in (*written, f"model hash {solver.hash}"):
+        page.say(text)
 
 
 def with_mesh(cable: FittedCable, chosen: argparse.Namespace) -> FittedCable:

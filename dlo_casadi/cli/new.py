@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from dlo_casadi.cli.options import command, one_of, option, print_json
+from dlo_casadi.cli.options import Page, command, one_of, option
 from dlo_casadi.config.template import schema_text, template
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
@@ -18,14 +18,6 @@ _PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 @command(
-    """\
-Write a commented configuration to start from: one pose for each file that is found,
-and FILL_IN wherever only you know the value. Nothing is asked, nothing replaced.
-
-dlo new rope.yaml
-dlo new rope.yaml --photographs photographs/
-dlo new rope.yaml --centerlines measured/
-dlo new loom.yaml --space --centerlines markers/""",
     option("file", type=Path, help="the configuration to write, such as rope.yaml"),
     one_of(
         option("--photographs", type=Path, metavar="DIR", help="folder of photographs"),
@@ -35,7 +27,14 @@ dlo new loom.yaml --space --centerlines markers/""",
     json="print what was written as JSON",
 )
 def new(chosen: argparse.Namespace) -> None:
-    """Run `dlo new FILE [--space] [--photographs DIR | --centerlines DIR]`."""
+    """Write a commented configuration to start from: one pose for each file that is found,
+    and FILL_IN wherever only you know the value. Nothing is asked, nothing replaced.
+
+    dlo new rope.yaml
+    dlo new rope.yaml --photographs photographs/
+    dlo new rope.yaml --centerlines measured/
+    dlo new loom.yaml --space --centerlines markers/
+    """
     target: Path = chosen.file
     if target.suffix not in (".yaml", ".yml"):
         raise DloError(f"{target}: the name of a configuration ends in .yaml")
@@ -61,12 +60,11 @@ def new(chosen: argparse.Namespace) -> None:
         write_file(schema, schema_text())
         written.append(schema)
     write_file(target, text)
-    if chosen.json:
-        print_json({"files": [str(path) for path in written], "poses": len(files)})
-    elif not chosen.quiet:
-        left = text.count("FILL_IN") - 1  # one is in a comment
-        places = f"{counted(left, 'place')} to fill in, each marked FILL_IN"
-        print(f"{target}: {counted(len(files), 'pose')}, {places}\nthen: dlo check {target}")
+    page = Page(chosen)
+    page.data({"files": [str(path) for path in written], "poses": len(files)})
+    left = text.count("FILL_IN") - 1  # one is in a comment
+    places = f"{counted(left, 'place')} to fill in, each marked FILL_IN"
+    page.say(f"{target}: {counted(len(files), 'pose')}, {places}\nthen: dlo check {target}")
 
 
 def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list[str]:
@@ -87,14 +85,13 @@ def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list
 
 
 @command(
-    """\
-Print the JSON schema of a configuration, for editors.
-
-dlo schema > schema.json
-    then `# yaml-language-server: $schema=schema.json` as the first line of a configuration
-    gives completion, help and checks in editors with the YAML language server""",
     json=None,
 )
 def schema(chosen: argparse.Namespace) -> None:
-    """Run `dlo schema`."""
+    """Print the JSON schema of a configuration, for editors.
+
+    dlo schema > schema.json
+        then `# yaml-language-server: $schema=schema.json` as the first line of a configuration
+        gives completion, help and checks in editors with the YAML language server
+    """
     print(schema_text(), end="")

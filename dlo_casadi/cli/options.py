@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import re
 import sys
 from collections.abc import Callable, Sequence
 from decimal import Decimal
 from functools import wraps
+from inspect import getdoc
 from pathlib import Path
 from textwrap import indent
 from typing import Any
@@ -22,8 +22,6 @@ from dlo_casadi.cli.guard import OK
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
 
-# Begins the line of a warning, see `say`.
-WARNING = "[bold yellow]warning:[/] "
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
 # Adds itself to a parser or a group.
@@ -58,36 +56,21 @@ def _positive(text: str) -> int:
     return int(text)
 
 
-def session_jobs() -> int:
-    """Processes of a single session by default: two where there are two processors.
-
-    A third saves little. One where other processes cannot be started.
-    """
-    if multiprocessing.current_process().daemon:
-        return 1
-    return min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
-
-
 CONFIG = option("config", type=Path, help="configuration, such as configs/cable.yaml")
 PARAMETERS = option("parameters", type=Path, help="parameters.yaml of a fit, or its folder")
 SCHEDULER = option("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead")
-NO_DIAGNOSIS = option(
-    "--no-diagnosis", action="store_true", help="do not search for missing effects"
-)
 
 
 def command(
-    text: str,
-    *options: Option,
-    codes: str = "",
-    json: str | None = "print JSON instead of tables",
+    *options: Option, codes: str = "", json: str | None = "print JSON instead of tables"
 ) -> Callable[[Callable[[argparse.Namespace], int | None]], Callable[[Sequence[str]], int]]:
-    """Make a subcommand of the function of the same name: of its arguments, with its exit code.
+    """Make a subcommand of the function of the same name: from arguments to exit code.
+
+    Its docstring tells what it does, and after an empty line examples, one command a line. Where
+    it takes a `CONFIG` the function finds it loaded.
 
     Parameters
     ----------
-    text : str
-        What it does; after an empty line examples, one command a line.
     options : Option
         In the order in which the help lists them.
     codes : str
@@ -95,7 +78,6 @@ def command(
     json : str or None
         Help of `--json`, which comes with `--quiet`; without both if None.
     """
-    description, _, examples = text.partition("\n\n")
     if json is not None:
         quiet = option("--quiet", action="store_true", help="print nothing but errors")
         options = (*options, quiet, option("--json", action="store_true", help=json))
@@ -103,16 +85,22 @@ def command(
     def decorate(work: Callable[[argparse.Namespace], int | None]) -> Callable[..., int]:
         @wraps(work)
         def run(argv: Sequence[str]) -> int:
+            description, _, examples = str(getdoc(work)).partition("\n\n")
+            epilog = (
+                f"examples:\n{indent(examples, '  ')}\n\n{EXIT_CODES}{'; ' * bool(codes)}{codes}"
+            )
             parser = argparse.ArgumentParser(
                 prog=f"dlo {work.__name__.replace('_', '-')}",
                 description=description,
-                epilog=f"examples:\n{indent(examples, '  ')}\n\n{EXIT_CODES}"
-                f"{'; ' * bool(codes)}{codes}",
+                epilog=epilog,
                 formatter_class=argparse.RawDescriptionHelpFormatter,
             )
             for item in options:
                 item(parser)
-            return work(parser.parse_args(plain_numbers(argv))) or OK
+            chosen = parser.parse_args(plain_numbers(argv))
+            if "config" in chosen:
+                chosen.config = configuration(chosen.config)
+            return work(chosen) or OK
 
         return run
 
@@ -135,17 +123,24 @@ def configuration(path: Path) -> Config:
     return load_config(path)
 
 
-def console(quiet: bool = False) -> Console:
-    """Where results go; a file or a pipe has room for a whole table."""
-    width = None if sys.stdout.isatty() else 120
-    return Console(quiet=quiet, highlight=False, width=width)
+class Page(Console):
+    """Where results go: with `--json` as JSON alone, else as text, unless it is `--quiet`."""
 
+    def __init__(self, chosen: argparse.Namespace) -> None:
+        width = None if sys.stdout.isatty() else 120  # a file or a pipe has room for a whole table
+        quiet = chosen.quiet or chosen.json
+        super().__init__(quiet=quiet, highlight=False, emoji=False, width=width)
+        self.as_json: bool = chosen.json
 
-def say(page: Console, text: str, mark: str = "") -> None:
-    """Print a line as it is, however long, after a mark with markup."""
-    page.print(f"{mark}{escape(text)}", soft_wrap=True)
+    def data(self, data: Any) -> None:
+        """Print plain data as JSON, if it is asked for."""
+        if self.as_json:
+            print(json.dumps(data, indent=1, allow_nan=False))
 
+    def say(self, text: object, mark: str = "") -> None:
+        """Print a line as it is, however long, after a mark with markup."""
+        self.print(f"{mark}{escape(str(text))}", soft_wrap=True)
 
-def print_json(data: Any) -> None:
-    """Print plain data as JSON, and nothing else."""
-    print(json.dumps(data, indent=1, allow_nan=False))
+    def warn(self, text: str) -> None:
+        """Print a warning."""
+        self.say(text, "[bold yellow]warning:[/] ")

@@ -38,8 +38,9 @@ class Shown:
     quiet: bool = False
     bars: Progress | None = field(default=None, init=False)
     spoken: float = field(default=0.0, init=False)
+    _tasks: dict[str, TaskID] = field(default_factory=dict, init=False)
 
-    def columns(self) -> Sequence[ProgressColumn]:
+    def columns(self) -> Sequence[ProgressColumn | str]:
         """Columns of a bar on a terminal."""
         raise NotImplementedError
 
@@ -59,6 +60,20 @@ class Shown:
         if not self.quiet:
             self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
+    def update(
+        self, part: str, done: int, total: int | None, line: str, description: str, detail: str = ""
+    ) -> None:
+        """Move the bar of a part, or print a line at its end and now and then before."""
+        if self.bars is not None:
+            if part not in self._tasks:
+                self._tasks[part] = self.bars.add_task(part, detail="")
+            bar = self._tasks[part]
+            self.bars.update(bar, completed=done, total=total, description=description)
+            self.bars.update(bar, detail=detail)
+        elif done == total or (done and time.perf_counter() - self.spoken > PATIENCE):
+            self.message(line)
+            self.spoken = time.perf_counter()
+
 
 @dataclass
 class Watch(Shown):
@@ -68,20 +83,14 @@ class Watch(Shown):
     one piece has none.
     """
 
-    _tasks: dict[str, TaskID] = field(default_factory=dict)
     _begun: dict[str, float] = field(default_factory=dict)
 
-    def columns(self) -> Sequence[ProgressColumn]:
+    def columns(self) -> Sequence[ProgressColumn | str]:
         """Name, bar and times of a part."""
-        return (
-            SpinnerColumn(finished_text="+"),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.fields[detail]}", markup=False),
-            TimeElapsedColumn(),
-            TextColumn("left, at most:"),
-            TimeRemainingColumn(),
-        )
+        detail = TextColumn("{task.fields[detail]}", markup=False)
+        left = "left, at most:", TimeRemainingColumn()
+        ended = SpinnerColumn(finished_text="+")
+        return ended, "{task.description}", BarColumn(24), detail, TimeElapsedColumn(), *left
 
     def step(self, name: str, done: int, total: int) -> None:
         """`done` of `total` parts of the named work are finished."""
@@ -90,19 +99,11 @@ class Watch(Shown):
         now = time.perf_counter()
         begun = self._begun.setdefault(name, now)
         self.spoken = max(self.spoken, begun)
-        if self.quiet:
-            return
-        if self.bars is not None:
-            if name not in self._tasks:
-                self._tasks[name] = self.bars.add_task(name, total=total, detail="")
-            self.bars.update(self._tasks[name], completed=done, total=total, detail=detail)
-        elif done >= total:
-            self.message(f"{name}: {now - begun:.1f} s")
-            self.spoken = now
-        elif done and now - self.spoken > PATIENCE:
-            left = (now - begun) * (total - done) / done
-            self.message(f"{name}: {done} of {total}, at most {left:.0f} s left")
-            self.spoken = now
+        line = f"{name}: {now - begun:.1f} s"
+        if done < total:
+            left = (now - begun) * (total - done) / max(done, 1)
+            line = f"{name}: {done} of {total}, at most {left:.0f} s left"
+        self.update(name, done, total, line, name, detail)
 
     def warn(self, warnings: Sequence[str]) -> None:
         """What a run that may take long should have been told before; its report repeats it."""
@@ -128,22 +129,16 @@ class Counter(Shown):
     size: int = 1
     count: int | None = None
 
-    def columns(self) -> Sequence[ProgressColumn]:
+    def columns(self) -> Sequence[ProgressColumn | str]:
         """A bar, its text and its time."""
-        return BarColumn(bar_width=30), TextColumn("{task.description}"), TimeElapsedColumn()
+        return BarColumn(30), "{task.description}", TimeElapsedColumn()
 
     def show(self, tally: Tally) -> None:
         """Show how far the tasks have come."""
         signals.check()
-        if self.quiet:
-            return
-        now, text = time.perf_counter(), self._text(tally)
-        if self.bars is not None:
-            task = self.bars.task_ids[0] if self.bars.task_ids else self.bars.add_task(self.noun)
-            self.bars.update(task, completed=tally.done, total=tally.total, description=text)
-        elif tally.done == tally.total or now - self.spoken > PATIENCE:
-            self.message(f"{text}; {duration(tally.elapsed)} so far")
-            self.spoken = now
+        text = self._text(tally)
+        line = f"{text}; {duration(tally.elapsed)} so far"
+        self.update(self.noun, tally.done, tally.total, line, text)
 
     def _text(self, tally: Tally) -> str:
         done, total = self.size * tally.done, self.size * (tally.total or tally.done)

@@ -23,6 +23,7 @@ Row = dict[str, Any]
 
 STAGES = get_args(StageName)
 TIMES = (*TIMED, "total")
+_INTERVAL = ("_low_95", "_high_95")
 # What a stage tells beside its parameters.
 _ERRORS = {"rmse_fit": "m", "rmse_held_out": "m", "chi2_per_dof": ""}
 
@@ -31,10 +32,7 @@ _ERRORS = {"rmse_fit": "m", "rmse_held_out": "m", "chi2_per_dof": ""}
 COLUMNS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("session", "status", "message", "cable", "verdict"), ("text", "")),
     "effects": ("effects", ""),
-    "bending_stiffness": ("number", "N m^2"),
-    "bending_stiffness_std": ("number", "N m^2"),
-    "bending_stiffness_low_95": ("number", "N m^2"),
-    "bending_stiffness_high_95": ("number", "N m^2"),
+    **{f"bending_stiffness{part}": ("number", "N m^2") for part in ("", "_std", *_INTERVAL)},
     "identifiable": ("truth", ""),
     "torsional_stiffness": ("number", "N m^2"),
     "torsional_stiffness_std": ("number", "N m^2"),
@@ -76,7 +74,7 @@ def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: f
     """Row of a session with results, from its report ("dlo-report/1")."""
     found = report["stages"][-1]["parameters"]
     stiffness, torsion = found["bending_stiffness"], found.get("torsional_stiffness", {})
-    low, high = stiffness["interval_95"] or (None, None)
+    interval = stiffness["interval_95"] or (None, None)
     # In a plane, or in space about the material axis y, and then about z.
     rest = found["rest_curvature"]
     about = {"": rest} if "value" in rest else {"": rest["k_y"], "_z": rest["k_z"]}
@@ -94,8 +92,7 @@ def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: f
         ],
         "bending_stiffness": stiffness["value"],
         "bending_stiffness_std": stiffness["std"],
-        "bending_stiffness_low_95": low,
-        "bending_stiffness_high_95": high,
+        **{f"bending_stiffness{end}": x for end, x in zip(_INTERVAL, interval, strict=True)},
         "identifiable": stiffness["identifiable"],
         "torsional_stiffness": torsion.get("value"),
         "torsional_stiffness_std": torsion.get("std"),

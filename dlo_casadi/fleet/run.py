@@ -155,21 +155,11 @@ def fit_fleet(
 
 @dataclass(frozen=True)
 class Job:
-    """One session to fit, with all that a worker must know.
-
-    Parameters
-    ----------
-    session : Session
-    digest : str
-        Of what decides the results.
-    output : Path
-        Folder of all results, absolute.
-    options : Options
-    """
+    """One session to fit, with all that a worker must know."""
 
     session: Session
-    digest: str
-    output: Path
+    digest: str  # of what decides the results
+    output: Path  # folder of all results, absolute
     options: Options
 
     @property

@@ -20,6 +20,7 @@ from dlo_casadi.codegen.compiled import Branch, CompiledSolver
 from dlo_casadi.codegen.generate import solver_hash
 from dlo_casadi.codegen.shapes import STATUSES, records_of
 from dlo_casadi.errors import DloError, counted
+from dlo_casadi.fleet import parquet_library
 from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
 from dlo_casadi.io.files import only_run, write_file
 from dlo_casadi.model.cable_model import CableModel
@@ -124,6 +125,7 @@ def shape_table(
     DloError
         If the file or the parts belong to something else, or cannot be written.
     """
+    _, pq = parquet_library()
     identity = json.dumps(
         {
             "schema": SCHEMA,
@@ -154,7 +156,23 @@ def shape_table(
                 f"{plan.parts} holds parts of another table: other poses, another model or "
                 "version.\n  Try: another --output, or --restart to throw them away."
             )
-        fill = partial(_fill, plan, poses, executor, schema, progress, counts)
+
+        def fill(stream: BinaryIO) -> None:
+            with pq.ParquetWriter(
+                stream,
+                schema,
+                use_dictionary=["status"],
+                # Without it the digits of neighbouring points would not compress.
+                use_byte_stream_split=["points.list.element"],
+                compression="zstd",
+                compression_level=1,
+            ) as writer:
+                for path in _parts_in_order(plan, poses, executor, progress):
+                    part = _read_part(path, schema)
+                    codes = part["status"].chunk(0).indices
+                    counts[:] += np.bincount(codes, minlength=len(STATUSES))
+                    writer.write_table(part)
+
         write_file(output, fill, plan.parts / "draft.parquet")
         shutil.rmtree(plan.parts, ignore_errors=True)
     return {name: int(n) for name, n in zip(STATUSES, counts, strict=True) if n}
@@ -162,9 +180,7 @@ def shape_table(
 
 def _identity_of(path: Path) -> str | None:
     """Identity of a table; None of anything else."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+    pa, pq = parquet_library()
     try:
         found = (pq.read_schema(path).metadata or {}).get(b"identity")
     except (OSError, pa.ArrowInvalid):
@@ -172,54 +188,24 @@ def _identity_of(path: Path) -> str | None:
     return None if found is None else found.decode()
 
 
-def _fill(
+def _parts_in_order(
     plan: Plan,
     poses: Grid | PoseList,
     executor: Executor,
-    schema: pyarrow.Schema,
     progress: Callable[[Tally], None] | None,
-    counts: NDArray[np.int_],
-    stream: BinaryIO,
-) -> None:
-    """Compute what is missing; append each chunk to the table as soon as those before are in.
-
-    The poses are counted by status into `counts`.
-    """
-    import pyarrow.parquet as pq
-
+) -> Iterator[Path]:
+    """Compute what is missing; yield each finished chunk as soon as those before it are there."""
     total = -(-poses.count // plan.chunk)
     there = {k for k in range(total) if plan.part(k).exists()}
-    written = 0
-
-    def missing() -> Iterator[Chunk]:
-        for index, chunk in enumerate(poses.chunks(plan.chunk)):
-            if index not in there:
-                yield Chunk(index, chunk)
-
-    with pq.ParquetWriter(
-        stream,
-        schema,
-        use_dictionary=["status"],
-        # Without it the digits of neighbouring points would not compress.
-        use_byte_stream_split=["points.list.element"],
-        compression="zstd",
-        compression_level=1,
-    ) as writer:
-
-        def append() -> None:
-            nonlocal written
-            while written in there:
-                part = _read_part(plan.part(written), schema)
-                counts[:] += np.bincount(part["status"].chunk(0).indices, minlength=len(STATUSES))
-                writer.write_table(part)
-                written += 1
-
-        append()
-        left, solve = total - len(there), partial(solve_chunk, plan)
-        for done in map_as_completed(executor, solve, missing(), total=left, progress=progress):
+    chunks = (Chunk(k, chunk) for k, chunk in enumerate(poses.chunks(plan.chunk)) if k not in there)
+    left, solve = total - len(there), partial(solve_chunk, plan)
+    tasks = map_as_completed(executor, solve, chunks, total=left, progress=progress)
+    for index in range(total):
+        while index not in there:
+            done = next(tasks)
             _ = done.value  # a chunk that fails ends the run; finished ones are kept
             there.add(done.item.index)
-            append()
+        yield plan.part(index)
 
 
 def _read_part(path: Path, schema: pyarrow.Schema) -> pyarrow.Table:

@@ -136,7 +136,7 @@ class Cluster(Executor):
         except ImportError:
             message = "--scheduler needs Dask.\n  Try: pip install 'dlo-casadi[dask]'"
             raise DloError(message) from None
-        self.losses, self.logs = (distributed.KilledWorker,), logs
+        self.losses, self.logs = distributed.KilledWorker, logs
         try:
             self._client = distributed.Client(
                 address, timeout=PATIENCE, set_as_default=False, name="dlo-casadi"

@@ -139,6 +139,7 @@ def map_as_completed(
     if total is None and isinstance(items, Sized):
         total = len(items)
     here, logs = getattr(executor, "here", False), getattr(executor, "logs", None)
+    losses = getattr(executor, "losses", BrokenExecutor)
     waiting = iter(enumerate(items))
     again: list[tuple[int, Item, int]] = []
     suspects: list[tuple[int, Item, int]] = []
@@ -154,9 +155,8 @@ def map_as_completed(
             most = min(most, (workers - 1) * max(1, left // (2 * workers))) if left > 1 else 0
         return max(0, most - len(under_way))
 
-    def submit(index: int, item: Item, losses: int = 0) -> None:
-        """Hand out a task, and say how often it was lost before."""
-        under_way[executor.submit(_run, function, index, item, logs)] = index, item, losses
+    def submit(index: int, item: Item, lost: int = 0) -> None:
+        under_way[executor.submit(_run, function, index, item, logs)] = index, item, lost
 
     def ended(item: Item, task: Finished[Any, Result]) -> Finished[Item, Result]:
         nonlocal failed
@@ -194,7 +194,7 @@ def map_as_completed(
                 error = future.exception()
                 if error is None:
                     task = future.result()
-                elif not isinstance(error, _losses(executor)):
+                elif not isinstance(error, losses):
                     task = Finished(index, None, None, error, 0.0, "")
                 elif here:
                     task = _run(function, index, item, None)
@@ -243,7 +243,7 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
     def result() -> Result:
         try:
             return (task(None) if begun is None else begun.result()).value
-        except _losses(executor):
+        except getattr(executor, "losses", BrokenExecutor):
             return task(None).value
 
     return result
@@ -279,12 +279,6 @@ def _run(
         if failure is None:
             log.info("task %d done in %.3f s", index, seconds)
         return Finished(index, None, result, failure, seconds, worker_name())
-
-
-def _losses(executor: Executor) -> tuple[type[BaseException], ...]:
-    """How a lost worker shows."""
-    losses: tuple[type[BaseException], ...] = getattr(executor, "losses", (BrokenExecutor,))
-    return losses
 
 
 def _remaining(
