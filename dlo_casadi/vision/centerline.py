@@ -77,7 +77,6 @@ def trace_cable(
     direction = local_directions(raw, common, usual, diameter) if varied else common
     guess = EdgeShape(diameter, 0.8 / view.scale)
     for _ in range(2):
-        raw = sample_profiles(bright, view, curve, t, diameter)
         smooth = raw.average(raw.inside, _RAW * diameter)
         shape = edge_shape(smooth, direction, usual, guess)
         rough = find_edges(smooth, direction, shape)
@@ -91,7 +90,7 @@ def trace_cable(
         points = curve(t) + rough.offset[:, None] * normals(curve(t, 1))
         curve = fit_curve(t, points, sound.astype(float), 2 * diameter, 0.5 * diameter)
         usual = sound
-    raw = sample_profiles(bright, view, curve, t, diameter)
+        raw = sample_profiles(bright, view, curve, t, diameter)
     # In a plane light shifts all photographs alike, harmonics that `edge_bias` takes up better: EI
     # of the rendered `connector` is 0.2 % off then, 2 % with what is left of them here.
     rough = find_edges(raw.average(raw.inside, _RAW * diameter), direction, shape, varied)

@@ -1,7 +1,8 @@
-"""Pictures of a cable drawn with numpy alone, sharp to a small part of a pixel."""
+"""Pictures of a cable drawn with numpy, sharp to a small part of a pixel."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.spatial import cKDTree
@@ -32,9 +33,18 @@ def distance(points, shape, farthest):
     s = np.concatenate([[0], np.cumsum(steps)])
     fine = np.linspace(0, s[-1], int(10 * s[-1]))
     dense = np.column_stack([np.interp(fine, s, line[:, i]) for i in (0, 1)])
-    v, u = np.mgrid[: shape[0], : shape[1]]
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    return cKDTree(dense).query(pixels, distance_upper_bound=farthest)[0].reshape(shape)
+    away = np.full(shape, np.inf)
+    v, u = near(line, shape, farthest)
+    away[v, u] = cKDTree(dense).query(np.column_stack([u, v]), distance_upper_bound=farthest)[0]
+    return away
+
+
+def near(line, shape, farthest):
+    """Rows and columns of all pixels, and of some more, nearer than `farthest` to a line (K, 2)."""
+    band = np.zeros(shape, np.uint8)
+    wide = int(np.ceil(2 * farthest)) + 5
+    cv2.polylines(band, [np.round(line).astype(np.int32)], False, 1, wide)
+    return np.nonzero(band)
 
 
 def draw(

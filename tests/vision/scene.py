@@ -1,4 +1,4 @@
-"""A cable in front of a board, drawn from several places with numpy alone."""
+"""A cable in front of a board, drawn from several places with numpy."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+from drawing import near
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
@@ -122,15 +123,15 @@ def photograph(points, where, *, cable=(40, 60, 190), diameter=DIAMETER, blur=0.
     pixels = CAMERA.distort(flat)
     shadow_points = points + points[:, 2:] * np.array([0.35, -0.5, -1.0])
     shadow = shadow_points @ rotation.T + translation
-    grid = np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), 2).reshape(-1, 2)
 
     def cover(line, depth, soft):
         radii = 0.5 * CAMERA.focal * diameter / depth
-        # Pixels beyond are not covered: they are not looked for.
         farthest = float(radii.max()) + 0.5 * soft
-        away, nearest = cKDTree(line).query(grid, distance_upper_bound=farthest)
-        radius = np.append(radii, 0.0)[nearest]
-        return np.clip((0.5 * soft + radius - away) / soft, 0.0, 1.0).reshape(SHAPE)
+        v, u = near(line, SHAPE, farthest)
+        away, nearest = cKDTree(line).query(np.stack([u, v], 1), distance_upper_bound=farthest)
+        radius, covered = np.append(radii, 0.0)[nearest], np.zeros(SHAPE)
+        covered[v, u] = np.clip((0.5 * soft + radius - away) / soft, 0.0, 1.0)
+        return covered
 
     dark = cover(CAMERA.distort(shadow[:, :2] / shadow[:, 2:]), shadow[:, 2], 6.0)
     board = background(where, **of) * (1.0 - 0.25 * dark)
