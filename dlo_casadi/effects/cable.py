@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf, isfinite, pi
 from typing import Self
 
@@ -109,7 +109,3 @@ class Parameter:
     ) -> tuple[Self, ...]:
         """Parameters that vanish at 0, of one scale, and as far to either side as the bound."""
         return tuple(cls(name, unit, scale=scale, lower=-bound, upper=bound) for name in names)
-
-    def with_prior(self, std: float) -> Parameter:
-        """Return the same parameter with a prior of this standard deviation."""
-        return replace(self, prior_std=std)

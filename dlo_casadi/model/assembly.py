@@ -346,30 +346,25 @@ class Assembly:
     def state_after(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, ...]:
         """Rest strains (m, n_rests) that poses leave; their slopes by both nodes, rest and p.
 
-        The slopes are (m, n_rests, 2b), (m, n_rests, strains) by the cell's own rest strains, and
-        (m, n_rests, n_parameters).
+        The slopes are (m, n_cells, strains, 2b), (m, n_cells, strains, strains) by the cell's own
+        rest strains, and (m, n_cells, strains, n_parameters).
         """
-        bends = self.chain.layout.bends
-        after, *slopes = self._call_segments("segment_state", shapes, given)
-        stacked = [self._stacked(part[:, bends]) for part in slopes]
-        return (self._stacked(after[..., 0][:, bends]), *stacked)
+        found = self._call_segments("segment_state", shapes, given)
+        after, *slopes = (part[:, self.chain.layout.bends] for part in found)
+        return (self._stacked(after[..., 0]), *slopes)
 
     def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
         """Whether poses hand on the rest curvature that they find, to first order."""
-        same = np.repeat(np.eye(len(self.node.strains)), self.chain.n_cells, axis=0)
-        return bool(np.all(slopes[2] == same))
+        return bool(np.all(slopes[2] == np.eye(len(self.node.strains))))
 
     def state_along(
         self, slopes: tuple[FloatArray, ...], x: FloatArray, rest: FloatArray, p: FloatArray
     ) -> FloatArray:
         """Change (m, n_rests, q) of what poses leave behind, along nodes, rest and p."""
-        bends, strains = self.chain.layout.bends, len(self.node.strains)
         _, by_x, by_rest, by_p = slopes
-        both = np.concatenate([x[:, bends], x[:, bends + 1]], axis=2)
+        both = self._both(x)[:, self.chain.layout.bends]
         own = np.stack(self.chain.by_strain(rest), axis=2)
-        moved = (by_x[:, :, None] @ np.tile(both, (1, strains, 1, 1)))[:, :, 0]
-        moved += (by_rest[:, :, None] @ np.tile(own, (1, strains, 1, 1)))[:, :, 0]
-        return np.asarray(moved + by_p @ p)
+        return self._stacked(by_x @ both + by_rest @ own + by_p @ p[:, None])
 
 
 @lru_cache(maxsize=MODELS)

@@ -155,7 +155,7 @@ class CableModel:
         if self.cable.torsional_stiffness is not None:
             torsion = _stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness)
             # Known by its ratio to the bending stiffness, see `Unknowns.prior_precision`.
-            listed.append(torsion.with_prior(np.inf))
+            listed.append(replace(torsion, prior_std=np.inf))
             if self.start == self.end == "clamped":
                 std = self.priors.get(END_ROLL, ROLL_STD)
                 listed.append(
@@ -207,7 +207,7 @@ class CableModel:
     @property
     def yields(self) -> bool:
         """Whether the end moves with the force on it while the nodes stay."""
-        return self.extensible or self.chain.kind.n_inner > 0
+        return self.n_inner > 0
 
     @property
     def n_inner(self) -> int:

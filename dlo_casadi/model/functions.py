@@ -33,10 +33,9 @@ class Functions:
         rest, place = self.terms.rest_strains, self.terms.place
         self._segment_arguments = [x, lam, p, rest, place, deviation]
         self._end_arguments = [x, lam, p, self.terms.pose, deviation]
-        # Lagrangians are differentiated by the nodes' increments and the multipliers, their
-        # gradients by the numbers that they depend on.
-        self._by = ca.vertcat(self.terms.delta, lam)
-        self._numbers, self._end_numbers = ca.vertcat(p, rest, deviation), ca.vertcat(p, deviation)
+        # Lagrangians are differentiated by the nodes' increments and the multipliers, those of
+        # segments then by the numbers that they depend on.
+        self._by, self._numbers = ca.vertcat(self.terms.delta, lam), ca.vertcat(p, rest, deviation)
 
     def _here(
         self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
@@ -50,6 +49,12 @@ class Functions:
         found = ca.substitute(outputs, [self.terms.delta], [still])
         found = ca.cse(found) if often else found
         return ca.Function(name, arguments, [ca.densify(one) for one in found])
+
+    def _of_segment(self, name: str, *outputs: ca.SX, often: bool = True) -> ca.Function:
+        return self._here(name, self._segment_arguments, list(outputs), often=often)
+
+    def _of_ends(self, name: str, *outputs: ca.SX) -> ca.Function:
+        return self._here(name, self._end_arguments, list(outputs))
 
     @cached_property
     def _gradient(self) -> ca.SX:
@@ -67,12 +72,12 @@ class Functions:
         else:
             value = self.terms.segment_terms.lagrangian
             hessian, _ = ca.hessian(value, self._by)
-        return self._here("segment", self._segment_arguments, [value, self._gradient, hessian])
+        return self._of_segment("segment", value, self._gradient, hessian)
 
     @cached_property
     def segment_slope(self) -> ca.Function:
         """As `segment` -> its gradient alone, for a small part of the operations."""
-        return self._here("segment_slope", self._segment_arguments, [self._gradient])
+        return self._of_segment("segment_slope", self._gradient)
 
     @cached_property
     def segment_by_share(self) -> ca.Function:
@@ -89,16 +94,15 @@ class Functions:
         The unknowns inside are, for an extensible cable, a_e with the axial strain sqrt(C) a_e and
         the energy h a_e^2 / 2, and the element's own.
         """
-        kind, unknowns = self.model.chain.kind, ca.SX.sym("unknowns", self.model.n_inner)
+        kind, inner = self.model.chain.kind, self.terms.inner
+        unknowns = ca.SX.sym("unknowns", self.model.n_inner)
         ratio, axial = self.terms.stretch, ca.SX(0)
         if self.model.extensible:
             axial = unknowns[0]
             ratio = ratio + ca.sqrt(self.terms.axial_compliance) * axial
-        inner = ca.SX.sym("inner", kind.n_inner)
         segment = self.terms.segment(ratio, inner, inner**2)
-        energy = kind.expanded(
-            segment, self.terms.segment_energy(segment), self.terms.elastic_energy
-        )
+        energy = self.terms.segment_energy(segment)
+        energy = kind.expanded(segment, energy, self.terms.elastic_energy)
         energy += self.model.chain.h * axial**2 / 2
         own = ca.reshape(unknowns[self.model.n_inner - kind.n_inner :], inner.shape)
         reached = ca.gradient(self.terms.work_of_multipliers(segment), self.terms.lam)
@@ -139,9 +143,7 @@ class Functions:
     def at_ends(self) -> ca.Function:
         """(x, lam, p, pose, deviation) of the first and last node -> as `segment`."""
         hessian, gradient = ca.hessian(self.terms.ends_lagrangian, self._by)
-        return self._here(
-            "at_ends", self._end_arguments, [self.terms.ends_lagrangian, gradient, hessian]
-        )
+        return self._of_ends("at_ends", self.terms.ends_lagrangian, gradient, hessian)
 
     @cached_property
     def segment_sensitivity(self) -> ca.Function:
@@ -152,14 +154,14 @@ class Functions:
             mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
         else:
             mixed = ca.jacobian(self._gradient, self._numbers)
-        return self._here("segment_sensitivity", self._segment_arguments, [mixed], often=False)
+        return self._of_segment("segment_sensitivity", mixed, often=False)
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
         """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
         gradient = ca.gradient(self.terms.ends_lagrangian, self._by)
-        mixed = ca.jacobian(gradient, self._end_numbers)
-        return self._here("end_sensitivity", self._end_arguments, [mixed])
+        numbers = ca.vertcat(self.terms.p, self.terms.deviation)
+        return self._of_ends("end_sensitivity", ca.jacobian(gradient, numbers))
 
     @cached_property
     def _advanced(self) -> ca.SX:
@@ -177,7 +179,7 @@ class Functions:
     @cached_property
     def segment_curve(self) -> ca.Function:
         """As `segment` -> advance [m], length ratio and, in a plane, turning [1/m]."""
-        return self._here("segment_curve", self._segment_arguments, [self._advanced])
+        return self._of_segment("segment_curve", self._advanced)
 
     @cached_property
     def segment_curve_slopes(self) -> ca.Function:
@@ -191,8 +193,7 @@ class Functions:
             blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
         else:
             blocks = [ca.jacobian(self._advanced, one) for one in by]
-        outputs = [self._advanced, *blocks]
-        return self._here("segment_curve_slopes", self._segment_arguments, outputs, often=False)
+        return self._of_segment("segment_curve_slopes", self._advanced, *blocks, often=False)
 
     @cached_property
     def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
@@ -232,16 +233,13 @@ class Functions:
     @cached_property
     def segment_strain(self) -> ca.Function:
         """As `segment` -> mean strains of the cell [1/m]."""
-        return self._here(
-            "strain", self._segment_arguments, [self.model.chain.kind.strain(self._plain)]
-        )
+        return self._of_segment("strain", self.model.chain.kind.strain(self._plain))
 
     @property
     def _plain(self) -> Segment:
         """The segment without its inner unknowns."""
-        return self.terms.segment(
-            self.terms.stretch, ca.SX.zeros(self.model.chain.kind.n_inner), ca.SX(0)
-        )
+        inner = ca.SX.zeros(self.terms.inner.shape)
+        return self.terms.segment(self.terms.stretch, inner, ca.SX(0))
 
     @cached_property
     def segment_state(self) -> ca.Function:
@@ -254,7 +252,7 @@ class Functions:
         mean = ca.substitute(mean, own, rest)
         slopes = [ca.jacobian(mean, symbols) for symbols in (self.terms.delta, rest, self.terms.p)]
         mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
-        return self._here("segment_state", self._segment_arguments, [mean, *slopes])
+        return self._of_segment("segment_state", mean, *slopes)
 
     @cached_property
     def _reactions(self) -> ca.SX:
@@ -280,7 +278,7 @@ class Functions:
     @cached_property
     def reactions(self) -> ca.Function:
         """As `at_ends` -> `ends.REACTIONS` in one column [N, N m]."""
-        return self._here("reactions", self._end_arguments, [self._reactions])
+        return self._of_ends("reactions", self._reactions)
 
     @cached_property
     def _readings(self) -> ca.SX:
@@ -294,14 +292,13 @@ class Functions:
     @cached_property
     def readings(self) -> ca.Function:
         """As `reactions`, as sensors show them."""
-        return self._here("readings", self._end_arguments, [self._readings])
+        return self._of_ends("readings", self._readings)
 
     @cached_property
     def reading_slopes(self) -> ca.Function:
         """As `readings` -> derivatives by increments and multipliers, by p, and by deviation."""
         by = (self._by, self.terms.p, self.terms.deviation)
-        slopes = [ca.jacobian(self._readings, one) for one in by]
-        return self._here("reading_slopes", self._end_arguments, slopes)
+        return self._of_ends("reading_slopes", *(ca.jacobian(self._readings, one) for one in by))
 
     @cached_property
     def dead_load(self) -> ca.Function:
