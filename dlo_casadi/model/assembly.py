@@ -346,25 +346,28 @@ class Assembly:
     def state_after(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, ...]:
         """Rest strains (m, n_rests) that poses leave; their slopes by both nodes, rest and p.
 
-        The slopes are (m, n_cells, strains, 2b), (m, n_cells, strains, strains) by the cell's own
-        rest strains, and (m, n_cells, strains, n_parameters).
+        The slopes are (m, n_rests, 2b), (m, n_rests, strains) by the cell's own rest strains, and
+        (m, n_rests, n_parameters).
         """
         found = self._call_segments("segment_state", shapes, given)
-        after, *slopes = (part[:, self.chain.layout.bends] for part in found)
-        return (self._stacked(after[..., 0]), *slopes)
+        after, *slopes = (self._stacked(part[:, self.chain.layout.bends]) for part in found)
+        return (after[..., 0], *slopes)
 
     def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
         """Whether poses hand on the rest curvature that they find, to first order."""
-        return bool(np.all(slopes[2] == np.eye(len(self.node.strains))))
+        same = np.repeat(np.eye(len(self.node.strains)), self.chain.n_cells, axis=0)
+        return bool(np.all(slopes[2] == same))
 
     def state_along(
         self, slopes: tuple[FloatArray, ...], x: FloatArray, rest: FloatArray, p: FloatArray
     ) -> FloatArray:
         """Change (m, n_rests, q) of what poses leave behind, along nodes, rest and p."""
         _, by_x, by_rest, by_p = slopes
-        both = self._both(x)[:, self.chain.layout.bends]
-        own = np.stack(self.chain.by_strain(rest), axis=2)
-        return self._stacked(by_x @ both + by_rest @ own + by_p @ p[:, None])
+        strains = (1, len(self.node.strains), 1)
+        both = np.tile(self._both(x)[:, self.chain.layout.bends], (*strains, 1))
+        own = np.tile(np.stack(self.chain.by_strain(rest), axis=2), (*strains, 1))
+        moved = (by_x[:, :, None] @ both + by_rest[:, :, None] @ own)[:, :, 0]
+        return np.asarray(moved + by_p @ p)
 
 
 @lru_cache(maxsize=MODELS)

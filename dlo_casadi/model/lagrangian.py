@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
+from math import prod
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -31,7 +32,7 @@ from dlo_casadi.model.cable_model import (
     VIEWPOINT_SIZE,
     CableModel,
 )
-from dlo_casadi.rod.element import Cell, Law, Section, Segment
+from dlo_casadi.rod.element import Cell, Section, Segment
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentInFrame
 
@@ -236,12 +237,17 @@ class Lagrangian:
     def section(self) -> Section:
         """The section, its stiffnesses and laws."""
         known = dict(zip(self.model.names, ca.vertsplit(self.p), strict=True))
-        bending, laws = known[BENDING_STIFFNESS] * ca.SX.eye(len(self.node.curvatures)), []
-        for effect, local in self.effects_of(SectionLaw):
+        bending = known[BENDING_STIFFNESS] * ca.SX.eye(len(self.node.curvatures))
+        laws = self.effects_of(SectionLaw)
+        for effect, local in laws:
             bending = effect.bending(bending, local)
-            factors = (effect.along, effect.of_bend, effect.tangent)
-            laws.append(Law(*(partial(f, cable=self.model.cable, params=local) for f in factors)))
-        return Section(bending, known.get(TORSIONAL_STIFFNESS, ca.SX(0)), laws)
+
+        def product(factor: str, of: Any) -> ca.SX:
+            found = (getattr(law, factor)(of, self.model.cable, local) for law, local in laws)
+            return prod(found, start=ca.SX(1))
+
+        factors = (partial(product, factor) for factor in ("along", "of_bend", "tangent"))
+        return Section(bending, known.get(TORSIONAL_STIFFNESS, ca.SX(0)), *factors)
 
     @cached_property
     def section_moment(self) -> ca.Function:

@@ -7,10 +7,9 @@ energy and its shape are sums over segments, so that derivatives couple neighbou
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from math import prod
 from typing import ClassVar
 
 import casadi as ca
@@ -50,17 +49,9 @@ class Cell:
         return Cell(self.low, half, self.mesh / 2), Cell(self.middle, half, self.mesh / 2)
 
 
-@dataclass(frozen=True)
-class Law:
-    """A section law with its parameters: factors on the elastic energy, see `SectionLaw`.
-
-    `along` is on bending and torsion in a cell, `of_bend` on the energy of bending alone, by the
-    square of the bend, `tangent` on the stiffness against a small change of such a bend.
-    """
-
-    along: Callable[[Cell], ca.SX]
-    of_bend: Callable[[ca.SX], ca.SX]
-    tangent: Callable[[ca.SX], ca.SX]
+def one(_: object) -> ca.SX:
+    """The factor of a section without laws."""
+    return ca.SX(1)
 
 
 @dataclass(frozen=True)
@@ -69,20 +60,26 @@ class Section:
 
         W = a (b(|k|) k^T B k + GJ tau^2) / 2                           [N]
 
-    of the curvature k and the twist tau beyond those at rest [1/m], with the products a of the
-    laws' factors along the cable and b of their factors by the size of the bend.
+    of the curvature k and the twist tau beyond those at rest [1/m], with the products a and b of
+    the section laws' factors, see `SectionLaw`.
 
     Parameters
     ----------
     bending : (1, 1) or (2, 2) [N m^2]
         B: EI in a plane; in space about the material axes y and z.
     torsion : scalar GJ [N m^2]
-    laws : sequence of Law
+    along : callable
+        a, of a cell.
+    of_bend, tangent : callable
+        By the square of the bend: b, and the factor on the stiffness against a small change of
+        such a bend, which is exact of one law.
     """
 
     bending: ca.SX
     torsion: ca.SX
-    laws: Sequence[Law] = ()
+    along: Callable[[Cell], ca.SX] = one
+    of_bend: Callable[[ca.SX], ca.SX] = one
+    tangent: Callable[[ca.SX], ca.SX] = one
 
     def density(self, strain: ca.SX, cell: Cell) -> ca.SX:
         """Energy per length [N] of strains beyond those at rest [1/m], see `Node.strains`."""
@@ -90,18 +87,6 @@ class Section:
         twist, bend = strain[:-axes], strain[-axes:]
         bent = self.of_bend(ca.sumsqr(bend)) * ca.dot(bend, ca.mtimes(self.bending, bend))
         return self.along(cell) * (bent + self.torsion * ca.sumsqr(twist)) / 2
-
-    def along(self, cell: Cell) -> ca.SX:
-        """Factor on bending and torsion in a cell."""
-        return prod((law.along(cell) for law in self.laws), start=ca.SX(1))
-
-    def of_bend(self, square: ca.SX) -> ca.SX:
-        """Factor on the energy of bending, by the square of the bend."""
-        return prod((law.of_bend(square) for law in self.laws), start=ca.SX(1))
-
-    def tangent(self, square: ca.SX) -> ca.SX:
-        """Factor on the stiffness against a small change of such a bend, of one law exact."""
-        return prod((law.tangent(square) for law in self.laws), start=ca.SX(1))
 
 
 @dataclass(frozen=True)

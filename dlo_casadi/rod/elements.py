@@ -183,11 +183,8 @@ class Quadratic(Arc):
     ) -> ca.SX:
         """To second order in the bow, as in `condensed`."""
         torque = ca.gradient(energy, segment.inner)
-        stiffness = ca.jacobian(torque, segment.inner)
-        zero = ca.SX(0)
-        given, torque, stiffness = ca.substitute(
-            [energy, torque, stiffness], [segment.inner], [zero]
-        )
+        whole = [energy, torque, ca.jacobian(torque, segment.inner)]
+        given, torque, stiffness = ca.substitute(whole, [segment.inner], [ca.SX(0)])
         return given + torque * segment.inner + stiffness * segment.inner**2 / 2
 
 
@@ -290,7 +287,7 @@ class BowedHelix(Helix):
         self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> Condensed:
         """Minimum over the bow, resisted by the section alone."""
-        torque, given, own = self._of_bow(segment, lagrangian, elastic)
+        given, torque, own = self._of_bow(segment, lagrangian, elastic)
         bow = -ca.mtimes(inverse_of(own), torque)
         return Condensed(given + ca.dot(torque, bow) / 2, bow, segment.square)
 
@@ -298,19 +295,18 @@ class BowedHelix(Helix):
         self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> ca.SX:
         """To second order in the bow, as in `condensed`."""
-        torque, given, own = self._of_bow(segment, energy, elastic)
+        given, torque, own = self._of_bow(segment, energy, elastic)
         bow = segment.inner
         return given + ca.dot(torque, bow) + ca.dot(bow, ca.mtimes(own, bow)) / 2
 
     @staticmethod
     def _of_bow(
         segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
-    ) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Slope of an energy by the bow at 0, its value, and the section's own stiffness."""
+    ) -> list[ca.SX]:
+        """Value of an energy at no bow, its slope by the bow, and the section's own stiffness."""
         own, _ = ca.hessian(elastic(segment), segment.inner)
-        whole = [ca.gradient(energy, segment.inner), energy, own]
-        torque, given, own = ca.substitute(whole, [segment.inner], [ca.SX.zeros(3)])
-        return torque, given, own
+        whole = [energy, ca.gradient(energy, segment.inner), own]
+        return list(ca.substitute(whole, [segment.inner], [ca.SX.zeros(3)]))
 
 
 def inverse_of(a: ca.SX) -> ca.SX:

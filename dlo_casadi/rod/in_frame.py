@@ -167,15 +167,16 @@ class SegmentInFrame:
         phi_phi = bend[:3, :3]
         if inner.numel():
             # The inner unknowns follow.
-            phi_inner, mu_inner = bend[:3, 3:], turned.T @ force_inner
-            lam_inner = to_lam.T @ force_inner
-            solved = [self._inverse @ row.T for row in (mu_inner, phi_inner, lam_inner)]
-            mu_mu -= mu_inner @ solved[0]
-            mu_phi -= mu_inner @ solved[1]
-            mu_lam -= mu_inner @ solved[2]
-            lam_phi -= lam_inner @ solved[1]
-            lam_lam -= lam_inner @ solved[2]
-            phi_phi -= phi_inner @ solved[1]
+            whole = [
+                [mu_mu, mu_phi, mu_lam],
+                [mu_phi.T, phi_phi, lam_phi.T],
+                [mu_lam.T, lam_phi, lam_lam],
+            ]
+            follow = ca.vertcat(turned.T @ force_inner, bend[:3, 3:], to_lam.T @ force_inner)
+            left = ca.blockcat(whole) - follow @ (self._inverse @ follow.T)
+            edges = [0, 3, 6, left.shape[0]]
+            whole = ca.blocksplit(left, edges, edges)
+            (mu_mu, mu_phi, mu_lam), (_, phi_phi, _), (_, lam_phi, lam_lam) = whole
         lever, k = self._moved.lever, self._moved.stretch
         g_s, g_e = self._to_nodes(by_mu, slope)
         half = mu_mu @ lever
