@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import casadi as ca
@@ -115,7 +115,7 @@ class ClampRotation(ClampTurn):
             side, frame = name.split("_")[0], ca.vertsplit(getattr(ends, name))
             turn = rotation(ca.vertcat(0, params[f"{side}_y"], params[f"{side}_z"]))
             turned[name] = ca.vertcat(*quaternion_product(frame, ca.vertsplit(turn)))
-        return ends.changed(**turned)
+        return replace(ends, **turned)
 
 
 class ClampCompliance(ClampEffect):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 from dlo_casadi.effects.cable import Cable, Parameter
@@ -35,4 +36,4 @@ class EndOffset(BoundaryEffect):
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Move the end fixture."""
-        return ends.changed(end=ends.end + vector(params, "d"))
+        return replace(ends, end=ends.end + vector(params, "d"))

@@ -8,7 +8,7 @@ equilibrium is a stationary point.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from math import prod
 from typing import Any, NamedTuple
@@ -147,7 +147,7 @@ class Lagrangian:
         d, b = self.node.dimension, self.node.increment
         place, first, last, _ = ca.vertsplit(self.deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
         declared = EndConditions.of(self.declared_ends, self.node)
-        ends = declared.changed(end=declared.end + place).turned(first, last)
+        ends = replace(declared, end=declared.end + place).turned(first, last)
         for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)
         if END_ROLL in self.model.names:

@@ -81,7 +81,8 @@ class RestScatter:
     @property
     def sizes(self) -> NDArray[np.floating]:
         """Standard deviation (MODES,) [1/m] of each mode's coefficient."""
-        return self.std * np.sqrt(_shares(self.smoothness))
+        share = np.exp(-((np.arange(MODES) * np.pi * self.smoothness) ** 2) / 2)
+        return self.std * np.sqrt(share / share.sum())
 
 
 def modes_of(cells: NDArray[np.floating], length: float) -> NDArray[np.floating]:
@@ -90,9 +91,3 @@ def modes_of(cells: NDArray[np.floating], length: float) -> NDArray[np.floating]
     primitive = np.sin(np.pi / length * np.multiply.outer(cells, k)) * length / (k * np.pi)
     waves = (primitive[:, 1] - primitive[:, 0]) / (cells[:, 1] - cells[:, 0])[:, None]
     return np.column_stack([np.ones(len(cells)), np.sqrt(2.0) * waves])
-
-
-def _shares(smoothness: float) -> NDArray[np.floating]:
-    """Shares v_k (MODES,) of the variance."""
-    share = np.exp(-((np.arange(MODES) * np.pi * smoothness) ** 2) / 2)
-    return np.asarray(share / share.sum())

@@ -52,7 +52,6 @@ class Link(Element):
     plain = "link"
     nodes_are = "in the middles of the links, and of the clamps"
     node = Heading
-    order = 2
     smooth = False
     rule = (np.array([0.5]), np.array([1.0]))
 
@@ -99,24 +98,7 @@ class Arc(Element):
     """
 
     name = "arc"
-    plain = "arc"
-    nodes_are = "at the nodes"
     node = Heading
-    order = 2
-    smooth = True
-    # Three Gauss points integrate cos and sin of a heading that turns by d in one element with an
-    # error below d^6 / 2e6.
-    rule = (
-        np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)]),
-        np.array([5.0, 8.0, 5.0]) / 18.0,
-    )
-
-    def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
-        """Nodes at the element boundaries."""
-        nodes = np.linspace(0.0, length, n + 1)
-        width = np.full(n, length / n)
-        segments = np.column_stack([nodes[:-1], width, nodes[:-1], width, np.ones(n)])
-        return Layout(nodes, segments, np.stack([np.arange(n + 1)] * 2, axis=1))
 
     def strain(self, segment: Segment) -> ca.SX:
         """Turning over true length."""
@@ -203,17 +185,8 @@ class Helix(Element):
     """Constant curvature and twist between nodal frames."""
 
     name = "arc"
-    plain = "arc"
-    nodes_are = "at the nodes"
     node = Frame
     framed = True
-    order = 2
-    smooth = True
-    rule = Arc.rule
-
-    def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
-        """Nodes at the element boundaries, as those of a planar cable."""
-        return Arc().layout(length, n, clamped)
 
     def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
         """Frame in the middle (4,), and the rotation vector phi (3,) [rad] from node to node."""

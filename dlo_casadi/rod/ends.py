@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import accumulate, pairwise
 
 import casadi as ca
 
@@ -15,11 +15,8 @@ REACTIONS = ("start_force", "start_moment", "end_force", "end_moment")
 
 def reaction_rows(node: type[Node]) -> dict[str, slice]:
     """Where each of REACTIONS stands in their vector: forces (dimension,), moments (increment,)."""
-    sizes = [node.dimension, node.increment] * 2
-    ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
-    return {
-        name: slice(end - size, end) for name, size, end in zip(REACTIONS, sizes, ends, strict=True)
-    }
+    edges = pairwise(accumulate([node.dimension, node.increment] * 2, initial=0))
+    return {name: slice(*both) for name, both in zip(REACTIONS, edges, strict=True)}
 
 
 def deviation_names(node: type[Node]) -> tuple[str, ...]:
@@ -61,10 +58,6 @@ class EndConditions:
     def vector(self) -> ca.SX:
         """As given to `of`."""
         return ca.vertcat(self.start, self.end, self.start_frame, self.end_frame)
-
-    def changed(self, **values: Any) -> EndConditions:
-        """Return a copy with some conditions replaced."""
-        return replace(self, **values)
 
     def rolled(self, angle: ca.SX) -> EndConditions:
         """Return a copy whose end clamp in space is turned about its x axis [rad]."""
