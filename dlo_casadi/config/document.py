@@ -33,16 +33,6 @@ def read_yaml(path: str | Path) -> Any:
 
     Numbers such as 1e-3 are numbers here, as in YAML 1.2; a key that occurs twice is an error.
 
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    object
-        Its contents.
-
     Raises
     ------
     ConfigError
@@ -54,15 +44,8 @@ def read_yaml(path: str | Path) -> Any:
 def dump_yaml(data: object) -> str:
     """Write plain data as YAML: every digit of a float, keys in their order, no aliases.
 
-    Parameters
-    ----------
-    data : object
-        Mappings, sequences, arrays, numbers, text, paths, None; nested as you like.
-
-    Returns
-    -------
-    str
-        Text that `read_yaml` turns into the same data.
+    Of mappings, sequences, arrays, numbers, text, paths, None, nested as you like; `read_yaml`
+    turns the text into the same data.
     """
     return yaml.dump(
         _plain(data),
@@ -128,16 +111,18 @@ class _Loader(yaml.SafeLoader):
                 node.start_mark,
             ) from None
 
-    def construct_decimal(self, node: yaml.ScalarNode) -> int:
-        return int(self.construct_scalar(node))
 
-    def construct_number(self, node: yaml.ScalarNode) -> float:
-        return float(re.sub(r"\.(?=inf|nan)", "", self.construct_scalar(node).lower()))
+def _int(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
+    return int(loader.construct_scalar(node))
+
+
+def _float(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> float:
+    return float(re.sub(r"\.(?=inf|nan)", "", loader.construct_scalar(node).lower()))
 
 
 _with_numbers_of_yaml_1_2(_Loader)
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_decimal)
-_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_number)
+_Loader.add_constructor("tag:yaml.org,2002:int", _int)
+_Loader.add_constructor("tag:yaml.org,2002:float", _float)
 
 
 class _Dumper(yaml.SafeDumper):

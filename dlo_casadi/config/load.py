@@ -11,10 +11,17 @@ from pathlib import Path
 
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.measuring import Tolerances
-from dlo_casadi.config.options import DeclaredEffect
 from dlo_casadi.config.problems import Place, Problem, did_you_mean, kind_of, show
-from dlo_casadi.config.sections import Cable, Config, Experiment, File, Pose, SkippedPose
-from dlo_casadi.config.values import FINEST_STD, FINEST_TOLERANCE, Range
+from dlo_casadi.config.sections import (
+    Cable,
+    Config,
+    DeclaredEffect,
+    Experiment,
+    File,
+    Pose,
+    SkippedPose,
+)
+from dlo_casadi.config.values import Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, Setup
 from dlo_casadi.effects import Cable as EffectsCable
 from dlo_casadi.errors import ConfigError, counted
@@ -85,6 +92,11 @@ _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 
 # Results are named after a pose, with up to forty characters more; file systems take 255 bytes.
 _LONGEST_NAME = 200
+
+# A fifth of the wavelength of green light, beyond any camera. Upwards: the cable's length.
+_FINEST_STD = 1.0e-7
+# A nanometre over a metre is what interferometers resolve.
+_FINEST_TOLERANCE = 1.0e-9
 
 # The mesh that is chosen from the data has 20 elements at least, which error and time suggest. By
 # the order with which elements converge.
@@ -289,7 +301,7 @@ def _oddities(config: Config) -> Iterator[str]:
 def _impossible_values(experiment: Experiment, length: float) -> Iterator[Problem]:
     """Find noise and tolerances that are impossible for a cable of that length [m]."""
     std = experiment.measurement.std
-    if std is not None and std not in (possible := Range(FINEST_STD, length, "m")):
+    if std is not None and std not in (possible := Range(_FINEST_STD, length, "m")):
         text = f"std: {possible.complaint(std)}; without it, it is estimated from the data"
         yield Problem(("experiment", "measurement", "std"), text)
     # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
@@ -304,7 +316,7 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Proble
     }
     for key, q in taken_up.items():
         most = min(q.upper - q.nominal, q.nominal - q.lower)
-        if wrong := Range(FINEST_TOLERANCE, most, q.unit).complaint(declared[key]):
+        if wrong := Range(_FINEST_TOLERANCE, most, q.unit).complaint(declared[key]):
             yield Problem(("experiment", "tolerances", key), f"tolerances.{key}: {wrong}")
 
 

@@ -11,15 +11,12 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from dlo_casadi.config.problems import did_you_mean
 from dlo_casadi.config.values import (
     COORDINATE,
-    DISTORTION,
-    FOCAL_LENGTH,
-    FORCE_STD,
-    MARKER,
-    MOMENT_STD,
-    PIXELS,
+    FORCE,
+    MOMENT,
     NonNegative,
     Number,
     Positive,
+    Range,
     Row,
     Section,
     Vector,
@@ -29,6 +26,15 @@ from dlo_casadi.errors import counted
 from dlo_casadi.model.cable_model import Tolerances as Known
 
 _STANDARD = Known()
+# A nanonewton is what atomic force microscopes resolve.
+FORCE_STD, MOMENT_STD = FORCE._replace(least=1.0e-9), MOMENT._replace(least=1.0e-9)
+# A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
+PIXELS = Range(-1.0e6, 1.0e6, "px")
+FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
+# Terms of a wide lens that cancel one another reach hundreds; a million is a slip.
+DISTORTION = Range(-1.0e6, 1.0e6, "")
+# A marker of a tenth of a millimetre has no pixels; ten metres are the side of a house.
+MARKER = Range(1.0e-4, 10.0, "m")
 
 
 class Camera(Section):

@@ -1,23 +1,24 @@
 """The checked objects: one class for each section of a configuration. All units are SI.
 
-How was measured is in `measuring`, how the fit goes about it in `options`.
+How was measured is in `measuring`.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from dlo_casadi.config.measuring import Centerlines, Images, Tolerances
-from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
 from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, show
 from dlo_casadi.config.values import (
     STIFFNESS,
+    Elements,
     Force,
     Gravity,
     Moment,
@@ -26,13 +27,16 @@ from dlo_casadi.config.values import (
     Place,
     Positive,
     Quaternion,
+    RestCoefficients,
     Section,
+    Switch,
     implausible_sizes,
     optional,
     within,
 )
 from dlo_casadi.errors import well_formed
 from dlo_casadi.rod.ends import REACTIONS
+from dlo_casadi.thresholds import SIGNIFICANCE
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
 # a foam, to five times, which no metal of cables reaches.
@@ -231,6 +235,94 @@ class Experiment(Section):
     def in_space(self) -> bool:
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
+
+
+# ---- how the fit goes about it ----------------------------------------------------------------
+
+ElementName = Literal["quadratic", "arc", "link"]
+
+
+class EffectParameter(Section):
+    """The declared value of an effect's parameter: an initial guess, or kept when fixed."""
+
+    value: Number
+    """Value in the parameter's own unit."""
+    fixed: Switch = False
+    """Whether the value is kept; otherwise it is where the fit starts."""
+
+
+def _as_parameter(value: object) -> object:
+    return {"value": value} if not isinstance(value, Mapping | EffectParameter) else value
+
+
+def _as_effect(value: object) -> object:
+    return {"name": value} if isinstance(value, str) else value
+
+
+class DeclaredEffect(Section):
+    """An effect that is part of the model from the start."""
+
+    name: str
+    """Name of the effect, such as lumped_mass."""
+    parameters: dict[
+        str,
+        Annotated[
+            EffectParameter,
+            BeforeValidator(_as_parameter, json_schema_input_type=float | EffectParameter),
+        ],
+    ] = Field(default={})
+    """Initial guess of each parameter by its name; {value: ..., fixed: true} keeps a value."""
+
+
+class ModelOptions(Section):
+    """The declared model."""
+
+    n: Elements | None = None
+    """Number of elements; chosen from the data when absent."""
+    element: ElementName = "quadratic"
+    """quadratic (curvature changes in an element: fourth order), arc (it is constant: second
+    order, five times cheaper) or link (straight, as in the paper; in a plane only)."""
+    effects: tuple[
+        Annotated[
+            DeclaredEffect,
+            BeforeValidator(_as_effect, json_schema_input_type=str | DeclaredEffect),
+        ],
+        ...,
+    ] = ()
+    """Effects beside bending and weight."""
+
+
+class EstimationOptions(Section):
+    """How the parameters are estimated."""
+
+    algorithm1: Switch = True
+    """Whether the paper's loop runs as a baseline."""
+    algorithm1_n: Annotated[int, Field(strict=True, ge=2, le=200)] = 10
+    """Number of links in the paper's loop."""
+    algorithm1_inner: Literal["ipopt", "cobyla"] = "ipopt"
+    """Its inner minimisation: ipopt, or cobyla as in the paper (about 1 s a pose)."""
+    robust: Switch = False
+    """Whether outlying points weigh less."""
+    plausibility: Switch = True
+    """Whether contradictions of the configuration stop the fit, or leave out a single pose."""
+    rest_curvature_coefficients: RestCoefficients | None = None
+    """Number of coefficients of the rest curvature, 0 for a straight one; chosen from the data."""
+
+
+class DiagnosisOptions(Section):
+    """The search for missing effects."""
+
+    enabled: Switch = True
+    """Whether missing effects are searched for."""
+    exclude: tuple[str, ...] = ()
+    """Names of effects that are not tried."""
+    significance: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)] = SIGNIFICANCE
+    """Largest p-value with which an effect is added."""
+    max_effects: Annotated[int, Field(strict=True, ge=0)] = 4
+    """Largest number of effects that are added."""
+
+
+# ---- the whole -------------------------------------------------------------------------------
 
 
 class SkippedPose(NamedTuple):

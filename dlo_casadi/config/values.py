@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from dlo_casadi.config.problems import Problem, show
+from dlo_casadi.config.problems import Contradiction, Problem, show
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS
 from dlo_casadi.errors import counted
 
@@ -59,21 +59,8 @@ STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
 GRAVITY = Range(0.0, 1.0e4, "m/s^2")
 # A frame whose origin is farther away is that of a map; of 1e3 m, doubles resolve 1e-13 m.
 COORDINATE = Range(-1.0e3, 1.0e3, "m")
-# A fifth of the wavelength of green light, beyond any camera. Upwards: the cable's length.
-FINEST_STD = 1.0e-7
-# A nanometre over a metre is what interferometers resolve.
-FINEST_TOLERANCE = 1.0e-9
 # The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; taut it pulls more. A moment: a metre's arm.
 FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
-# A nanonewton is what atomic force microscopes resolve.
-FORCE_STD, MOMENT_STD = FORCE._replace(least=1.0e-9), MOMENT._replace(least=1.0e-9)
-# A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
-PIXELS = Range(-1.0e6, 1.0e6, "px")
-FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
-# Terms of a wide lens that cancel one another reach hundreds; a million is a slip.
-DISTORTION = Range(-1.0e6, 1.0e6, "")
-# A marker of a tenth of a millimetre has no pixels; ten metres are the side of a house.
-MARKER = Range(1.0e-4, 10.0, "m")
 # Two elements have a joint between them; of a metre, 2000 are half a millimetre each, less than a
 # cable is thick.
 MESH = Range(2, 2000, "elements")
@@ -145,12 +132,12 @@ def optional(section: type[Section]) -> BeforeValidator:
     )
 
 
-def checked(complaint: Callable[[Any], str]) -> AfterValidator:
-    """Refuse a value with what is wrong with it, if anything is."""
+def checked(complaint: Callable[[Any], str | list[Problem]]) -> AfterValidator:
+    """Refuse a value with what is wrong with it, or with its keys, if anything is."""
 
     def check(value: Any) -> Any:
         if wrong := complaint(value):
-            raise ValueError(wrong)
+            raise ValueError(wrong) if isinstance(wrong, str) else Contradiction(*wrong)
         return value
 
     return AfterValidator(check)

@@ -12,8 +12,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 from filelock import FileLock, Timeout
 
@@ -72,18 +71,9 @@ class FolderDraft:
             write_file(draft.folder / "a.txt", "...")
             draft.put_in_place()
 
+    The folder and its parents are made if they do not exist; `folder` is the one to be filled.
     Until then the folder stays as it is, and if putting in place fails it becomes so again.
     Entries of other names stay: what lies there and is not ours is never touched.
-
-    Parameters
-    ----------
-    path : str or Path
-        The folder; made, with its parents, if it does not exist.
-
-    Attributes
-    ----------
-    folder : Path
-        The folder to be filled.
 
     Raises
     ------
@@ -119,12 +109,7 @@ class FolderDraft:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         self._remove()
         if isinstance(error, OutputError):  # the user knows nothing of drafts
             error.retold(str(self.folder), str(self.path))
@@ -134,10 +119,7 @@ class FolderDraft:
     def put_in_place(self, obsolete: Iterable[str] = ()) -> None:
         """Move all that the draft holds into the folder; on any failure put back what was there.
 
-        Parameters
-        ----------
-        obsolete : iterable of str
-            Names of ours that go even if the draft holds nothing of that name.
+        Entries of the names in `obsolete` go even if the draft holds nothing of that name.
         """
         for folder, _, files in os.walk(self.folder):
             for name in files:
@@ -202,13 +184,7 @@ def refuse_foreign(folder: Path, taken: Sequence[str]) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and its parents, unless they are there.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be made.
-    """
+    """Make a folder and its parents, unless they are there, or raise OutputError."""
     with _explained(path):
         path.mkdir(parents=True, exist_ok=True)
 
@@ -217,10 +193,7 @@ def make_folder(path: Path) -> None:
 def only_run(folder: Path) -> Iterator[None]:
     """Hold a folder for one run; the system lets go of it when the process ends, however.
 
-    Raises
-    ------
-    OutputError
-        If another run holds it, or it cannot be written.
+    Raises OutputError if another run holds it, or it cannot be written.
     """
     make_folder(folder)
     with _explained(folder):

@@ -19,9 +19,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.options import ElementName
-from dlo_casadi.config.problems import Place, Problem, show
-from dlo_casadi.config.sections import Boundary
+from dlo_casadi.config.problems import Problem, show
+from dlo_casadi.config.sections import Boundary, ElementName
 from dlo_casadi.config.values import (
     STIFFNESS,
     Elements,
@@ -31,6 +30,7 @@ from dlo_casadi.config.values import (
     OpenSection,
     Positive,
     RestCoefficients,
+    checked,
     implausible_sizes,
     stacked,
     within,
@@ -54,6 +54,32 @@ _ROUNDING = 1e-9
 # Folders of results that a message lists.
 _LISTED = 5
 _DAMAGED, _REMEDY = "damaged parameters", ".\n  Try: the file as a fit has written it."
+
+
+def _wrong_effect(row: Mapping[str, Any]) -> list[Problem]:
+    """Find what is wrong with an effect and its options, by their keys."""
+    name = row.get("name")
+    kind = known_effect(name) if isinstance(name, str) else None
+    if kind is None:
+        known = ", ".join((*EFFECTS, *NUISANCES))
+        return [Problem((), f"no effect is called {name!r}; known: {known}")]
+    defaults = {item.name: item.default for item in fields(kind)}
+    problems = []
+    for key, value in row.items():
+        if key not in ("name", *defaults):
+            problems.append(Problem((key,), f"{name} knows {', '.join(defaults)}"))
+        elif key != "name" and _form(value) != _form(defaults[key]):
+            text = f"something like {defaults[key]!r} belongs here, found {show(value)}"
+            problems.append(Problem((key,), text))
+    return problems
+
+
+def _form(value: Any) -> Any:
+    """What kind of a value it is, item by item: a finite number, text, true or false."""
+    if isinstance(value, list | tuple):
+        return [_form(item) for item in value]
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return "number" if number and math.isfinite(value) else type(value)
 
 
 class _Cable(OpenSection):
@@ -88,6 +114,12 @@ class _Covariance(OpenSection):
     names: tuple[str, ...]
     values: tuple[tuple[Number, ...], ...]
 
+    @property
+    def complaint(self) -> str:
+        size = len(self.names)
+        square = [len(row) for row in self.values] == [size] * size
+        return "" if square else f"{counted(size, 'row')} of as many values belong here"
+
 
 class _Scatter(OpenSection):
     fixtures: dict[str, float | None] | None = None
@@ -99,17 +131,19 @@ class _Scatter(OpenSection):
 class ParametersFile(OpenSection):
     """What is read of a parameters.yaml; each key as `report.parameters_text` writes it."""
 
-    cable: _Cable
+    cable: Annotated[
+        _Cable, checked(lambda cable: implausible_sizes(cable.length, cable.mass, cable.diameter))
+    ]
     boundary: Boundary
     gravity: Gravity
     element: ElementName
     n: Elements
     n_rest: RestCoefficients
-    effects: tuple[dict[str, Any], ...]
+    effects: tuple[Annotated[dict[str, Any], checked(_wrong_effect)], ...]
     parameters: dict[str, _Value]
     rest_curvature: _Fitted
     state: _State
-    covariance: _Covariance
+    covariance: Annotated[_Covariance, checked(lambda found: found.complaint)]
     scatter: _Scatter | None = None
     fixtures: dict[str, Any] | None = None
     model_hash: Name
@@ -153,18 +187,14 @@ def load_parameters(path: str | Path) -> FittedCable:
             source,
         )
     file = document.checked(ParametersFile, _DAMAGED, _REMEDY)
-    if problems := [*_contradictions(file)]:
-        raise document.error(problems, _DAMAGED, _REMEDY)
     try:
         model = _model(file)
-        if problems := [*_unlike(file, model)]:
-            raise document.error(problems, _DAMAGED, _REMEDY)
-    except ConfigError:
-        raise
     except DloError as error:
         raise ConfigError(f"{_DAMAGED}: {error.message}{_REMEDY}", source) from None
+    if problems := [*_unlike(file, model)]:
+        raise document.error(problems, _DAMAGED, _REMEDY)
     p = np.array([file.parameters[name].value for name in model.names])
-    return FittedCable(model, p, np.array(file.state.rest_curvature), _metadata(file, data, source))
+    return FittedCable(model, p, np.array(file.state.rest_curvature), metadata_of(data, source))
 
 
 def _results_near(path: Path) -> str:
@@ -179,47 +209,6 @@ def _results_near(path: Path) -> str:
     names = difflib.get_close_matches(wanted.name, known, 1) or list(known)[:_LISTED]
     listed = ", ".join(str(known[name]) for name in names)
     return f"\n  Try: {listed}" if listed else "\n  Try: the results folder of a fit (dlo fit)."
-
-
-def _contradictions(file: ParametersFile) -> Iterator[Problem]:
-    """Find what no cable and no effect can be."""
-    cable = file.cable
-    for (key,), message in implausible_sizes(cable.length, cable.mass, cable.diameter):
-        yield Problem(("cable", key), f"cable.{key}: {message}")
-    for k, row in enumerate(file.effects):
-        yield from _wrong_effect(row, ("effects", k))
-    size = len(file.covariance.names)
-    if [len(row) for row in file.covariance.values] != [size] * size:
-        text = f"covariance.values: {counted(size, 'row')} of as many numbers belong here"
-        yield Problem(("covariance", "values"), text)
-
-
-def _wrong_effect(row: Mapping[str, Any], at: Place) -> Iterator[Problem]:
-    name = row.get("name")
-    kind = known_effect(name) if isinstance(name, str) else None
-    if kind is None:
-        known = ", ".join((*EFFECTS, *NUISANCES))
-        yield Problem(at, f"effects.{at[1]}: no effect is called {show(name)}; known: {known}")
-        return
-    defaults = {item.name: item.default for item in fields(kind)}
-    for key, value in row.items():
-        where = f"effects.{at[1]}.{key}"
-        if key != "name" and key not in defaults:
-            yield Problem((*at, key), f"{where}: {kind.name} knows {', '.join(defaults)}")
-        elif key != "name" and not _is_like(value, defaults[key]):
-            text = f"something like {defaults[key]!r} belongs here, found {show(value)}"
-            yield Problem((*at, key), f"{where}: {text}")
-
-
-def _is_like(value: Any, example: Any) -> bool:
-    """Whether an effect's option is of the kind of its default; numbers are finite."""
-    if isinstance(example, tuple):
-        alike = isinstance(value, list) and len(value) == len(example)
-        return alike and all(map(_is_like, value, example))
-    if isinstance(example, float):
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        return number and math.isfinite(value)
-    return isinstance(value, type(example))
 
 
 def _model(file: ParametersFile) -> CableModel:
@@ -251,8 +240,7 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[Problem]:
     if strange := set(file.parameters) ^ set(model.names):
         wrong = ", ".join(sorted(strange))
         yield Problem(("parameters",), f"parameters and effects do not belong together: {wrong}")
-        return
-    for q in model.parameters:
+    for q in [] if strange else model.parameters:
         if wrong := _beyond(q, file.parameters[q.name]):
             name = f"parameters.{q.name}.value"
             yield Problem(("parameters", q.name, "value"), f"{name}: {wrong}")
@@ -283,10 +271,7 @@ def _beyond(q: Parameter, row: _Value) -> str:
 
 def metadata_of(document: dict[str, Any], source: Path) -> Metadata:
     """What a document tells beside the model."""
-    return _metadata(ParametersFile.model_validate(document), document, source)
-
-
-def _metadata(file: ParametersFile, document: dict[str, Any], source: Path) -> Metadata:
+    file = ParametersFile.model_validate(document)
     names, stiffness = file.covariance.names, file.parameters["bending_stiffness"]
     covariance = np.array(file.covariance.values, dtype=float).reshape(len(names), len(names))
     scatter = file.scatter or _Scatter()

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.config import Config, declared_setup, wrong_effects
-from dlo_casadi.config.options import EstimationOptions
+from dlo_casadi.config import Config, EstimationOptions, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
 from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError, EstimationError

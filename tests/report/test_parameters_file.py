@@ -277,9 +277,12 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
         ),
         (
             lambda d: d["effects"][0].update(center=[0, 0]),
-            "effects.0.center: length_error knows label",
+            "center: length_error knows label",
         ),
-        (lambda d: d["effects"][0].update(label=[1]), "effects.0.label: something like '' belongs"),
+        (
+            lambda d: d["effects"][0].update(label=[1]),
+            "effects[0].label: something like '' belongs",
+        ),
     ],
 )
 def test_a_value_that_cannot_be_computed_with_is_named_with_its_line(
