@@ -51,24 +51,17 @@ class Declared:
     ----------
     model : CableModel
         Nominal values, priors of the nuisances within their tolerances.
-    values : dict
-        Starting values of declared effects' parameters by qualified name.
-    fixed : tuple of str
-        Parameters that keep their declared value.
+    start : (n_parameters,)
+        Parameters at their declared values.
+    free : list of str
+        Parameters that do not keep them.
     tolerances : Tolerances
     """
 
     model: CableModel
-    values: dict[str, float]
-    fixed: tuple[str, ...]
+    start: NDArray[np.floating]
+    free: list[str]
     tolerances: Tolerances
-
-    def start_values(self) -> NDArray[np.floating]:
-        """Parameter vector at the declared values."""
-        p = self.model.nominal.copy()
-        for name, value in self.values.items():
-            p[self.model.names.index(name)] = value
-        return p
 
 
 def nuisances(
@@ -129,19 +122,19 @@ def declared_model(
     )
     if END_ROLL in model.names:
         model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
-    values: dict[str, float] = {}
-    fixed: list[str] = []
     for item in options.effects:
         model = model.with_effect(EFFECTS[item.name].made_for(setup))
-        for name, parameter in item.parameters.items():
-            values[f"{item.name}.{name}"] = parameter.value
-            if parameter.fixed:
-                fixed.append(f"{item.name}.{name}")
     if config.cable.mass is None:
         model = model.with_effect(UNKNOWN_MASS())
     tolerances = Tolerances(**setup.tolerances)
     model = nuisances(model, tolerances, pixel, setup.readings)
-    return Declared(model, values, tuple(fixed), tolerances)
+    start, free = model.nominal.copy(), list(model.names)
+    for item in options.effects:
+        for name, parameter in item.parameters.items():
+            start[model.names.index(f"{item.name}.{name}")] = parameter.value
+            if parameter.fixed:
+                free.remove(f"{item.name}.{name}")
+    return Declared(model, start, free, tolerances)
 
 
 def straight(model: CableModel) -> CableModel:
@@ -160,15 +153,14 @@ def fit_declared(
     model = declared.model.with_mesh(min(finest or first, first))
     if config.estimation.rest_curvature_coefficients is None:
         model = replace(model, n_rest=min(model.n_rest, carried_coefficients(model, measured)))
-    free = [name for name in model.names if name not in declared.fixed]
     measurement = config.experiment.measurement
     fit = fit_model(
         model,
         measured,
         declared.tolerances,
         measurement.std,
-        free=free,
-        values=declared.start_values(),
+        free=declared.free,
+        values=declared.start,
         readings=first_reading_noise(model, measurement.force_std, measurement.moment_std),
     )
     if finest:

@@ -129,11 +129,15 @@ def _reader(config: Config, pose: DeclaredPose) -> Callable[[Config, DeclaredPos
 
 def _read_csv(config: Config, pose: DeclaredPose) -> PoseInput:
     read = read_points(pose.paths[0], pose.start, pose.end, config.cable.length)
-    if len(read.points) <= MOST_POINTS:
-        return PoseInput(pose.name, pose.role, read.points, s=read.s)
-    kept = slice(None, None, -(-len(read.points) // MOST_POINTS))
+    kept = _kept(read.points)
     s = None if read.s is None else read.s[kept]
-    return PoseInput(pose.name, pose.role, read.points[kept], s=s, means=read.means(MOST_POINTS))
+    means = read.means(MOST_POINTS) if len(read.points) > MOST_POINTS else None
+    return PoseInput(pose.name, pose.role, read.points[kept], s=s, means=means)
+
+
+def _kept(points: np.ndarray) -> slice:
+    """Points evenly picked, `MOST_POINTS` at most."""
+    return slice(None, None, max(1, -(-len(points) // MOST_POINTS)))
 
 
 def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
@@ -153,7 +157,7 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
     return PoseInput(
         pose.name,
         pose.role,
-        points[:: max(1, -(-len(points) // MOST_POINTS))],
+        points[_kept(points)],
         confidence=min(curve.confidence for curve in views.curves.values()),
         messages=(*problems, *views.messages),
         markers=tuple(sorted(set.intersection(*numbers))),
@@ -172,7 +176,7 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
     except MeasurementError as error:
         hint = _turned(config, pose, image)
         raise MeasurementError(f"{error.message}{hint}") from None
-    kept = slice(None, None, max(1, -(-len(line.points) // MOST_POINTS)))
+    kept = _kept(line.points)
     return PoseInput(
         pose.name,
         pose.role,

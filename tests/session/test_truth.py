@@ -54,7 +54,7 @@ def test_stiffness_and_effects_are_those_of_the_truth(name):
         measured,
         declared.tolerances,
         config.experiment.measurement.std,
-        values=declared.start_values(),
+        values=declared.start,
         decades=(0,),
     )
 
