@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 from dlo_casadi.estimation.stiffness import LEAST_POINTS, law_of, measured_moment_curve
+from dlo_casadi.report import words
 from dlo_casadi.report.canvas import (
     BLACK,
     BLUE,
@@ -35,15 +36,7 @@ from dlo_casadi.report.canvas import (
     save_figure,
 )
 from dlo_casadi.report.scene import Mark, Scene, next_marks, pull_marks, scene_of
-from dlo_casadi.report.words import (
-    NOISE_ALONE,
-    compared,
-    cross_validated,
-    directions,
-    finding_of,
-    label_of,
-    millimetres,
-)
+from dlo_casadi.report.words import NOISE_ALONE, compared, directions, millimetres
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.thresholds import NORMAL_95
 
@@ -93,7 +86,7 @@ _KINDS = {"fit": ("o", BLUE), "cross-validated": ("D", BLUE), "held out": ("s", 
 
 def errors_figure(outcome: Outcome) -> Figure:
     """Errors of all stages as points on a logarithmic axis, with that of noise alone."""
-    validated = cross_validated(outcome)
+    validated = words.cross_validated(outcome)
     floor = outcome.measurement.noise_distance
     shown = ["fit", *["cross-validated"] * bool(validated)]
     shown += ["held out"] * bool(outcome.measurement.poses_held_out)
@@ -129,7 +122,7 @@ def errors_figure(outcome: Outcome) -> Figure:
             np.mean([y for y, (own, *_) in zip(places, rows, strict=True) if own == k])
             for k in range(len(outcome.stages))
         ]
-        names = [textwrap.fill(label_of(stage, outcome), 18) for stage in outcome.stages]
+        names = [textwrap.fill(words.label_of(stage, outcome), 18) for stage in outcome.stages]
         axes.set_yticks(middles, names)
         handles = [dot(kind, *_KINDS[kind]) for kind in shown]
         drawing.legend(handles=[*handles, _floor(floor)], loc="outside lower center", ncols=2)
@@ -268,7 +261,7 @@ def readings_figure(outcome: Outcome) -> Figure:
     stage = outcome.stages[-1]
     names = sorted({name for shape in stage.shapes.values() for name in shape.readings})
     poses = [x for x in outcome.poses if x.name in stage.shapes and stage.shapes[x.name].readings]
-    said = f"readings, measured minus predicted ({label_of(stage, outcome)})"
+    said = f"readings, measured minus predicted ({words.label_of(stage, outcome)})"
     with chart(outcome, said, 0.9 + 2.4 * len(names), len(names), 8.5) as (drawing, grid):
         for axes, name in zip(grid, names, strict=True):
             std, unit = outcome.measurement.std_of(name.split("_")[1])
@@ -376,7 +369,9 @@ def candidates_figure(outcome: Outcome) -> Figure:
             found.append(look)
             axes.barh(-k, row.score, height=0.5, color=looks[look][0])
             if look == 2:
-                axes.text(0, -k - 0.38, f" {finding_of(outcome, row)[1]}", va="center", fontsize=7)
+                axes.text(
+                    0, -k - 0.38, f" {words.finding_of(outcome, row)[1]}", va="center", fontsize=7
+                )
             text = f" {row.score:,.0f}" if row.score >= 100 else f" {row.score:.2g}"
             text += "" if error is None else f"   cross-validated {millimetres(error)}"
             axes.text(row.score, -k, text, va="center", fontsize=9)

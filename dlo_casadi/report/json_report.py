@@ -43,10 +43,10 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "warnings": [*outcome.doubts, *all_warnings(outcome)],
         "timing_s": outcome.timing,
         "measurement": {
-            **_fields(m, "kind", "poses_fit", "poses_held_out", "held_out_missing", "points"),
-            **_fields(m, "std", "std_source"),
+            **fields_of(m, "kind", "poses_fit", "poses_held_out", "held_out_missing", "points"),
+            **fields_of(m, "std", "std_source"),
             "correlation_length_m": m.correlation_length,
-            **_fields(m, "readings", "force_std", "moment_std"),
+            **fields_of(m, "readings", "force_std", "moment_std"),
         },
         "stages": [_stage(name, outcome) for name in names],
         "repeatability": {
@@ -62,12 +62,12 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "either_side": {name: asdict(found) for name, found in outcome.either_side.items()},
         "unexplained": load
         and {
-            **_fields(load, "force", "force_per_pose", "poses", "position"),
+            **fields_of(load, "force", "force_per_pose", "poses", "position"),
             "interval_95": load.interval,
         },
         "next_pose": proposal
         and {
-            **_fields(proposal, "end", "separates"),
+            **fields_of(proposal, "end", "separates"),
             "expected_difference_m": proposal.difference,
             "expected_difference_std": proposal.separation,
             "reading": asdict(proposal.reading),
@@ -100,8 +100,8 @@ def finite(value: Any) -> Any:
     return value
 
 
-def _fields(item: object, *names: str) -> dict[str, Any]:
-    """Fields of an object that have the same name in the file."""
+def fields_of(item: object, *names: str) -> dict[str, Any]:
+    """Fields of an object that have the same names in a file."""
     return {name: getattr(item, name) for name in names}
 
 
@@ -122,7 +122,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
         curvature = {"s": rest.s, **own}
     kept = ("value", "std", "unit", "interval_95", "identifiable")
     return {
-        **_fields(stage, "name", "rmse_fit", "rmse_held_out"),
+        **fields_of(stage, "name", "rmse_fit", "rmse_held_out"),
         "force_rmse_fit": stage.readings_fit.force,
         "force_rmse_held_out": stage.readings_held_out.force,
         "moment_rmse_fit": stage.readings_fit.moment,
@@ -135,12 +135,12 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
             for pose, shape in stage.shapes.items()
             if shape.readings
         },
-        **_fields(stage, "rmse_fit_measured_branch", "rmse_held_out_measured_branch"),
+        **fields_of(stage, "rmse_fit_measured_branch", "rmse_held_out_measured_branch"),
         "other_branch": {
             pose: {
                 "rmse": stage.shapes[pose].rmse,
                 "rmse_measured_branch": found.rmse,
-                **_fields(found, "branch", "turns"),
+                **fields_of(found, "branch", "turns"),
             }
             for pose, found in stage.other_branch.items()
         },
@@ -148,7 +148,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
         "held_out": held_out,
         "chi2_per_dof": stage.chi2_per_dof,
         "parameters": {
-            **{key: _fields(found, *kept) for key, found in stage.parameters.items()},
+            **{key: fields_of(found, *kept) for key, found in stage.parameters.items()},
             "rest_curvature": curvature,
         },
     }
@@ -192,7 +192,7 @@ def _checked(config: Config, item: PoseInput) -> dict[str, Any]:
         "length": length,
         "length_over_declared": None if length is None else length / config.cable.length,
         "largest_distance_from_fixture": max(away, default=None),
-        **_fields(item, "coverage", "confidence", "pixel", "markers"),
+        **fields_of(item, "coverage", "confidence", "pixel", "markers"),
         "problem": item.problem or None,
         "advice": item.messages,
     }

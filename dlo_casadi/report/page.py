@@ -8,7 +8,6 @@ import inspect
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,36 +18,12 @@ from matplotlib.figure import Figure
 from dlo_casadi.config import Config
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.errors import DloError, counted
-from dlo_casadi.io.files import write_file
+from dlo_casadi.report import tables, words
 from dlo_casadi.report.canvas import inline_svg
 from dlo_casadi.report.figures import figures_of
 from dlo_casadi.report.page_pictures import pictures, pose_pictures, scene_pictures, view_pictures
 from dlo_casadi.report.scene import VIEWS
-from dlo_casadi.report.tables import (
-    describe,
-    fitted_rows,
-    fixed_rows,
-    footnotes,
-    nuisance_rows,
-    rest_rows,
-    stage_rows,
-    timing_rows,
-)
-from dlo_casadi.report.words import (
-    CANDIDATE_ORDER,
-    NOISE_ALONE,
-    all_warnings,
-    compared,
-    finding_of,
-    label_of,
-    mesh_text,
-    millimetres,
-    p_value_note,
-    reading_text,
-    separation_text,
-    vector,
-    verdict_lines,
-)
+from dlo_casadi.report.words import compared, millimetres
 from dlo_casadi.session.outcome import Outcome, ParameterEstimate, PoseInput
 from dlo_casadi.thresholds import NORMAL_95
 
@@ -89,45 +64,25 @@ def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> 
         forces_read=any(mark.kind == "force-read" for item in shown for mark in item.over),
         scenes=scene_pictures(outcome),
         charts={name: Markup(inline_svg(chart, name)) for name, chart in charts.items()},
+        outcome=outcome,
         **page_data(outcome),
     )
 
 
 def page_data(outcome: Outcome) -> dict[str, Any]:
-    """Everything that the template of a run writes, but for pictures and charts."""
-    first, *details = (line.strip() for line in verdict_lines(outcome))
+    """What the template of a run writes, beside pictures, charts and the outcome itself."""
+    first, *details = (line.strip() for line in words.verdict_lines(outcome))
     labels = {item.kind: item.label for item in compared(outcome)}
-    m, proposal = outcome.measurement, outcome.next_pose
     return {
         "verdict": outcome.verdict or "off",
         "verdict_word": "Fit failed" if outcome.fit.failed else VERDICT_WORDS[outcome.verdict],
         "sentence": sentence(first),
         "details": details,
-        "tiles": tiles(outcome),
-        "warnings": all_warnings(outcome),
         "before": labels.get("before"),
         "after": labels.get("after"),
-        "last": label_of(outcome.stages[-1], outcome),
-        "stages": stage_rows(outcome, NOTHING),
-        "noise": millimetres(m.std),
-        "noise_alone": NOISE_ALONE,
-        "noise_distance": millimetres(m.noise_distance),
-        "noise_source": m.std_source,
-        "correlation": millimetres(m.correlation_length) if m.correlation_length > 0 else None,
+        "tiles": tiles(outcome),
         "candidates": candidate_rows(outcome),
-        "candidate_order": CANDIDATE_ORDER,
-        "p_value_note": p_value_note(outcome),
         "parameters": parameter_rows(outcome),
-        "nuisances": nuisance_rows(outcome),
-        "fixed": fixed_rows(outcome),
-        "footnotes": footnotes(outcome),
-        "next_pose": proposal,
-        "next_pose_said": proposal
-        and f"{sentence(separation_text(proposal))} {reading_text(proposal.reading)}",
-        "unexplained": outcome.unexplained,
-        "timing": timing_rows(outcome),
-        "mesh": mesh_text(outcome),
-        "versions": outcome.versions,
     }
 
 
@@ -138,7 +93,7 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         after = shown[-1].stage
         stiffness = after.parameters.get("bending_stiffness")
         if stiffness is not None:
-            value, interval, remark = describe(stiffness)
+            value, interval, remark = tables.describe(stiffness)
             rows.append(("bending stiffness", value, f"95 %: {interval}" if interval else remark))
         role, key = "held-out poses", "rmse_held_out"
         if after.rmse_held_out is None:
@@ -146,7 +101,9 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         was = [f"{x.label}: {millimetres(getattr(x.stage, key), NOTHING)}" for x in shown[:-1]]
         now = millimetres(getattr(after, key), NOTHING)
         rows.append((f"error, {role}", now, "".join(was)))
-    rows.append((NOISE_ALONE, millimetres(m.noise_distance), f"of the points, {m.std_source}"))
+    rows.append(
+        (words.NOISE_ALONE, millimetres(m.noise_distance), f"of the points, {m.std_source}")
+    )
     lost = f"; {len(m.held_out_missing)} held out were not measured" if m.held_out_missing else ""
     count = f"{m.poses_fit} + {m.poses_held_out}"
     return [*rows, ("poses", count, f"to fit + held out to check{lost}")]
@@ -157,7 +114,7 @@ def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
     largest = max([row.score for row in outcome.candidates], default=0.0)
     rows = []
     for row in outcome.candidates:
-        status, said = finding_of(outcome, row)
+        status, said = words.finding_of(outcome, row)
         rows.append(
             {
                 "name": row.name,
@@ -183,11 +140,11 @@ def parameter_rows(outcome: Outcome) -> list[dict[str, str]]:
     """Fitted parameters of the last stage with 95 % intervals, and what the data cannot tell."""
     keys = ("name", "value", "interval", "remark", "doubt")
     rows = []
-    for name, value, interval, remark in fitted_rows(outcome):
+    for name, value, interval, remark in tables.fitted_rows(outcome):
         found = outcome.stages[-1].parameters[name]
         doubt = "unknown" if found.identifiable is False else "bound" if found.at_bound else ""
         rows.append((name, value, interval or symmetric_interval(found), remark, doubt))
-    rows += [(*row, "") for row in rest_rows(outcome)]
+    rows += [(*row, "") for row in tables.rest_rows(outcome)]
     return [dict(zip(keys, row, strict=True)) for row in rows]
 
 
@@ -202,32 +159,8 @@ def symmetric_interval(estimate: ParameterEstimate) -> str:
 # ---- of a run that has failed ------------------------------------------------------------------
 
 
-def write_failure_page(
-    path: Path, config: Config, error: DloError, poses: Sequence[PoseInput] = ()
-) -> None:
-    """Write the page of a run that has failed, whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    config : Config
-        What was run.
-    error : DloError
-        How it ended.
-    poses : sequence of PoseInput
-        The poses as they were read; empty if it did not come to that.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    write_file(path, failure_page(config, error, poses))
-
-
 def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = ()) -> str:
-    """The text of failed.html."""
+    """The text of failed.html: what was run, how it ended, the poses as they were read, if any."""
     known = {pose.name: pose for pose in poses}
     nothing = np.zeros((0, len(config.experiment.gravity)))
     shown = [
@@ -315,7 +248,8 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for item in (units, breakable, vector, counted):
+    environment.globals |= {"words": words, "tables": tables}
+    for item in (units, breakable, counted, sentence, millimetres, words.vector):
         environment.filters[item.__name__] = item
     return environment
 

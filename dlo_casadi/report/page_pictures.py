@@ -38,7 +38,7 @@ from dlo_casadi.session.pose_shape import PoseShape
 from dlo_casadi.vision import nearest_in_order
 
 FloatArray = NDArray[np.floating]
-Box = tuple[float, float, float, float]
+Box = tuple[float, float, float, float]  # left, top, width, height
 
 # Of a part of a photograph about the cable: its sides over those of the cable.
 _ROOM = 1.3
@@ -48,51 +48,37 @@ _PER_POINT = 4  # of a predicted curve in a photograph, between two of its point
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a picture, or a word in it.
-
-    Parameters
-    ----------
-    kind : str
-        "measured", "before", "after", or that of a `scene.Mark`.
-    points : str
-        "u,v u,v ..." as SVG has it.
-    near : str
-        Of a prediction: its points beside the measured ones, one for one; deviations are enlarged
-        by moving them away from those.
-    solid, near_solid : str
-        The same points in a room, "x,y,z x,y,z ...".
-    label : str
-        The word, if it is one.
-    """
+    """A line of a picture, or a word in it."""
 
     kind: str
+    """"measured", "before", "after", or that of a `scene.Mark`."""
     points: str
+    """"u,v u,v ..." as SVG has it."""
     near: str = ""
+    """Of a prediction: its points beside the measured ones, one for one.
+
+    Deviations are enlarged by moving them away from those.
+    """
     solid: str = ""
+    """The points in a room, "x,y,z x,y,z ..."."""
     near_solid: str = ""
+    """Those of `near` in a room."""
     label: str = ""
+    """The word, if it is one."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """What lies under the lines: a photograph [px], the board or a room [mm, y down].
-
-    Parameters
-    ----------
-    whole : (left, top, width, height)
-        All there is.
-    scene : Scene or None
-        Where the pose stands; None of a photograph in space, which has the world's coordinates.
-    place : callable or None
-        Maps points of the scene into it; None where the camera was not located.
-    photograph : str
-        As a data URI; empty for the board.
-    """
+    """What lies under the lines: a photograph [px], the board or a room [mm, y down]."""
 
     whole: Box
+    """All there is."""
     scene: Scene | None
+    """Where the pose stands; None of a photograph in space, which has the world's coordinates."""
     place: Callable[[FloatArray], FloatArray] | None
+    """Maps points of the scene into it; None where the camera was not located."""
     photograph: str = ""
+    """As a data URI; empty for the board."""
 
     @property
     def room(self) -> Room | None:
@@ -147,38 +133,27 @@ class Background:
 
 @dataclass(frozen=True)
 class Picture:
-    """One pose as the page shows it.
-
-    Parameters
-    ----------
-    behind : Background
-        What lies under the lines.
-    box : (left, top, width, height)
-        What of it is shown at first: the part with the cable.
-    start, end : (u, v) or None
-        Where the cable begins and ends: predicted, or declared where nothing was.
-    facts : tuple of (kind, name, text)
-        The kind is that of the line that a fact is about.
-    notes : tuple of str
-        What the camera step noticed, or why the pose could not be read.
-    under, over : tuple of Line
-        What stands there behind the cable, and in front of it; in a plane the forces that were
-        read, beside the predicted ones.
-    """
+    """One pose as the page shows it."""
 
     name: str
     role: str
     alt: str
     behind: Background
     box: Box
+    """What is shown of `behind` at first: the part with the cable."""
     lines: tuple[Line, ...] = ()
     start: tuple[float, float] | None = None
     end: tuple[float, float] | None = None
+    """Where the cable begins and ends: predicted, or declared where nothing was."""
     facts: tuple[tuple[str, str, str], ...] = ()
+    """(kind, name, text); the kind is that of the line that a fact is about."""
     problem: str = ""
+    """Why the pose could not be read."""
     notes: tuple[str, ...] = ()
+    """What the camera step noticed."""
     under: tuple[Line, ...] = ()
     over: tuple[Line, ...] = ()
+    """What stands behind the cable and in front of it; in a plane the forces that were read."""
 
 
 def pictures(outcome: Outcome) -> list[Picture]:

@@ -18,7 +18,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.io.parameters import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.model.cable_model import STIFFNESSES
-from dlo_casadi.report.json_report import finite
+from dlo_casadi.report.json_report import fields_of, finite
 from dlo_casadi.session.outcome import Outcome
 
 FloatArray = NDArray[np.floating]
@@ -69,27 +69,21 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "cable": {
-            "name": model.cable.name,
-            "length": model.cable.length,
-            "mass": model.cable.mass,
-            "diameter": model.cable.diameter,
-            "bending_stiffness": model.cable.bending_stiffness,
-            **({"torsional_stiffness": model.cable.torsional_stiffness} if model.in_space else {}),
+            **fields_of(model.cable, "name", "length", "mass", "diameter"),
+            **fields_of(
+                model.cable, "bending_stiffness", *["torsional_stiffness"] * model.in_space
+            ),
             "rest_shape": "straight" if model.cable.straight else "curved",
         },
         "boundary": {"start": model.start, "end": model.end},
         "gravity": list(model.gravity),
-        "element": model.element,
-        "n": model.n,
-        "n_rest": model.n_rest,
+        **fields_of(model, "element", "n", "n_rest"),
         "effects": [_effect_row(effect) for effect in model.effects],
         "parameters": {
             q.name: {
                 "value": float(value),
                 "std": fit.std(q.name),
-                "unit": q.unit,
-                "lower": q.lower,
-                "upper": q.upper,
+                **fields_of(q, "unit", "lower", "upper"),
                 "fitted": q.name in names,
                 # Standard deviation of the prior of what is known within a tolerance.
                 "tolerance": model.priors.get(q.name),
@@ -136,10 +130,8 @@ def _effect_row(effect: Effect) -> dict[str, Any]:
     """Name and label of an effect, and what else it was made with."""
     if known_effect(effect.name) is not type(effect):
         raise DloError(f"the effect {effect.name!r} cannot be written to parameters.yaml")
-    options = {
-        item.name: getattr(effect, item.name) for item in fields(effect) if item.name != "label"
-    }
-    return {"name": effect.name, "label": effect.label, **options}
+    options = (item.name for item in fields(effect) if item.name != "label")
+    return fields_of(effect, "name", "label", *options)
 
 
 def shared_fixtures(config: Config) -> dict[str, Any]:

@@ -45,20 +45,13 @@ _POINTS = 60
 
 @dataclass(frozen=True)
 class Mark:
-    """A line in a scene, or a word at a place in it.
-
-    Parameters
-    ----------
-    kind : str
-        How it is drawn.
-    points : (K, d)
-    label : str
-        The word, if it is one.
-    """
+    """A line (K, d) in a scene, or a word at a place in it."""
 
     kind: str
+    """How it is drawn."""
     points: FloatArray
     label: str = ""
+    """The word, if it is one."""
 
 
 def arrow(root: FloatArray, shaft: FloatArray) -> FloatArray:
@@ -97,21 +90,14 @@ def band_outline(curve: FloatArray, half_width: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Board:
-    """The plane of a cable.
-
-    Parameters
-    ----------
-    length : float [m]
-        Of the cable.
-    newton : float [m/N]
-        How long a force is drawn.
-    markers : (K, 5, 2) [m], optional
-        Outlines of the squares printed on it.
-    """
+    """The plane of a cable."""
 
     length: float
+    """Of the cable [m]."""
     newton: float
+    """How long a force is drawn [m/N]."""
     markers: FloatArray | tuple[()] = ()
+    """Outlines (K, 5, 2) [m] of the squares printed on it."""
 
     def points(self, points: FloatArray) -> FloatArray:
         """Points (K, 2) [m], or one of them, as they are."""
@@ -128,30 +114,20 @@ class Board:
 
 @dataclass(frozen=True)
 class Room:
-    """Space about one pose.
-
-    Parameters
-    ----------
-    upright : (3, 3)
-        Rows: two level directions of the world, and the one up.
-    center : (3,) [mm]
-        Its middle, in those directions from the world's origin.
-    radius : float [mm]
-        Of a ball that holds the cable and the arrows in every pose.
-    floor : float [mm]
-        Height of the floor.
-    length : float [mm]
-        Of the cable.
-    newton : float [mm/N]
-        How long a force is drawn.
-    """
+    """Space about one pose."""
 
     upright: FloatArray
+    """Rows (3, 3): two level directions of the world, and the one up."""
     center: FloatArray
+    """Its middle (3,) [mm], in those directions from the world's origin."""
     radius: float
+    """Of a ball [mm] that holds the cable and the arrows in every pose."""
     floor: float
+    """Height of the floor [mm]."""
     length: float
+    """Of the cable [mm]."""
     newton: float = 0.0
+    """How long a force is drawn [mm/N]."""
 
     @property
     def square(self) -> float:

@@ -13,28 +13,8 @@ from rich.text import Text
 from dlo_casadi.config import Config
 from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.errors import counted
-from dlo_casadi.report.tables import (
-    fitted_rows,
-    fixed_rows,
-    footnotes,
-    nuisance_rows,
-    prediction_rows,
-    rest_rows,
-    stage_rows,
-    timing_rows,
-)
-from dlo_casadi.report.words import (
-    CANDIDATE_ORDER,
-    NOISE_ALONE,
-    all_warnings,
-    cross_validated,
-    finding_of,
-    label_of,
-    mesh_text,
-    millimetres,
-    p_value_note,
-    verdict_lines,
-)
+from dlo_casadi.report import tables, words
+from dlo_casadi.report.words import millimetres
 from dlo_casadi.session.outcome import Outcome, ReadingErrors
 
 # Of the table of a check: the key of a pose's row, how its number is written, and times what.
@@ -65,18 +45,20 @@ def _table(title: str, words: Sequence[str], numbers: Sequence[str] = ()) -> Tab
 
 def print_summary(console: Console, outcome: Outcome) -> None:
     """Print all that a user should see at the end of a run."""
-    warnings = [Text.assemble(("warning: ", "bold yellow"), text) for text in all_warnings(outcome)]
+    warnings = [
+        Text.assemble(("warning: ", "bold yellow"), text) for text in words.all_warnings(outcome)
+    ]
     blank = [Text("")] if warnings else []
     console.print(
         Group(
             "",
             _heading(outcome),
             _parameter_table(outcome),
-            *(Text("  " + line) for line in footnotes(outcome)),
+            *(Text("  " + line) for line in tables.footnotes(outcome)),
             "",
             _error_table(outcome),
             "",
-            *(Text(line) for line in verdict_lines(outcome)),
+            *(Text(line) for line in words.verdict_lines(outcome)),
             *blank,
             *warnings,
             "",
@@ -94,19 +76,23 @@ def _heading(outcome: Outcome) -> Text:
     declared = f" of {m.poses_held_out + missing}" if missing else ""
     text = (
         f"{counted(m.poses_fit, 'fit pose')}, {m.poses_held_out}{declared} held out, "
-        f"{counted(m.points, 'point')}; {noise}; {mesh_text(outcome)}"
+        f"{counted(m.points, 'point')}; {noise}; {words.mesh_text(outcome)}"
     )
     return Text.assemble((outcome.config.cable.name, "bold"), ": ", text)
 
 
 def _parameter_table(outcome: Outcome) -> Table:
     """Fitted parameters of the last stage with their units, and what was kept fixed."""
-    table = _table(f"Parameters ({label_of(outcome.stages[-1], outcome)})", [])
+    table = _table(f"Parameters ({words.label_of(outcome.stages[-1], outcome)})", [])
     for column in ("parameter", "value", "95 % interval", ""):
         table.add_column(column, no_wrap=bool(column))
-    for row in (*fitted_rows(outcome), *rest_rows(outcome), *nuisance_rows(outcome)):
+    for row in (
+        *tables.fitted_rows(outcome),
+        *tables.rest_rows(outcome),
+        *tables.nuisance_rows(outcome),
+    ):
         table.add_row(*row)
-    for row in fixed_rows(outcome):
+    for row in tables.fixed_rows(outcome):
         table.add_row(*row, style="dim")
     return table
 
@@ -115,11 +101,11 @@ def _error_table(outcome: Outcome) -> Table:
     """Errors of the stages: fit, cross-validated, held out, chi-square, beside the noise."""
     columns = {"fit": "fit", "validated": "cross-validated", "held_out": "held out"}
     columns["chi2"] = "chi2/dof"
-    if not cross_validated(outcome):
+    if not words.cross_validated(outcome):
         del columns["validated"]
     title = "Distance of the measured points from the predicted shape, RMS"
     table = _table(title, ["stage"], list(columns.values()))
-    for row in stage_rows(outcome, "-"):
+    for row in tables.stage_rows(outcome, "-"):
         table.add_row(row["label"], *(row[column] for column in columns))
     if outcome.measurement.readings:
         last = outcome.stages[-1]
@@ -127,7 +113,7 @@ def _error_table(outcome: Outcome) -> Table:
         table.add_row("  forces, moments", *(cells.get(column, "") for column in columns))
     table.add_section()
     floor = millimetres(outcome.measurement.noise_distance)
-    table.add_row(f"{NOISE_ALONE} ({outcome.measurement.std_source})", floor)
+    table.add_row(f"{words.NOISE_ALONE} ({outcome.measurement.std_source})", floor)
     return table
 
 
@@ -140,12 +126,12 @@ def _newtons(errors: ReadingErrors) -> str:
 def candidate_table(outcome: Outcome) -> Table:
     """Every effect that was tried, in the order of `CANDIDATE_ORDER`."""
     numbers = ("score", "p-value", "cross-validated error")
-    table = _table(f"Effects that were tried: {CANDIDATE_ORDER}", ["effect"], numbers)
-    table.caption, table.caption_justify = p_value_note(outcome), "left"
+    table = _table(f"Effects that were tried: {words.CANDIDATE_ORDER}", ["effect"], numbers)
+    table.caption, table.caption_justify = words.p_value_note(outcome), "left"
     table.add_column("finding")
     for row in outcome.candidates:
         error = millimetres(row.rmse_cross_validated)
-        finding = finding_of(outcome, row)[1]
+        finding = words.finding_of(outcome, row)[1]
         table.add_row(row.name, f"{row.score:.1f}", f"{row.p_value:.2g}", error, finding)
     return table
 
@@ -154,7 +140,7 @@ def _timing_table(outcome: Outcome) -> Table:
     """Wall-clock time of the parts of the run."""
     table = _table("Time", ["part"], ["seconds"])
     table.add_column("")
-    *parts, total = timing_rows(outcome)
+    *parts, total = tables.timing_rows(outcome)
     for row in parts:
         table.add_row(*row)
     table.add_section()
@@ -168,7 +154,7 @@ def _timing_table(outcome: Outcome) -> Table:
 def prediction_table(shape: CableShape, notes: Iterable[str] = ()) -> RenderableType:
     """Reactions, energy, stability and shape of one predicted pose."""
     table = _table(f"{shape.cable.model.cable.name}: predicted shape", ["quantity", "value"])
-    for row in prediction_rows(shape):
+    for row in tables.prediction_rows(shape):
         table.add_row(*row)
     every = shape.points()
     axes = "xyz"[: every.shape[1]]

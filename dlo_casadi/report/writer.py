@@ -17,7 +17,7 @@ from dlo_casadi.io.points import write_points, write_table
 from dlo_casadi.report.figures import figures_of, write_figures
 from dlo_casadi.report.figures_poses import draw_poses
 from dlo_casadi.report.json_report import report_text
-from dlo_casadi.report.page import GENERATOR, report_page, write_failure_page
+from dlo_casadi.report.page import GENERATOR, failure_page, report_page
 from dlo_casadi.report.parameters_text import parameters_text
 from dlo_casadi.report.photographs import write_overlays
 from dlo_casadi.runtime.executors import InProcess
@@ -76,8 +76,9 @@ class ResultsFolder(FolderDraft):
         super().__exit__(kind, error, trace)
         if isinstance(error, DloError) and self.config is not None:
             try:
+                page = failure_page(self.config, error, error.poses)
                 with FolderDraft(self.path) as draft:
-                    write_failure_page(draft.folder / FAILURE, self.config, error, error.poses)
+                    write_file(draft.folder / FAILURE, page)
                     draft.put_in_place()
             except OutputError:
                 return  # the error itself is what the user must see

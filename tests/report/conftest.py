@@ -5,9 +5,14 @@ import os
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(variable, "1")  # before numpy: the matrices are small
 
-import pytest  # noqa: E402
-from small_sessions import in_space, photographs, small  # noqa: E402
+from contextlib import redirect_stdout  # noqa: E402
+from io import StringIO  # noqa: E402
 
+import pytest  # noqa: E402
+from small_sessions import BARE, in_space, photographs, small  # noqa: E402
+
+from dlo_casadi.cli import main  # noqa: E402
+from dlo_casadi.report import writer  # noqa: E402
 from dlo_casadi.session import run_session  # noqa: E402
 
 
@@ -24,3 +29,32 @@ def photographed():
 @pytest.fixture(scope="session")
 def in_room():
     return run_session(in_space(("pose_01", "pose_02", "pose_04")))
+
+
+@pytest.fixture(scope="session")
+def written(outcome, tmp_path_factory):
+    """Folder of the small session's results, and what `dlo fit --json` printed."""
+    folder = tmp_path_factory.mktemp("written") / "rope"
+    command = ["fit", str(outcome.config.path), "--json", "--quiet", "--output", str(folder)]
+    printed = StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
+        patch.setattr("dlo_casadi.session.run_session", lambda *_: outcome)
+        assert main([*command, "--jobs", "1"]) == 0
+    return folder, printed.getvalue()
+
+
+@pytest.fixture(scope="session")
+def page(written):
+    """Its report.html."""
+    folder, _ = written
+    return (folder / "report.html").read_text()
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Figures take seconds and have their own tests: empty ones stand in."""
+    monkeypatch.setattr(writer, "figures_of", lambda outcome: BARE)
+    monkeypatch.setattr(writer, "write_figures", lambda folder, outcome: None)
+    monkeypatch.setattr(
+        writer, "draw_poses", lambda folder, outcome: (folder / "poses.png").touch()
+    )

@@ -3,9 +3,23 @@
 from dataclasses import replace
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from dlo_casadi.config import load_config
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
+# Charts of a page of which only the text is looked at.
+BARE = {
+    name: Figure((1, 1))
+    for name in (
+        "errors",
+        "pose_errors",
+        "residuals",
+        "rest_curvature",
+        "unexplained",
+        "next_pose",
+    )
+}
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 

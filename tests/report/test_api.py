@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
 
@@ -89,18 +88,6 @@ def test_plots_are_figures_that_leave_pyplot_alone(result):
     assert "held out of the fit" in {line.get_label() for line in lines}
     assert isinstance(result.predict((0.3, -0.1)).plot(), Figure)
     assert dict(mpl.rcParams) == before
-
-
-@pytest.fixture(scope="module")
-def written(outcome, tmp_path_factory):
-    """Folder of the small session's results, and what `dlo fit --json` printed."""
-    folder = tmp_path_factory.mktemp("written") / "rope"
-    command = ["fit", str(outcome.config.path), "--json", "--quiet", "--output", str(folder)]
-    printed = StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
-        patch.setattr("dlo_casadi.session.run_session", lambda *_: outcome)
-        assert main(command) == 0
-    return folder, printed.getvalue()
 
 
 def test_fit_prints_its_report_and_nothing_else(written):

@@ -71,11 +71,9 @@ def drawn(path):
     return image.shape[:2], float((image.min(axis=2) < 0.9).mean())
 
 
-def test_an_outcome_without_effects(outcome, tmp_path):
-    figures_poses.draw_poses(tmp_path, outcome)
-    figures.write_figures(tmp_path, figures.figures_of(outcome))
-
-    names = {path.name for path in tmp_path.iterdir()}
+def test_an_outcome_without_effects(written):
+    folder = written[0] / "figures"
+    names = {path.name for path in folder.iterdir()}
     assert names == {
         "poses.png",
         "residuals.png",
@@ -83,7 +81,7 @@ def test_an_outcome_without_effects(outcome, tmp_path):
         "errors.png",
         "pose_errors.png",
     }
-    for path in tmp_path.iterdir():
+    for path in folder.iterdir():
         (height, width), ink = drawn(path)
         assert min(height, width) >= 500, path.name
         assert ink > 0.01, path.name

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from small_sessions import BARE
 from test_terminal import said
 
 from dlo_casadi.equilibrium.pose import Pose
@@ -44,7 +45,7 @@ def test_markers_in_space_have_one_floor_everywhere(in_room, monkeypatch):
     assert f"{row} {millimetres(floor)}" in said(in_room)
     assert f"{row}  {1e3 * floor:.3g} mm" in outcome_text(in_room)
     assert f"<td>{row}</td><td>{1e3 * floor:.3g} mm</td>" in outcome_html(in_room)
-    page = report_page(in_room)
+    page = report_page(in_room, BARE | dict(zip(("errors", "pose_errors"), shown, strict=True)))
     assert f"noise alone, {millimetres(floor)}" in page
     assert "noise floor" not in page
     assert report_dict(in_room)["measurement"]["std"] == in_room.measurement.std

@@ -7,8 +7,9 @@ import pytest
 from test_writer import tree
 
 from dlo_casadi.errors import DloError, EstimationError, MeasurementError, OutputError
+from dlo_casadi.io.files import write_file
 from dlo_casadi.report import writer
-from dlo_casadi.report.page import GENERATOR, failure_page, hints, write_failure_page
+from dlo_casadi.report.page import GENERATOR, failure_page, hints
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import run_session
 
@@ -100,9 +101,7 @@ def test_earlier_results_stay_and_the_user_is_told_of_the_page(outcome, tmp_path
     assert error.__notes__ == [f"Pose by pose: {target / 'failed.html'}"]
 
 
-def test_the_next_success_removes_the_page(outcome, tmp_path, monkeypatch):
-    for step in ("write_figures", "draw_poses"):
-        monkeypatch.setattr(writer, step, lambda folder, outcome: None)
+def test_the_next_success_removes_the_page(outcome, quick, tmp_path):
     target = tmp_path / "results"
     fail(target, outcome.config, DloError("broken"))
     assert [path.name for path in target.iterdir()] == ["failed.html"]
@@ -129,7 +128,7 @@ def test_a_page_that_cannot_be_written_does_not_hide_the_error(outcome, tmp_path
     def refuse(*_):
         raise OutputError("cannot be written: Permission denied")
 
-    monkeypatch.setattr(writer, "write_failure_page", refuse)
+    monkeypatch.setattr(writer, "write_file", refuse)
     error = DloError("broken")
     fail(tmp_path / "results", outcome.config, error)
 
@@ -147,7 +146,7 @@ def test_a_page_of_that_name_from_elsewhere_is_not_replaced(outcome, tmp_path):
 
 
 def test_a_page_is_whole_or_not_there(outcome, tmp_path, monkeypatch):
-    write_failure_page(tmp_path / "failed.html", outcome.config, DloError("first"))
+    fail(tmp_path, outcome.config, DloError("first"))
     before = tree(tmp_path)
 
     def stop(*_):
@@ -155,5 +154,6 @@ def test_a_page_is_whole_or_not_there(outcome, tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.replace", stop)
     with pytest.raises(OutputError, match="No space"):
-        write_failure_page(tmp_path / "failed.html", outcome.config, DloError("second"))
+        write_file(tmp_path / "failed.html", failure_page(outcome.config, DloError("second")))
+    fail(tmp_path, outcome.config, DloError("third"))
     assert tree(tmp_path) == before

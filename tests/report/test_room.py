@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from rich.console import Console
+from small_sessions import BARE
 from test_figures import pull
 from test_page import PROPOSAL, diagnosed
 
@@ -98,7 +99,7 @@ def test_what_is_said_has_three_components(in_room):
     console = Console(width=200, record=True, file=io.StringIO())
     print_summary(console, pulled)
     text = console.export_text()
-    for said in (text, report_page(pulled)):
+    for said in (text, report_page(pulled, BARE)):
         assert "(0, 0.1, 0.2) N" in said
         assert "(0.600, -0.200, 0.300) m" in said
         assert "(0, 0, -9.81) m/s" in said

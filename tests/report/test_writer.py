@@ -3,7 +3,6 @@
 import json
 import os
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,15 +15,6 @@ from dlo_casadi.report import writer
 from dlo_casadi.report.page import GENERATOR
 from dlo_casadi.report.writer import OWNED, ResultsFolder
 from dlo_casadi.runtime.parallel import open_executor
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """Figures take seconds and have their own tests: an empty one stands in."""
-    monkeypatch.setattr(writer, "write_figures", lambda folder, outcome: None)
-    monkeypatch.setattr(
-        writer, "draw_poses", lambda folder, outcome: (folder / "poses.png").touch()
-    )
 
 
 def tree(folder):
@@ -93,7 +83,9 @@ def test_a_run_that_stops_before_writing_leaves_no_trace(earlier, error):
 @pytest.mark.parametrize(
     ("error", "step"), [(KeyboardInterrupt, "write_figures"), (ValueError, "parameters_text")]
 )
-def test_a_run_that_stops_while_writing_leaves_no_trace(outcome, monkeypatch, earlier, error, step):
+def test_a_run_that_stops_while_writing_leaves_no_trace(
+    outcome, quick, monkeypatch, earlier, error, step
+):
     def stop(*_):
         raise error
 
@@ -103,6 +95,13 @@ def test_a_run_that_stops_while_writing_leaves_no_trace(outcome, monkeypatch, ea
         folder.write(outcome)
 
     assert tree(earlier) == before
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Where the other half is drawn: one more process."""
+    with open_executor(2, here=True) as executor:
+        yield executor
 
 
 def broken(folder, outcome):
@@ -125,21 +124,31 @@ def interrupted(folder, outcome):
         (None, broken, ZeroDivisionError, False),
         (broken, full, OutputError, True),
         (full, broken, OutputError, True),
-        (interrupted, full, KeyboardInterrupt, True),
     ],
 )
-def test_halves_that_fail(outcome, monkeypatch, earlier, here, there, error, kept):
+def test_halves_that_fail(outcome, monkeypatch, earlier, two, here, there, error, kept):
     """In two processes: the numbers stay where they can, and what the user has to see is raised."""
     monkeypatch.setattr(writer, "draw_each", here or nothing)
     monkeypatch.setattr(writer, "draw_summary", there or nothing)
     before = tree(earlier)
+    with pytest.raises(error), ResultsFolder(earlier) as folder:
+        folder.write(outcome, two)
+    assert (tree(earlier) == before) == kept
+    assert not list(earlier.glob(".*"))
+
+
+def test_a_half_that_is_interrupted(outcome, monkeypatch, earlier):
+    """While the other half is at work in a process that ends before the folder does."""
+    monkeypatch.setattr(writer, "draw_each", interrupted)
+    monkeypatch.setattr(writer, "draw_summary", full)
+    before = tree(earlier)
     with (
-        pytest.raises(error),
+        pytest.raises(KeyboardInterrupt),
         ResultsFolder(earlier) as folder,
         open_executor(2, here=True) as executor,
     ):
         folder.write(outcome, executor)
-    assert (tree(earlier) == before) == kept
+    assert tree(earlier) == before
     assert not list(earlier.glob(".*"))
 
 
@@ -147,13 +156,11 @@ def nothing(folder, outcome):
     pass
 
 
-def test_two_processes_draw_what_one_draws(outcome, tmp_path):
-    outcome = replace(outcome, poses=outcome.poses[:2])
-    with open_executor(2, here=True) as executor:
-        for name, where in (("one", None), ("two", executor)):
-            with ResultsFolder(tmp_path / name) as folder:
-                folder.write(outcome, where)
-    assert tree(tmp_path / "one").keys() == tree(tmp_path / "two").keys()
+def test_two_processes_draw_what_one_draws(outcome, written, two, tmp_path):
+    with ResultsFolder(tmp_path / "two") as folder:
+        folder.write(outcome, two)
+    one, _ = written
+    assert tree(one).keys() == tree(tmp_path / "two").keys()
 
 
 def test_a_disk_that_is_full_leaves_the_earlier_results(outcome, monkeypatch, earlier):
@@ -196,7 +203,9 @@ def test_files_of_the_same_names_from_elsewhere_are_not_replaced(tmp_path):
         pass
 
 
-def test_a_chart_that_cannot_be_drawn_does_not_lose_the_numbers(outcome, earlier, monkeypatch):
+def test_a_chart_that_cannot_be_drawn_does_not_lose_the_numbers(
+    outcome, quick, earlier, monkeypatch
+):
     def broken(outcome, drawn):
         raise ZeroDivisionError("no range")
 
