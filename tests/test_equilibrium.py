@@ -210,11 +210,13 @@ def bench(name: str, n: int, element: str, poses: int = 99) -> list[np.ndarray]:
     for low, high in model.chain.cells:
         s = np.linspace(low, high, 101)
         rest.append(np.trapezoid(np.interp(s, places, kappa), s) / (high - low))
-    shapes = []
-    for item in config.experiment.poses[:poses]:
-        pose = Pose(item.start, item.end, branch="ccw", name=item.name)
-        shapes.append(solve_equilibrium(model, np.array([stiffness]), np.array(rest), pose).points)
-    return shapes
+    held = [
+        Pose(item.start, item.end, branch="ccw", name=item.name)
+        for item in config.experiment.poses[:poses]
+    ]
+    found = solve_equilibria(model, np.array([stiffness]), np.array(rest), held)
+    assert all(isinstance(eq, Equilibrium) for eq in found)
+    return [eq.points for eq in found]
 
 
 def node_error(name: str, n: int, element: str) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
-from dlo_casadi.equilibrium.minima import descend, stepped
+from dlo_casadi.equilibrium.minima import TOLERANCE, descend, stepped
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -114,9 +114,8 @@ class BatchEquilibrium:
         p: FloatArray,
         rest: FloatArray,
         max_iterations: int = 25,
-        tolerance: float = 1e-10,
+        tolerance: float = TOLERANCE,
         reach: float = REACH,
-        tangent: BandMatrix | None = None,
     ) -> tuple[Shapes, NDArray[np.bool_]]:
         """Newton's method from nearby shapes, for each pose until it has converged or is lost.
 
@@ -133,8 +132,6 @@ class BatchEquilibrium:
             Largest step at convergence.
         reach : float [rad]
             A pose whose nodes move farther is lost: it runs for another equilibrium, or none.
-        tangent : BandMatrix, optional
-            Tangent matrices of equilibria close by, to begin with.
 
         Returns
         -------
@@ -146,8 +143,7 @@ class BatchEquilibrium:
         converged = np.zeros(self.m, dtype=bool)
         coupled = self.model.has_state and rest.ndim == 1
         active, last = np.arange(self.m), np.full(self.m, np.inf)
-        matrix = None if coupled else tangent
-        stale = np.full(self.m, matrix is None)
+        stale, matrix = np.ones(self.m, dtype=bool), None
         for _ in range(max_iterations):
             given = self._given(now, p, rest).subset(active)
             here = now.subset(active)
@@ -205,6 +201,8 @@ class BatchEquilibrium:
         matrix: BandMatrix | None,
     ) -> tuple[Vector, BandMatrix]:
         """Imbalance of the active poses, and all poses' matrices, of some of them evaluated."""
+        if matrix is not None and not fresh.any():
+            return self.assembly.imbalance(here, given), matrix
         if fresh.all():
             _, force, new = self.assembly.balance(here, given)
         else:

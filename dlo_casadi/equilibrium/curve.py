@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -13,6 +14,7 @@ from dlo_casadi.equilibrium.pose import Pose
 
 FloatArray = NDArray[np.floating]
 
+_NEWTON_STEPS = 12
 # Polynomial coefficients (powers of u, weights) of the interpolants' derivatives by u.
 _HERMITE = np.array(
     [
@@ -67,6 +69,15 @@ class NodeCurve:
         """Number of coordinates of a point: 2 or 3."""
         return self.nodes.shape[1]
 
+    @cached_property
+    def grid(self) -> FloatArray:
+        """Arc lengths [m] of eight places an element, among which the nearest one is sought."""
+        return np.linspace(0.0, self.length, 8 * self.n + 1)
+
+    @property
+    def _table(self) -> FloatArray:
+        return _LINEAR if self.slopes is None else _HERMITE
+
     def _local(self, s: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
         """Element index (K,) and the fraction (K,) of its length at s [m]."""
         u = s * (self.n / self.length)
@@ -78,8 +89,7 @@ class NodeCurve:
         e, u = self._local(s)
         h = self.length / self.n
         powers = u[:, None] ** np.arange(4)
-        table = (_HERMITE if self.slopes is not None else _LINEAR)[derivative]
-        return e, powers @ table / h**derivative
+        return e, powers @ self._table[derivative] / h**derivative
 
     @cached_property
     def _handles(self) -> FloatArray:
@@ -96,9 +106,8 @@ class NodeCurve:
         powers = u[:, None] ** np.arange(4)
         handles = self._handles[e]
         scale = self.n / self.length
-        table = _HERMITE if self.slopes is not None else _LINEAR
         return [
-            np.einsum("kw,kwd->kd", powers @ table[d], handles) * scale**d
+            np.einsum("kw,kwd->kd", powers @ self._table[d], handles) * scale**d
             for d in range(derivatives + 1)
         ]
 
@@ -116,33 +125,43 @@ class NodeCurve:
             out += h * (w[:, 2] * slopes[e, self.d :] + w[:, 3] * slopes[e + 1, self.d :])
         return np.asarray(out)
 
-    def projections(self, points: FloatArray, guess: FloatArray) -> FloatArray:
-        """Arc lengths (K,) [m] of the points' projections, by Newton steps from a guess.
+    def followed(
+        self, guess: FloatArray, step: Callable[[FloatArray], FloatArray], tolerance: float
+    ) -> FloatArray:
+        """Arc lengths (K,) [m] after Newton steps from a guess, within [0, L].
 
-        Solves t . (x - r(s)) = 0; a projection stays within [0, L].
+        No step is longer than half an element; `tolerance` is that over the length of the last.
         """
-        s = guess.copy()
-        limit = 0.5 * self.length / self.n
-        for _ in range(12):
-            position, t, bend = self.frame(s, 2)
-            gap = points - position
-            square = (t * t).sum(axis=1)
-            curvature = np.maximum(square - (bend * gap).sum(axis=1), 0.2 * square)
-            step = np.clip((t * gap).sum(axis=1) / curvature, -limit, limit)
-            new = np.clip(s + step, 0.0, self.length)
-            done = np.abs(new - s).max() < 1e-8 * self.length
+        s, limit = guess.copy(), 0.5 * self.length / self.n
+        for _ in range(_NEWTON_STEPS):
+            new = np.clip(s + np.clip(step(s), -limit, limit), 0.0, self.length)
+            done = np.abs(new - s).max() < tolerance * self.length
             s = new
             if done:
                 break
         return s
 
-    def nearest(self, points: FloatArray, per_element: int = 8) -> FloatArray:
+    def projections(self, points: FloatArray, guess: FloatArray) -> FloatArray:
+        """Arc lengths (K,) [m] of the points' projections, by Newton steps from a guess.
+
+        Solves t . (x - r(s)) = 0; a projection stays within [0, L].
+        """
+
+        def step(s: FloatArray) -> FloatArray:
+            position, t, bend = self.frame(s, 2)
+            gap = points - position
+            square = (t * t).sum(axis=1)
+            curvature = np.maximum(square - (bend * gap).sum(axis=1), 0.2 * square)
+            return np.asarray((t * gap).sum(axis=1) / curvature)
+
+        return self.followed(guess, step, 1e-8)
+
+    def nearest(self, points: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] of the nearest places on the whole curve."""
-        grid = np.linspace(0.0, self.length, self.n * per_element + 1)
-        line = self.at(grid)
+        line = self.at(self.grid)
         # Square distances but for those of the points from the origin.
         square = (line**2).sum(axis=1) - 2 * points @ line.T
-        return self.projections(points, grid[square.argmin(axis=1)])
+        return self.projections(points, self.grid[square.argmin(axis=1)])
 
     def normals(self, s: FloatArray) -> FloatArray:
         """Unit normals (K, d - 1, d): in the plane to the left of the direction of travel.

@@ -62,13 +62,17 @@ class Pose:
         return Heading if len(self.start) == 2 else Frame
 
     @property
+    def _direction_names(self) -> tuple[str, str]:
+        if self.node is Heading:
+            return "start_heading", "end_heading"
+        return "start_orientation", "end_orientation"
+
+    @property
     def directions(self) -> dict[str, Any]:
         """What tells the directions of the ends, by its name in a session."""
-        names: tuple[str, ...] = ("start_heading", "end_heading")
-        if self.node is Frame:
-            names = ("start_orientation", "end_orientation", "turns")
-        known = {name: getattr(self, name) for name in names}
-        return {name: list(x) if isinstance(x, tuple) else x for name, x in known.items()}
+        known = {name: getattr(self, name) for name in self._direction_names}
+        known = {name: list(x) if isinstance(x, tuple) else x for name, x in known.items()}
+        return known if self.node is Heading else {**known, "turns": self.turns}
 
     @property
     def ends(self) -> FloatArray:
@@ -84,24 +88,19 @@ class Pose:
     @property
     def frames(self) -> tuple[FloatArray, FloatArray]:
         """Frames (coordinates,) of both ends as nodes carry them: in a plane headings [rad]."""
+        known = (getattr(self, name) or self.node.identity for name in self._direction_names)
+        first, last = (np.atleast_1d(np.array(x, dtype=float)) for x in known)
         if self.node is Heading:
-            return np.array([self.start_heading or 0.0]), np.array([self.end_heading or 0.0])
-        first, last = self.start_orientation, self.end_orientation
-        return _unit(first or Frame.identity), _unit(last or Frame.identity)
+            return first, last
+        least = 1e-300
+        return first / max(np.linalg.norm(first), least), last / max(np.linalg.norm(last), least)
 
     def moved(self, start: FloatArray, end: FloatArray, frames: Sequence[FloatArray]) -> Pose:
         """The same pose elsewhere; what is free stays free."""
-        headings = [float(frame[0]) if len(frame) == 1 else None for frame in frames]
-        orientations = [tuple(frame) if len(frame) == 4 else None for frame in frames]
-        return replace(
-            self,
-            start=tuple(start),
-            end=None if self.end is None else tuple(end),
-            start_heading=headings[0],
-            end_heading=headings[1],
-            start_orientation=orientations[0],
-            end_orientation=orientations[1],
-        )
+        values = (float(x[0]) if self.node is Heading else tuple(x) for x in frames)
+        held: dict[str, Any] = dict(zip(self._direction_names, values, strict=True))
+        end_place = None if self.end is None else tuple(end)
+        return replace(self, start=tuple(start), end=end_place, **held)
 
     def rolled(self, angle: float) -> Pose:
         """The pose with its end clamp, in space, turned about its x axis [rad]."""
@@ -119,8 +118,3 @@ class Pose:
         """
         x, y, z = self.camera_center or (0.0, 0.0, np.inf)
         return np.concatenate([self.ends, np.array([x, y, 1.0]) / z])
-
-
-def _unit(quaternion: tuple[float, ...]) -> FloatArray:
-    q = np.array(quaternion, dtype=float)
-    return q / max(float(np.linalg.norm(q)), 1e-300)

@@ -38,6 +38,8 @@ SMOOTH = 0.9
 # Points beyond its own directions that a pose needs to tell of the noise, and degrees of freedom
 # that all poses need together for a size and a correlation.
 _SPARE_POINTS, _LEAST_DEGREES = 5, 6
+# Most poses from which the correlation is estimated, evenly picked; its size is that of all.
+_MOST_POSES = 60
 
 
 def correlation(kernel: Kernel, ratio: FloatArray) -> FloatArray:
@@ -284,7 +286,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
 
 
 def estimate_noise(
-    samples: list[NoiseSample], cable_length: float, max_points: int = 80, max_poses: int = 60
+    samples: list[NoiseSample], cable_length: float, max_points: int = 80
 ) -> NoiseModel:
     """Estimate size and correlation of the noise from the residuals of all poses.
 
@@ -294,15 +296,13 @@ def estimate_noise(
     cable_length : float [m]
     max_points : int
         Points used per pose; evenly thinned beyond that, and where smooth noise makes them alike.
-    max_poses : int
-        Poses from which the correlation is estimated, evenly picked; its size is that of all.
 
     See Also
     --------
     tell_of_noise : whether there is enough to estimate it from.
     """
     samples = [sample.thinned(max_points) for sample in _telling(samples)]
-    everything, samples = samples, samples[:: max(1, -(-len(samples) // max_poses))]
+    everything, samples = samples, samples[:: max(1, -(-len(samples) // _MOST_POSES))]
     # A correlation that is there but weak must not be dropped: it makes smooth residuals
     # look significant. So the likelihood alone decides, without a price on the parameters.
     found = [_white(samples, cable_length)]
@@ -312,7 +312,7 @@ def estimate_noise(
     smooth = best.noise.share > SMOOTH and not samples[0].correlation_length
     apart = int(cable_length / best.noise.length) if smooth else max_points
     if apart < max_points and tell_of_noise([sample.thinned(apart) for sample in everything]):
-        return estimate_noise(everything, cable_length, apart, max_poses)
+        return estimate_noise(everything, cable_length, apart)
     noise = replace(best.noise, slow_dof=_slow_dof(found))
     if len(everything) == len(samples):
         return noise

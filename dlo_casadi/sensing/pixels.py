@@ -17,9 +17,7 @@ from dlo_casadi.vision import ImageCurve, Viewpoint, compare_pixels, nearest_in_
 
 FloatArray = NDArray[np.floating]
 
-_NEWTON_STEPS = 12
 _SETTLED = 1e-5  # of the length: a residual feels half the bend times the square of that
-_PER_ELEMENT = 8
 # Standard deviations of the average along the cable. On rendered photographs pixels are 0.014 px
 # RMS off the true curve, but 0.1 px within two of an end, and 0.03 px within three.
 _REACH = 3.0
@@ -116,29 +114,24 @@ class Pixels(Sensor):
         """
         if self.on_line:
             return self._nearest(curve, curve.nearest(self.points))
-        grid = np.linspace(0.0, curve.length, _PER_ELEMENT * curve.n + 1)
-        seen = self.viewpoint.to_pixels(curve.at(grid))
+        seen = self.viewpoint.to_pixels(curve.at(curve.grid))
         away = np.linalg.norm(self.pixels[:, None] - seen[None], axis=2)
         found = nearest_in_order(away / (_SURE_PX + np.median(away.min(axis=1))))
         known = np.flatnonzero(found >= 0)
-        guess = np.interp(np.arange(len(found)), known, grid[found[known]])
+        guess = np.interp(np.arange(len(found)), known, curve.grid[found[known]])
         return self._nearest(curve, guess)
 
     def _nearest(self, curve: NodeCurve, guess: FloatArray) -> FloatArray:
         """Gauss-Newton steps on the distance in the picture, within [0, L]."""
-        s, limit = guess.copy(), 0.5 * curve.length / curve.n
-        for _ in range(_NEWTON_STEPS):
+
+        def step(s: FloatArray) -> FloatArray:
             position, tangent = curve.frame(s, 1)
             seen, slopes = self.viewpoint.project(position)
             along = np.einsum("kij,kj->ki", slopes, tangent)
             ahead = np.sum((self.pixels - seen) * along, axis=1)
-            step = ahead / np.maximum(np.sum(along**2, axis=1), 1e-12)
-            new = np.clip(s + np.clip(step, -limit, limit), 0.0, curve.length)
-            done = np.abs(new - s).max() < _SETTLED * curve.length
-            s = new
-            if done:
-                break
-        return s
+            return np.asarray(ahead / np.maximum(np.sum(along**2, axis=1), 1e-12))
+
+        return curve.followed(guess, step, _SETTLED)
 
     def _compared(self, curve: NodeCurve, places: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (K,) [m] and their slopes (K, 3) by the curve's points."""

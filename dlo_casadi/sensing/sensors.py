@@ -102,6 +102,25 @@ class Sensor(ABC):
         return replace(self, weight=weight)  # type: ignore[type-var]
 
 
+class _Known(Sensor):
+    """A sensor that knows the arc lengths s (K,) [m] of its points."""
+
+    s: FloatArray
+    marked = True
+
+    def places(self, pose: Pose, length: float) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s
+
+    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s
+
+    def nearest(self, curve: NodeCurve) -> FloatArray:
+        """The known arc lengths (K,) [m]."""
+        return self.s
+
+
 @dataclass(frozen=True)
 class _Points(Sensor):
     """Points in the board's or the world's frame, compared where they are on the curve."""
@@ -165,7 +184,7 @@ class Centerline(_Points):
 
 
 @dataclass(frozen=True)
-class Markers(_Points):
+class Markers(_Known, _Points):
     """Points at known arc lengths, compared in all directions: d residuals each.
 
     Where the cable's length is an unknown, the known arc lengths are shares of the declared one.
@@ -180,28 +199,15 @@ class Markers(_Points):
     """
 
     s: FloatArray
-    marked = True
 
     @property
     def per_point(self) -> int:
         """Residuals of a point."""
         return self.points.shape[1]
 
-    def places(self, pose: Pose, length: float) -> FloatArray:
-        """The known arc lengths (K,) [m]."""
-        return self.s
-
-    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
-        """The known arc lengths (K,) [m]."""
-        return self.s
-
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """All components, (K d, q)."""
         return moved.reshape((-1, moved.shape[2]))
-
-    def nearest(self, curve: NodeCurve) -> FloatArray:
-        """The known arc lengths (K,) [m]."""
-        return self.s
 
 
 def line_or_markers(
@@ -221,7 +227,7 @@ def line_or_markers(
 
 
 @dataclass(frozen=True)
-class Wrench(Sensor):
+class Wrench(_Known):
     """Forces and moments on the fixtures, component by component: R residuals [N], [N m].
 
     Parameters
@@ -235,9 +241,7 @@ class Wrench(Sensor):
     measured: dict[str, FloatArray]
     node: type[Node]
     per_point = 0
-    marked = True
-    points = np.zeros((0, 1))
-    weight = np.zeros(0)
+    points, weight, s = np.zeros((0, 1)), np.zeros(0), np.zeros(0)
 
     @property
     def _rows(self) -> dict[str, slice]:
@@ -254,18 +258,6 @@ class Wrench(Sensor):
         return np.concatenate(
             [np.full(at.stop - at.start, name.split("_")[1]) for name, at in self._rows.items()]
         )
-
-    def places(self, pose: Pose, length: float) -> FloatArray:
-        """None (0,)."""
-        return np.zeros(0)
-
-    def located(self, seen: Observed, places: FloatArray) -> FloatArray:
-        """None (0,)."""
-        return places
-
-    def nearest(self, curve: NodeCurve) -> FloatArray:
-        """None (0,)."""
-        return np.zeros(0)
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """Zeros (R, q): no point of theirs moves."""

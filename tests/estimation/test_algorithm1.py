@@ -11,7 +11,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import Pose
-from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.io.points import read_points
 from dlo_casadi.model.cable_model import CableModel
@@ -66,14 +66,12 @@ def measured(
     rng = np.random.default_rng(0)
     model = fine_rod(cable)
     rest = np.full(160, kappa_0)
-    poses = []
-    for k, end in enumerate(ends):
-        pose = Pose((0.0, 0.0), end, branch="ccw", name=f"pose {k}")
-        points = solve_equilibrium(model, np.array([stiffness]), rest, pose).points[2:-1]
-        poses.append(
-            MeasuredPose.of_points(pose, points + rng.normal(scale=noise, size=points.shape))
-        )
-    return poses
+    poses = [Pose((0.0, 0.0), end, branch="ccw", name=f"pose {k}") for k, end in enumerate(ends)]
+    found = solve_equilibria(model, np.array([stiffness]), rest, poses)
+    return [
+        MeasuredPose.of_points(pose, eq.points[2:-1] + rng.normal(scale=noise, size=(158, 2)))
+        for pose, eq in zip(poses, found, strict=True)
+    ]
 
 
 def rmse(result, poses: list[MeasuredPose]) -> float:
