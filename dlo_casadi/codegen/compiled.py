@@ -49,15 +49,7 @@ _ARGUMENTS = {
 
 
 def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",)) -> Path:
-    """Compile a solver into a shared library.
-
-    Parameters
-    ----------
-    solver : Solver
-    folder : Path
-        Where the files go.
-    flags : sequence of str
-        Of the compiler, beside what a shared library needs.
+    """Compile a solver into a shared library in a folder, with these flags and those it needs.
 
     Raises
     ------

@@ -94,14 +94,9 @@ class Kernel:
 class Kernels:
     """All that the generated solver knows of a model's mechanics.
 
-    Parameters
-    ----------
-    segments : tuple of Kernel
-        In the order of the cable.
-    ends : casadi.Function or None
-        The holders' own energy by the first and last node; None where they have none.
-    shared : (n_parameters,) or (0,)
-        Parameters that stand in the table, ahead of the segments' rows.
+    `segments` are in the order of the cable; `ends` is the holders' own energy by the first and
+    last node, where they have any; `shared` (n_parameters,) or (0,) are the parameters that stand
+    in the table, ahead of the segments' rows.
     """
 
     segments: tuple[Kernel, ...]
@@ -243,19 +238,10 @@ def _of_frames(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers)
     """Derivatives are by increments about the world's axes."""
     found = lagrangian_of(model).in_frame(x, lam, numbers).derivatives()
     found = found.about(found.turn, found.turn)
-    (first, between, last), (first_lam, last_lam) = found.bends, found.mixed
-    return [
-        found.value,
-        found.by_lam,
-        found.phi,
-        *found.slopes,
-        _triangle(first),
-        _rows(between),
-        _triangle(last),
-        _rows(first_lam),
-        _rows(last_lam),
-        _triangle(found.lam_lam),
-    ]
+    (first, between, last), mixed = found.bends, found.mixed
+    bends = [_triangle(first), _rows(between), _triangle(last)]
+    borders = [*map(_rows, mixed), _triangle(found.lam_lam)]
+    return [found.value, found.by_lam, found.phi, *found.slopes, *bends, *borders]
 
 
 def _rows(a: ca.SX) -> ca.SX:

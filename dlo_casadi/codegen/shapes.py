@@ -178,13 +178,10 @@ class Gap:
 
 
 class Records(NamedTuple):
-    """The structures of a solver's C: dlo_shape, dlo_slope, dlo_obstacle and dlo_gap.
+    """Layouts of dlo_shape, dlo_slope, dlo_obstacle and dlo_gap of a solver's C.
 
-    Parameters
-    ----------
-    shape, slope, obstacle, gap : numpy.dtype
-    columns : int
-        Numbers of a pose by which dlo_slope has derivatives; in a plane not of the start's place.
+    `columns` are the numbers of a pose by which dlo_slope has derivatives; in a plane not those of
+    the start's place.
     """
 
     shape: np.dtype[Any]
@@ -196,44 +193,33 @@ class Records(NamedTuple):
 
 def records_of(model: CableModel) -> Records:
     """Layouts of the structures of a model's solver."""
-    node, points, nodes = model.node, model.n + 1, model.chain.n_nodes
+    node, n, nodes = model.node, model.n + 1, model.chain.n_nodes
     d, turn = node.dimension, node.increment
     k = 2 * turn + (2 * d if model.in_space else d)
-    shape = _record(
-        points=(float, (points, d)),
-        x=(float, (nodes, node.coordinates)),
-        start_force=(float, d),
-        end_force=(float, d),
-        moments=(float, (2, turn)),
-        energy=float,
-        min_bend_radius=float,
-        max_twist=float,
-        end_error=float,
-        imbalance=float,
-        iterations=np.intc,
-        turn=np.intc,
+    forces = {"start_force": (d,), "end_force": (d,), "moments": (2, turn)}
+    scalars = ("energy", "min_bend_radius", "max_twist", "end_error", "imbalance")
+    slope = {"points": (n, d, k), "rotations": (nodes, turn, k), "end_force": (d, k)}
+    slope |= {"moments": (2, turn, k), "min_bend_radius": (k,)}
+    gap = {"distance": (), "place": (), "point": (d,), "normal": (d,), "gradient": (k,)}
+    return Records(
+        _record(
+            _floats({"points": (n, d), "x": (nodes, node.coordinates)}),
+            _floats(forces | dict.fromkeys(scalars, ())),
+            [("iterations", np.intc), ("turn", np.intc)],
+        ),
+        _record(_floats(slope)),
+        _record([("kind", np.intc)], _floats({"a": (d,), "b": (d,), "radius": ()})),
+        _record(_floats(gap), [("obstacle", np.uintp)]),
+        k,
     )
-    slope = _record(
-        points=(float, (points, d, k)),
-        rotations=(float, (nodes, turn, k)),
-        end_force=(float, (d, k)),
-        moments=(float, (2, turn, k)),
-        min_bend_radius=(float, k),
-    )
-    obstacle = _record(kind=np.intc, a=(float, d), b=(float, d), radius=float)
-    gap = _record(
-        distance=float,
-        place=float,
-        point=(float, d),
-        normal=(float, d),
-        gradient=(float, k),
-        obstacle=np.uintp,
-    )
-    return Records(shape, slope, obstacle, gap, k)
 
 
-def _record(**fields: Any) -> np.dtype[Any]:
-    return np.dtype({"names": list(fields), "formats": list(fields.values())}, align=True)
+def _floats(shapes: dict[str, tuple[int, ...]]) -> list[Any]:
+    return [(name, float, shape) for name, shape in shapes.items()]
+
+
+def _record(*fields: list[Any]) -> np.dtype[Any]:
+    return np.dtype([field for part in fields for field in part], align=True)
 
 
 def pose_size(model: CableModel) -> int:
@@ -246,16 +232,8 @@ def pose_table(
 ) -> tuple[FloatArray, int]:
     """Poses (m, k) laid out as dlo_pose, and the C solver's number of their branch.
 
-    Parameters
-    ----------
-    poses : sequence of Pose, or (m, k)
-    branch : "ccw", "cw" or None
-        Of rows of numbers; a Pose has its own.
-
-    Raises
-    ------
-    DloError
-        If they are no poses of this cable, of several branches, or of an unknown one.
+    `branch` ("ccw", "cw" or None) is that of rows of numbers; a Pose has its own. Raises DloError
+    if they are no poses of this cable, of several branches, or of an unknown one.
     """
     if isinstance(poses, np.ndarray):
         size = pose_size(model)

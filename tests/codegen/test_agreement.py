@@ -124,9 +124,9 @@ def test_clamps_in_space_that_give_way_are_refused():
 
 
 @pytest.mark.parametrize("name", [name for name in VALUES if not name.startswith("clamp_")])
-@pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
-def test_effect(name, element):
-    assert difference([name], element, "pinned", "pinned") < 1e-8
+def test_effect(name):
+    """On links and arcs they are together in `test_all_effects_together`."""
+    assert difference([name], "quadratic", "pinned", "pinned") < 1e-8
 
 
 @pytest.mark.parametrize(("start", "end"), BOUNDARIES)

@@ -17,7 +17,7 @@ from dlo_casadi.model.cable_model import CableModel
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
 CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
-STRICT = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow"]
+STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow"]
 KINDS = [
     ("link", "pinned", "pinned"),
     ("arc", "pinned", "pinned"),

@@ -27,12 +27,23 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
 
+SOLVERS = {}
+
+
+def any_cable(rng, element="link"):
+    """The solver of all cables of one kind of element, compiled once."""
+    problem = random_problem(rng, 1, element=element)
+    if element not in SOLVERS:
+        SOLVERS[element] = AnyCable(problem)
+    return SOLVERS[element]
+
+
 @pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_random_cables_have_stable_equilibria(element):
     rng = np.random.default_rng(2)
-    solver = AnyCable(random_problem(rng, 1, element=element))
+    solver = any_cable(rng, element)
     failed = total = 0
-    for _ in range(15 if element == "quadratic" else 30):
+    for _ in range(10 if element == "quadratic" else 20):
         problem = random_problem(rng, 60, element=element)
         shapes, statuses, _ = solver.solve(problem)
         failed, total = failed + np.count_nonzero(statuses), total + len(statuses)
@@ -45,7 +56,7 @@ def test_random_cables_have_stable_equilibria(element):
 
 def test_the_equilibrium_is_that_of_ipopt_or_a_lower_one():
     rng = np.random.default_rng(3)
-    solver = AnyCable(random_problem(rng, 1))
+    solver = any_cable(rng)
     words = []
     for _ in range(15):
         problem = random_problem(rng, 2)
@@ -62,7 +73,7 @@ def test_the_equilibrium_is_that_of_ipopt_or_a_lower_one():
 def test_a_named_branch_is_found_where_there_is_one_and_never_the_other(branch):
     """Where the lowest equilibrium turns that way, so does the one that is returned."""
     rng = np.random.default_rng(4)
-    solver = AnyCable(random_problem(rng, 1))
+    solver = any_cable(rng)
     sign = {1: 1, 2: -1}[branch]
     refused = 0
     for _ in range(10):

@@ -63,9 +63,9 @@ def session(name, n):
 
 @pytest.mark.parametrize("name", SESSIONS)
 def test_session(name):
-    model, p, rest, poses = session(name, n=24)
+    model, p, rest, poses = session(name, n=12)
     solver = CompiledSolver(model, p, rest, flags=("-O0",))  # compiles quickly
-    for pose in poses[: 3 if model.has_state else 8]:
+    for pose in poses[: 3 if model.has_state else 6]:
         expected = solve_equilibrium(model, p, rest, pose)
         shape = solver.solve(pose)
         assert np.abs(shape.points - expected.points).max() < 1e-8

@@ -30,7 +30,7 @@ def file(outcome, tmp_path_factory):
     return path
 
 
-def fitted(name, *effects, n=20):
+def fitted(name, *effects, n=10):
     """A quick fit of a bench session with more effects than declared."""
     config = load_config(BENCH / name / "session.yaml")
     measured = measured_poses(config, read_inputs(config, lambda *_: None))
@@ -323,7 +323,7 @@ def test_values_at_their_bounds_are_read_as_they_were_written(outcome, tmp_path,
 
 def test_a_fit_that_ends_at_a_bound_can_be_read(outcome, tmp_path):
     """IPOPT widens bounds by 1e-8 of them; here the softness would be -5e-10 m."""
-    fit, _ = fitted("short_clean", BendingSoftening(), n=10)
+    fit, _ = fitted("short_clean", BendingSoftening())
     point = minimum_by_ipopt(fit).point
     assert point is not None
     fit = Fit(fit.problem, point, converged=True)
