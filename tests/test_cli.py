@@ -40,7 +40,14 @@ def config(tmp_path_factory):
 def run(config, tmp_path_factory):
     """Folder and printed text of one run of the command as a user starts it."""
     folder = tmp_path_factory.mktemp("run")
-    command = [sys.executable, str(ROOT / "scripts" / "fit.py"), str(config), "--no-diagnosis"]
+    command = [
+        sys.executable,
+        str(ROOT / "scripts" / "fit.py"),
+        str(config),
+        "--no-diagnosis",
+        "--jobs",
+        "1",
+    ]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return folder, done
@@ -75,7 +82,7 @@ def test_what_may_take_long_is_told_first(config, monkeypatch, capsys):
     many.write_text(config.read_text().replace("n: 20", "n: 300"))
     monkeypatch.setattr("dlo_casadi.session.run_session", lambda *_: 1 / 0)
 
-    assert main(["fit", str(many), "--output", str(many.with_name("out"))]) == 1
+    assert main(["fit", str(many), "--output", str(many.with_name("out")), "--jobs", "1"]) == 1
     assert "warning: model.n: 300 elements take minutes" in capsys.readouterr().err
 
 
@@ -161,7 +168,8 @@ def test_fit_checks_the_output_before_it_works(config, tmp_path, capsys, monkeyp
     monkeypatch.setattr("dlo_casadi.session.run_session", lambda *_: pytest.fail("started"))
     (tmp_path / "file").touch()
 
-    assert main(["fit", str(config), "--output", str(tmp_path / "file"), "--quiet"]) == 2
+    command = ["fit", str(config), "--output", str(tmp_path / "file"), "--jobs", "1", "--quiet"]
+    assert main(command) == 2
     assert "cannot be written: it is a file" in capsys.readouterr().err
 
 
@@ -210,7 +218,7 @@ def test_a_bug_is_told_apart_from_bad_input(config, tmp_path, capsys, monkeypatc
 
     monkeypatch.setattr("dlo_casadi.session.run_session", broken)
 
-    assert main(["fit", str(config), "--output", str(tmp_path / "out")]) == 1
+    assert main(["fit", str(config), "--output", str(tmp_path / "out"), "--jobs", "1"]) == 1
     error = capsys.readouterr().err
     assert "ZeroDivisionError: oops" in error
     assert "This is a bug. Please report it" in error

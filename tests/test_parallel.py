@@ -8,12 +8,21 @@ import time
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from functools import partial
-from pathlib import Path
 
 import casadi as ca
-import cv2
+import cv2  # noqa: F401 (that it is loaded in this process)
 import pytest
-from threadpoolctl import threadpool_info
+from tasks import (
+    broken,
+    draw,
+    kill_always,
+    kill_elsewhere,
+    kill_once,
+    root,
+    slowly,
+    square,
+    threads,
+)
 
 from dlo_casadi.equilibrium.minima import run_ipopt
 from dlo_casadi.errors import DloError, EquilibriumError
@@ -28,49 +37,6 @@ from dlo_casadi.runtime.parallel import (
     map_in_order,
     open_executor,
 )
-
-
-def square(x):
-    return x * x
-
-
-def root(x):
-    if x < 0:
-        raise EquilibriumError(f"{x} has no root", pose="p", p_des=(x, 0.0))
-    return x**0.5
-
-
-def threads(_):
-    return [row["num_threads"] for row in threadpool_info()], cv2.getNumThreads(), os.getpid()
-
-
-def kill_once(mark, x):
-    """Square of x; the worker that meets item 3 first is killed."""
-    if x == 3 and not Path(mark).exists():
-        Path(mark).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return x * x
-
-
-def kill_always(x):
-    if x == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return x * x
-
-
-def draw(index):
-    return generator_of(7, index).standard_normal(3).tolist()
-
-
-def slowly(x):
-    time.sleep(0.05)
-    return x, os.getpid()
-
-
-def kill_elsewhere(pid):
-    if os.getpid() != pid:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return "done here"
 
 
 @pytest.fixture(scope="module")
@@ -118,10 +84,6 @@ def test_a_task_is_what_it_was_when_it_was_begun(two_of_us):
     with pytest.raises(TypeError, match="pickle"):
         begin(two_of_us, len, threading.Lock())()
     assert [done.item for done in map_as_completed(two_of_us, slowly, range(2))]
-
-
-def broken(x):
-    raise ZeroDivisionError("oops")
 
 
 def test_a_bug_elsewhere_comes_with_its_stack(two_of_us):

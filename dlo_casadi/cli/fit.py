@@ -22,16 +22,10 @@ from dlo_casadi.runtime.parallel import begin, open_executor
 DIAGNOSIS = ("config", "verdict", "effects", "candidates", "unexplained", "next_pose", "warnings")
 
 
-def session_jobs() -> int:
-    """Processes of a single session by default: two where there are two processors.
-
-    A third saves little. One where other processes cannot be started.
-    """
-    if multiprocessing.current_process().daemon:
-        return 1
-    return min(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
-
-
+# Processes of a single session by default: two where there are two processors, a third saves
+# little; one where other processes cannot be started.
+PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
+SESSION_JOBS = jobs(1 if multiprocessing.current_process().daemon else min(2, PROCESSORS))
 NO_DIAGNOSIS = option(
     "--no-diagnosis", action="store_true", help="do not search for missing effects"
 )
@@ -45,7 +39,7 @@ NO_DIAGNOSIS = option(
         metavar="DIR",
         help="folder of the results; default results/<config name>/",
     ),
-    jobs(session_jobs()),
+    SESSION_JOBS,
     NO_DIAGNOSIS,
     codes="on 2 and 130 earlier results are kept",
     json="print report.json instead of tables",
@@ -68,7 +62,7 @@ def fit(chosen: argparse.Namespace) -> None:
 @command(
     CONFIG,
     option("--output", type=Path, metavar="DIR", help="write the results there"),
-    jobs(session_jobs()),
+    SESSION_JOBS,
 )
 def diagnose(chosen: argparse.Namespace) -> None:
     """Fit a cable and search for what the declared model lacks, whether or not the

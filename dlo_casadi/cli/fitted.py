@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, one_of, option
@@ -148,12 +147,7 @@ def shape_table(chosen: argparse.Namespace) -> None:
             "  Try: dlo predict, or dlo generate-solver for many shapes"
         )
     model, p, rest, metadata = with_mesh(cable, chosen)
-    fixed, needed = _ends(cable, chosen)
-    poses: Grid | PoseList
-    if chosen.grid is None:
-        poses = PoseList(chosen.list, needed, fixed)
-    else:
-        poses = _grid(cable, chosen.grid, fixed, needed)
+    poses = _poses(cable, chosen)
     output = chosen.output.resolve()
     plan = Plan(model, p, rest, chosen.branch, output.with_name(f"{output.name}.parts"))
     counter = Counter(quiet=chosen.quiet, noun="pose", size=plan.chunk, count=poses.count)
@@ -173,14 +167,12 @@ def shape_table(chosen: argparse.Namespace) -> None:
     page.say(f"{output}: {said or 'complete already'}")
 
 
-def _ends(
-    cable: FittedCable, chosen: argparse.Namespace
-) -> tuple[dict[str, float], tuple[str, ...]]:
-    """What all poses share, and the columns that a list must have beside it."""
+def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
+    """The poses, if all that is not in the list is given or the same in the session's poses."""
     model, shared = cable.model, cable.metadata.fixtures
     x, y = chosen.start or shared.get("start") or (0.0, 0.0)
     fixed = {"start_x": float(x), "start_y": float(y)}
-    needed = [] if model.end == "free" else ["end_x_m", "end_y_m"]
+    unknown = []
     for side in ("start", "end"):
         held, name = getattr(model, side), f"{side}_heading"
         heading = getattr(chosen, name)
@@ -190,25 +182,20 @@ def _ends(
             continue
         heading = shared.get(name) if heading is None else heading
         if heading is None:
-            needed.append(f"{name}_rad")
+            unknown.append(name)
         else:
             fixed[name] = float(heading)
-    return fixed, tuple(needed)
-
-
-def _grid(
-    cable: FittedCable, numbers: Sequence[float], fixed: dict[str, float], needed: Sequence[str]
-) -> Grid:
-    """The grid, if all that it does not say is known."""
-    if cable.model.end == "free":
+    if chosen.grid is None:
+        place = () if model.end == "free" else ("end_x_m", "end_y_m")
+        return PoseList(chosen.list, (*place, *(f"{name}_rad" for name in unknown)), fixed)
+    if model.end == "free":
         raise DloError("--grid: the end of this cable is free, it has no place; use --list")
-    headings = [name.removesuffix("_rad") for name in needed if name.endswith("_rad")]
-    if headings:
+    if unknown:
         raise DloError(
             "--grid: this cable is clamped, and the session's poses do not share "
-            f"{' and '.join(headings)}.\n  Try: --start-heading, --end-heading [rad]"
+            f"{' and '.join(unknown)}.\n  Try: --start-heading, --end-heading [rad]"
         )
-    x0, x1, nx, y0, y1, ny = numbers
+    x0, x1, nx, y0, y1, ny = chosen.grid
     return Grid((x0, x1, nx), (y0, y1, ny), fixed)
 
 

@@ -3,7 +3,6 @@
 import os
 import signal
 from functools import partial
-from pathlib import Path
 
 import pytest
 
@@ -12,13 +11,14 @@ pytest.importorskip("distributed", reason="needs Dask: pip install 'dlo-casadi[d
 
 import pyarrow.parquet as pq
 from distributed import LocalCluster
+from tasks import draw, kill_once, root, threads
 from tiny_sessions import QUICK, without_times
 
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet.discover import find_sessions
 from dlo_casadi.fleet.run import fit_fleet
 from dlo_casadi.runtime import executors
-from dlo_casadi.runtime.parallel import generator_of, map_as_completed, map_in_order, open_executor
+from dlo_casadi.runtime.parallel import map_as_completed, map_in_order, open_executor
 
 
 @pytest.fixture(scope="module")
@@ -29,37 +29,15 @@ def cluster():
         yield running
 
 
-def draw(index):
-    return generator_of(7, index).standard_normal(3).tolist()
-
-
-def fail(x):
-    raise EquilibriumError(f"{x} hangs nowhere", pose="p", p_des=(x, 0.0))
-
-
-def threads(_):
-    import cv2
-    from threadpoolctl import threadpool_info
-
-    return [row["num_threads"] for row in threadpool_info()], cv2.getNumThreads(), os.getpid()
-
-
-def kill_once(mark, x):
-    if x == 2 and not Path(mark).exists():
-        Path(mark).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return x * x
-
-
 def test_tasks_errors_and_threads(cluster, tmp_path):
     with open_executor(scheduler=cluster.scheduler_address, logs=tmp_path) as executor:
         assert executor.workers == 2
         assert map_in_order(executor, draw, range(4)) == [draw(k) for k in range(4)]
         assert map_in_order(executor, abs, [-1, -1]) == [1, 1], "equal calls are two tasks"
-        (ended,) = map_as_completed(executor, fail, [2.0])
-        with pytest.raises(EquilibriumError, match=r"p: 2\.0 hangs nowhere") as caught:
+        (ended,) = map_as_completed(executor, root, [-2.0])
+        with pytest.raises(EquilibriumError, match=r"p: -2\.0 has no root") as caught:
             _ = ended.value
-        assert caught.value.p_des == (2.0, 0.0)
+        assert caught.value.p_des == (-2.0, 0.0)
         for blas, opencv, pid in map_in_order(executor, threads, range(4)):
             assert set(blas) == {1}
             assert opencv == 1

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,7 +22,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.fleet.discover import find_sessions
 from dlo_casadi.fleet.overview import judge, overview_html, robust_z
 from dlo_casadi.fleet.rows import COLUMNS, empty_row, row_of
-from dlo_casadi.fleet.run import Job, fit_fleet, fit_one
+from dlo_casadi.fleet.run import fit_fleet
 from dlo_casadi.io.files import only_run
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import open_executor
@@ -55,17 +54,24 @@ def test_one_row_each_sorted_and_a_failure_is_a_row_with_its_message(expected):
         assert [item["name"] for item in row["parameters"]] == ["bending_stiffness"]
 
 
-def test_numbers_are_those_of_the_report_and_results_are_linked(fleet, expected, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def with_reports(fleet, tmp_path_factory):
+    """Folder of the results of one session, fitted by the command with a pattern."""
+    output = tmp_path_factory.mktemp("with_reports")
     pattern = str(fleet / "shed_1" / "*" / "session.yaml")
-    assert main(["fit-many", pattern, "--output", str(tmp_path), "--quiet", "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
+    assert main(["fit-many", pattern, "--output", str(output), "--quiet"]) == 0
+    return output
+
+
+def test_numbers_are_those_of_the_report_and_results_are_linked(with_reports, expected):
+    (row,) = rows_of(with_reports)
     assert row["session"] == "session.yaml"
-    report = json.loads((tmp_path / "sessions" / "session.yaml" / "report.json").read_text())
+    report = json.loads((with_reports / "sessions" / "session.yaml" / "report.json").read_text())
     last = report["stages"][-1]
     assert row["bending_stiffness"] == last["parameters"]["bending_stiffness"]["value"]
     assert row["bending_stiffness"] == expected[-1]["bending_stiffness"]
     assert row["batch_rmse_fit"] == last["rmse_fit"]
-    assert 'href="sessions/session.yaml/report.' in (tmp_path / "index.html").read_text()
+    assert 'href="sessions/session.yaml/report.' in (with_reports / "index.html").read_text()
 
 
 def test_a_session_without_results_is_told_by_the_exit_code(tmp_path, capsys):
@@ -188,12 +194,10 @@ def test_results_and_hidden_folders_are_no_sessions(tmp_path):
         find_sessions(tmp_path / "nowhere")
 
 
-def test_a_cable_in_space_has_columns_of_its_own(fleet, tmp_path):
+def test_a_cable_in_space_has_columns_of_its_own(with_reports):
     """A planar report with what one in space has instead."""
-    (tmp_path / "rows").mkdir()
-    job = Job(find_sessions(fleet)[1][-1], "hash", tmp_path, replace(QUICK, reports=True))
-    plane = fit_one(job)
-    report = json.loads((job.folder / "report.json").read_text())
+    (plane,) = rows_of(with_reports)
+    report = json.loads((with_reports / "sessions" / "session.yaml" / "report.json").read_text())
     found = report["stages"][-1]["parameters"]
     found["torsional_stiffness"] = {**found["bending_stiffness"], "value": 0.2, "std": 0.1}
     about = found["rest_curvature"]

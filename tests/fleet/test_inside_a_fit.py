@@ -23,7 +23,7 @@ def fit(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pool():
-    with open_executor(jobs=2) as executor:
+    with open_executor(jobs=2, here=True) as executor:
         yield executor
 
 
@@ -34,7 +34,7 @@ def pool():
         ("softening", "bending_softening", "effect_found"),
     ],
 )
-def test_a_whole_session(tmp_path, name, tried, verdict):
+def test_a_whole_session(tmp_path, pool, name, tried, verdict):
     """One that ends with a pull, and one with an effect."""
     config = load_config(write_session(tmp_path / "cable", name))
     few = {tried, "rest_curvature_drift"}
@@ -44,8 +44,7 @@ def test_a_whole_session(tmp_path, name, tried, verdict):
         estimation=config.estimation.model_copy(update={"algorithm1": True}),
         diagnosis=config.diagnosis.model_copy(update=limits),
     )
-    with open_executor(jobs=2, here=True) as executor:
-        both = [report_dict(run_session(config, executor=where)) for where in (None, executor)]
+    both = [report_dict(run_session(config, executor=where)) for where in (None, pool)]
     for report in both:
         del report["timing_s"]
         for stage in report["stages"]:
