@@ -194,20 +194,20 @@ def map_as_completed(
                 error = future.exception()
                 if error is None:
                     task = future.result()
-                elif not isinstance(error, losses):
-                    task = Finished(index, None, None, error, 0.0, "")
-                elif here:
+                elif here and isinstance(error, losses):
                     task = _run(function, index, item, None)
-                elif lost < retries:
-                    # With no other beside it, nobody else can be to blame for the last loss.
-                    (again if lost + 1 < retries else suspects).append((index, item, lost + 1))
-                    continue
                 else:
-                    times = f"{lost + 1} times, at last alone" if retries else "once"
-                    error = LostTaskError(
-                        f"task {index} was lost {times}: its worker was killed.\n"
-                        "  Try: more memory; see the workers' logs."
-                    )
+                    if isinstance(error, losses):
+                        if lost < retries:
+                            # With none beside it, no other can be to blame for the last loss.
+                            put_off = again if lost + 1 < retries else suspects
+                            put_off.append((index, item, lost + 1))
+                            continue
+                        times = f"{lost + 1} times, at last alone" if retries else "once"
+                        error = LostTaskError(
+                            f"task {index} was lost {times}: its worker was killed.\n"
+                            "  Try: more memory; see the workers' logs."
+                        )
                     task = Finished(index, None, None, error, 0.0, "")
                 yield ended(item, task)
     finally:
