@@ -12,14 +12,17 @@ from scipy.ndimage import binary_dilation, gaussian_filter1d, label
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, View
 from dlo_casadi.vision.chain import Workings, find_cable
-from dlo_casadi.vision.curves import chord_length, fit_curve, length_of, normals
 from dlo_casadi.vision.profiles import (
     Crossings,
     EdgeShape,
     cable_direction,
+    chord_length,
     edge_shape,
     find_edges,
+    fit_curve,
+    length_of,
     local_directions,
+    normals,
     sample_profiles,
 )
 from dlo_casadi.vision.workplane import ALONG_BOARD, ExpectedLine, KnownCable, rectify

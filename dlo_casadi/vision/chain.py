@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, Flags, View
-from dlo_casadi.vision.curves import length_of
+from dlo_casadi.vision.profiles import length_of
 from dlo_casadi.vision.workplane import (
     Contrast,
     ExpectedLine,

@@ -12,7 +12,7 @@ from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, Viewpoint
 from dlo_casadi.vision.centerline import FINE, measure_line
 from dlo_casadi.vision.chain import Workings
-from dlo_casadi.vision.curves import chord_length, normals
+from dlo_casadi.vision.profiles import chord_length, normals
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
 _NEAREST = 0.2  # m: least distance from which a cable is photographed

@@ -6,14 +6,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import find_objects, label
 
 from dlo_casadi.vision.camera import Array, Picture, Viewpoint, compare_pixels
 from dlo_casadi.vision.centerline import FINE
-from dlo_casadi.vision.curves import DEGREE, FINE_GRID, SpaceCurve, chord_length, fit_curve, normals
 from dlo_casadi.vision.image_curve import ImageCurve, other_stretches, places_along
-from dlo_casadi.vision.profiles import EdgeShape, find_edges, sample_profiles
+from dlo_casadi.vision.profiles import (
+    DEGREE,
+    EdgeShape,
+    chord_length,
+    find_edges,
+    fit_curve,
+    length_of,
+    normals,
+    sample_profiles,
+)
 
 _GRID = 401  # places along the curve among which a pixel's nearest is searched
 _TANGENTIAL = 1e-5  # m: std of the prior that holds a curve along itself, which no picture shows
@@ -22,6 +31,53 @@ _HUBER = 3.0  # standard deviations beyond which a pixel counts less
 # 0 <= t <= 1: from a bow of 0.3 L to waves of 300 L; afterwards those near the last.
 _WANDER, _WANDER_NEXT = np.logspace(-1.0, 5.0, 13), np.array([0.3, 0.6, 1.0, 1.7, 3.0])
 _LOOPS, _SETTLED = 15, 3e-5  # m: a quarter of the smallest std of a line from three photographs
+_FINE = np.linspace(0.0, 1.0, 1001)  # places along a line in space, closely spaced
+
+
+@dataclass(frozen=True)
+class SpaceCurve:
+    """A cubic B-spline r(t), 0 <= t <= 1, with t close to arc length over the whole."""
+
+    coefficients: Array  # (n, 3) [m], in the board frame
+
+    @property
+    def knots(self) -> Array:
+        """Knots (n + 4,), evenly spaced."""
+        n = len(self.coefficients)
+        return np.asarray(np.arange(-DEGREE, n + 1) / (n - DEGREE))
+
+    def design(self, t: Array) -> Array:
+        """Basis functions (K, n) at t (K,)."""
+        inside = np.clip(t, 0.0, 1.0 - 1e-12)
+        if not len(t):
+            return np.zeros((0, len(self.coefficients)))
+        return np.asarray(BSpline.design_matrix(inside, self.knots, DEGREE).toarray())
+
+    def position(self, t: Array) -> Array:
+        """Points (K, 3) [m]."""
+        return self.design(t) @ self.coefficients
+
+    def tangent(self, t: Array) -> Array:
+        """Give the unit tangents (K, 3)."""
+        slope = np.asarray(BSpline(self.knots, self.coefficients, DEGREE)(t, 1))
+        return slope / np.linalg.norm(slope, axis=1, keepdims=True)
+
+    @property
+    def length(self) -> float:
+        """Arc length [m]."""
+        return length_of(self.position(_FINE))
+
+    def away_from(self, fixtures: Array) -> Array:
+        """Distances [m] of its ends from the fixtures: one of the start alone, or both."""
+        ends = self.position(np.array([0.0, 1.0]))[: len(fixtures)]
+        return np.asarray(np.linalg.norm(ends - fixtures, axis=1))
+
+    def evenly(self) -> SpaceCurve:
+        """Give the same curve with t proportional to its arc length."""
+        s = chord_length(self.position(_FINE))
+        at = np.interp(_FINE * s[-1], s, _FINE)
+        even = np.linalg.lstsq(self.design(_FINE), self.position(at), rcond=None)[0]
+        return SpaceCurve(np.asarray(even, float))
 
 
 @dataclass(frozen=True)
@@ -118,7 +174,7 @@ def fit_curve_to_images(
         wander = q * _WANDER_NEXT
         x = x + step
         change = SpaceCurve(step[: 3 * n].reshape(n, 3))
-        moved = float(np.abs(change.position(FINE_GRID)).max())
+        moved = float(np.abs(change.position(_FINE)).max())
         motions = x[3 * n :].reshape(m, 6)
         curve = SpaceCurve(x[: 3 * n].reshape(n, 3)).evenly()
         if loop > 2 and moved < _SETTLED:
@@ -188,7 +244,7 @@ def measure_shared_outlines(
     """
     shared = []
     for curve in curves:
-        pixels = curve.viewpoint.to_pixels(fit.curve.position(FINE_GRID))
+        pixels = curve.viewpoint.to_pixels(fit.curve.position(_FINE))
         beside = other_stretches(pixels, chord_length(pixels), curve.width)
         shared.append(bool(np.isfinite(beside).any()))
     if not any(shared):
@@ -222,7 +278,7 @@ def see_beside(
     -------
     What is seen, in the order of the line, and the parameters of its pixels.
     """
-    params, curve = FINE_GRID, line.position(FINE_GRID)
+    params, curve = _FINE, line.position(_FINE)
     viewpoint, distance = seen.viewpoint, seen.distance
     view = viewpoint.facing(distance)
     pixel = 1.0 / view.scale

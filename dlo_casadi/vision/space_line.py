@@ -13,7 +13,6 @@ from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import Board, locate_camera
 from dlo_casadi.vision.camera import Array, Camera, Indices, Picture
 from dlo_casadi.vision.centerline import SPACING
-from dlo_casadi.vision.curves import chord_length
 from dlo_casadi.vision.image import spoilt
 from dlo_casadi.vision.image_curve import (
     TIP,
@@ -23,6 +22,7 @@ from dlo_casadi.vision.image_curve import (
     see_cable,
     triangulate,
 )
+from dlo_casadi.vision.profiles import chord_length
 from dlo_casadi.vision.space_curve import (
     CurveFit,
     first_curve,
@@ -140,11 +140,8 @@ class _Agreement:
     fit: CurveFit
     share: float  # of its pixels in the photograph that agrees least
     worst: str  # that photograph
-
-    @property
-    def score(self) -> tuple[float, float]:
-        """What of two readings the better one has more of: agreement, then likelihood."""
-        return min(self.share, _SURE), -self.fit.surprise
+    score: tuple[float, float]
+    """What of two readings the better one has more of: agreement, then likelihood."""
 
 
 def agreeing_fit(
@@ -251,7 +248,8 @@ def _agreement_of(curves: Mapping[str, ImageCurve], cable: KnownCable) -> _Agree
             shares[name] = float(near[curve.whole].sum() / max(int(curve.whole.sum()), 1))
         worst = min(shares, key=lambda name: shares[name])
         if best is None or shares[worst] > best.share:
-            best = _Agreement(curves, fit, shares[worst], worst)
+            score = min(shares[worst], _SURE), -fit.surprise
+            best = _Agreement(curves, fit, shares[worst], worst, score)
         if best.share > _SURE:
             break
     return best
