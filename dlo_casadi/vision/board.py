@@ -32,24 +32,16 @@ _AXES = {
 
 @dataclass(frozen=True)
 class Board:
-    """A flat board with ArUco markers, whose sides are parallel to the board's axes.
-
-    Parameters
-    ----------
-    dictionary : str
-        Name of OpenCV's predefined dictionary, e.g. DICT_4X4_50.
-    marker_size : scalar [m]
-        Side of the black square.
-    standoff : scalar [m]
-        Distance of the cable's axis in front of the board, towards the camera.
-    marker_centers : dict of int to (x, y) [m]
-        Centre of each marker in the board frame, by its number.
-    """
+    """A flat board with ArUco markers, whose sides are parallel to the board's axes."""
 
     dictionary: str
+    """Name of OpenCV's predefined dictionary, e.g. DICT_4X4_50."""
     marker_size: float
+    """Side of the black square [m]."""
     standoff: float
+    """Distance [m] of the cable's axis in front of the board, towards the camera."""
     marker_centers: Mapping[int, tuple[float, float] | Array]
+    """Centre (x, y) [m] of each marker in the board frame, by its number."""
 
     def corners(self, marker: int) -> Array:
         """Corners (4, 2) [m] in the order in which ArUco reports them: clockwise from top left."""
@@ -65,16 +57,8 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
 
         H = [r_1, r_2, t + standoff r_3]
 
-    Without one, H is the homography of the board's own plane to pixels.
-
-    Parameters
-    ----------
-    image : (H, W, 3) uint8
-        The photograph.
-    board : Board
-        Markers and standoff.
-    camera : Camera, optional
-        Intrinsic matrix and distortion.
+    Without one, H is the homography of the board's own plane to pixels. `image` (H, W, 3) uint8 is
+    the photograph.
 
     Raises
     ------
@@ -88,7 +72,8 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
             "plane can be measured. Try: give camera.matrix, or standoff: 0."
         )
     fit, seen = _located(image, board, camera)
-    cable = fit.plane + board.standoff * np.outer(fit.normal, [0.0, 0.0, 1.0])
+    normal = np.cross(fit.plane[:, 0], fit.plane[:, 1])
+    cable = fit.plane + board.standoff * np.outer(normal, [0.0, 0.0, 1.0])
     return View(homography=cable, camera=camera, **seen)
 
 
@@ -104,7 +89,8 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
         If fewer than three of the board's markers are seen where they are declared.
     """
     fit, seen = _located(image, board, camera, LEAST_MARKERS)
-    rotation, shift = np.column_stack([fit.plane[:, :2], fit.normal]), fit.plane[:, 2]
+    one, other, shift = fit.plane.T
+    rotation = np.column_stack([one, other, np.cross(one, other)])
     at = np.vstack([board.corners(n) for n in fit.found]) @ rotation[:, :2].T + shift
     # Corners of a marker err together: 4 (J^T J)^-1 s^2 with the corners' own scatter s^2 = sum /
     # (2 K - 6). On rendered boards poses are off by up to five times what sixteen independent
@@ -132,10 +118,6 @@ class _Fit:
     @property
     def rms(self) -> float:
         return float(np.sqrt(np.mean(np.square(self.errors))))
-
-    @property
-    def normal(self) -> Array:
-        return np.cross(self.plane[:, 0], self.plane[:, 1])
 
 
 def _located(

@@ -75,12 +75,8 @@ def calibrate_camera(photographs: Mapping[str, Picture], board: Board) -> Calibr
 
     with k numbers and N independent corners is taken (Schwarz).
 
-    Parameters
-    ----------
-    photographs : dict of str to (H, W, 3) uint8
-        By their names, all taken with one camera at one focus and zoom.
-    board : Board
-        Markers; the standoff does not count.
+    The photographs (H, W, 3) uint8, by their names, are all taken with one camera at one focus and
+    zoom. The board's standoff does not count.
 
     Raises
     ------
@@ -195,14 +191,9 @@ def _matrix_std(slopes: list[Array], displaced: list[Array], rms: float) -> Arra
     they are declared. OpenCV's drop what photographs from one direction do not tell, and call it
     known.
 
-    Parameters
-    ----------
-    slopes : list of (2 K, 10 + k)
-        Derivatives of the corners of one photograph by its place (6), the matrix (4), the lens.
-    displaced : list of (2 K, 2 m)
-        By the places of the m markers on the board [px/m].
-    rms : scalar [px]
-        Of the distances of the corners.
+    `slopes` (2 K, 10 + k) are derivatives of the corners of each photograph by its place (6), the
+    matrix (4) and the lens, `displaced` (2 K, 2 m) by the places of the m markers on the board
+    [px/m]; `rms` [px] is that of the distances of the corners.
     """
     places = 6 * len(slopes)
     own, shared = block_diag(*(s[:, :6] for s in slopes)), np.vstack([s[:, 6:] for s in slopes])

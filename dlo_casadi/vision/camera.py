@@ -23,19 +23,13 @@ _UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with a lens, both as OpenCV defines them.
-
-    Parameters
-    ----------
-    matrix : (3, 3) [px]
-        [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
-    distortion : (0,), (4,), (5,), (8,), (12,) or (14,)
-        k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4[, tau_x, tau_y]]]]: radial and
-        tangential, rational, thin prism, tilted sensor.
-    """
+    """A pinhole camera with a lens, both as OpenCV defines them."""
 
     matrix: Array
+    """(3, 3) [px]: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
     distortion: Array
+    """k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4[, tau_x, tau_y]]]], or none: radial and
+    tangential, rational, thin prism, tilted sensor."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "matrix", np.asarray(self.matrix, float).reshape(3, 3))

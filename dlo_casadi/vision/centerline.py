@@ -225,9 +225,7 @@ def extract_centerline(
     Parameters
     ----------
     image : (H, W, 3) uint8
-        The photograph, blue, green, red.
-    view : View
-        Where its pixels lie on the cable's plane.
+        The photograph, blue, green, red; the view tells where its pixels lie on the cable's plane.
     cable : KnownCable
         Its fixtures, (2,) [m] each, and its size.
     workings : Workings, optional

@@ -32,15 +32,7 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 def read_image(path: Path | str) -> Picture:
     """Read a photograph, turned upright as its EXIF tag asks.
 
-    Parameters
-    ----------
-    path : Path or str
-        A JPEG, PNG, TIFF, BMP or WebP file.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        Blue, green, red.
+    A JPEG, PNG, TIFF, BMP or WebP file becomes (H, W, 3) uint8: blue, green, red.
 
     Raises
     ------
@@ -134,13 +126,9 @@ def spoilt(image: Picture) -> str:
 def draw_steps(image: Picture, workings: Workings) -> dict[str, Picture]:
     """Draw the steps of an extraction that were reached.
 
-    Parameters
-    ----------
-    image : (H, W, 3) uint8
-        The photograph, blue, green, red.
-    workings : Workings
-        Filled by `extract_centerline` or `see_cable`, as far as it came; empty where the board was
-        not found: the photograph is then all there is to see.
+    `image` (H, W, 3) uint8 is the photograph. The workings are filled by `extract_centerline` or
+    `see_cable`, as far as it came; they are empty where the board was not found: the photograph is
+    then all there is to see.
 
     Returns
     -------

@@ -64,20 +64,6 @@ class ImageCurve:
         """Distance [px] of neighbouring pixels, the median."""
         return float(np.median(np.linalg.norm(np.diff(self.pixels, axis=0), axis=1)))
 
-    @property
-    def independent_std(self) -> Array:
-        """Standard deviations (K,) [px] of independent pixels that tell as much.
-
-        Pixels a distance h apart whose errors are correlated over the length c (the integral of the
-        correlation, on both sides) are worth h / (2 c) independent ones.
-        """
-        return self.std * np.sqrt(max(2.0 * self.correlation / max(self.spacing, 1e-6), 1.0))
-
-    @property
-    def rays(self) -> Array:
-        """Undistorted rays (K, 2) of the pixels."""
-        return self.viewpoint.rays(self.pixels)
-
 
 def see_cable(
     image: Picture, viewpoint: Viewpoint, cable: KnownCable, workings: Workings | None = None
@@ -223,7 +209,10 @@ def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Indices, Indices, f
     R = other.viewpoint.rotation @ one.viewpoint.rotation.T
     t = other.viewpoint.translation - R @ one.viewpoint.translation
     E = np.cross(t, R, axisb=0, axisc=0)
-    a, b = (np.column_stack([seen.rays, np.ones(len(seen.pixels))]) for seen in (one, other))
+    a, b = (
+        np.column_stack([seen.viewpoint.rays(seen.pixels), np.ones(len(seen.pixels))])
+        for seen in (one, other)
+    )
     in_other, in_one = a @ E.T, b @ E
     slope = np.sum(in_other[:, :2] ** 2, axis=1)[:, None] + np.sum(in_one[:, :2] ** 2, axis=1)
     focal = np.sqrt(one.viewpoint.camera.focal * other.viewpoint.camera.focal)
@@ -271,7 +260,7 @@ def triangulate(one: ImageCurve, other: ImageCurve, first: Indices, second: Indi
     rows, sides = [], []
     for seen, chosen in ((one, first), (other, second)):
         R, t = seen.viewpoint.rotation, seen.viewpoint.translation
-        rays = seen.rays[chosen]
+        rays = seen.viewpoint.rays(seen.pixels[chosen])
         rows.append(rays[:, :, None] * R[2] - R[:2])
         sides.append(t[:2] - rays * t[2])
     A, b = np.concatenate(rows, axis=1), np.concatenate(sides, axis=1)

@@ -140,6 +140,9 @@ def fit_curve_to_images(
     curve, n, m = first, len(first.coefficients), len(curves)
     grid = np.linspace(0.0, 1.0, _GRID)
     params = list(params or [places_along(seen, curve.position(grid)) for seen in curves])
+    # Pixels a distance h apart whose errors are correlated over the length c (the integral of the
+    # correlation, on both sides) are worth h / (2 c) independent ones.
+    shared = [max(2 * seen.correlation / max(seen.spacing, 1e-6), 1.0) for seen in curves]
     motions = np.zeros((m, 6))
     rigid = [np.linalg.inv(seen.viewpoint.covariance) for seen in curves]
     prior = block_diag(np.zeros((3 * n, 3 * n)), *rigid)
@@ -163,7 +166,7 @@ def fit_curve_to_images(
             whole = np.zeros((len(by_curve), 3 * n + 6 * m))
             whole[:, : 3 * n] = by_curve
             whole[:, 3 * n + 6 * v : 3 * n + 6 * v + 6] = by_motion
-            std = seen.independent_std[used]
+            std = seen.std[used] * np.sqrt(shared[v])
             scaled = error[used] / std
             weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(scaled), 1e-9)))
             rows.append(whole * (weight / std)[:, None])

@@ -267,7 +267,7 @@ def _guessed(curve: ImageCurve, cable: KnownCable) -> Array:
     depths = viewpoint.in_camera(cable.fixtures)[:, 2]
     along = chord_length(curve.pixels)
     depth = np.interp(along / along[-1], np.linspace(0.0, 1.0, len(depths)), depths)
-    at = np.column_stack([curve.rays, np.ones(len(depth))]) * depth[:, None]
+    at = np.column_stack([viewpoint.rays(curve.pixels), np.ones(len(depth))]) * depth[:, None]
     return np.asarray((at - viewpoint.translation) @ viewpoint.rotation)
 
 

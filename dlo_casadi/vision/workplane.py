@@ -26,20 +26,14 @@ _NARROWEST, _WIDEST = 0.4, 1.8  # of the cable's width
 
 @dataclass(frozen=True)
 class KnownCable:
-    """What is known of a cable before it is seen.
-
-    Parameters
-    ----------
-    start, end : (2,) or (3,) [m]
-        The fixtures in the board frame; `end` is None for a free end.
-    diameter, length : scalar [m]
-        Of the cable.
-    """
+    """What is known of a cable before it is seen."""
 
     start: ArrayLike
+    """Fixture (2,) or (3,) [m] in the board frame."""
     end: ArrayLike | None
-    diameter: float
-    length: float
+    """The other fixture; None for a free end."""
+    diameter: float  # [m]
+    length: float  # [m]
 
     @property
     def fixtures(self) -> Array:
@@ -267,9 +261,7 @@ def find_strands(mask: Flags, width_px: float) -> list[tuple[Indices, float]]:
     shorter than the cable is wide are left out: whether the strands on both sides of a cut
     continue each other is decided by their directions, not by the pixels between them.
 
-    Returns
-    -------
-    Column and row (K, 2) of the neighbouring pixels of each strand, in order, and the median width
+    Of each strand column and row (K, 2) of its neighbouring pixels, in order, and the median width
     [px] of the mask about it.
     """
     whole = mask.astype(np.uint8) * 255
