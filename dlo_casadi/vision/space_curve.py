@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import find_objects, label
 
-from dlo_casadi.vision.camera import Array, Picture, Viewpoint, compare_pixels
+from dlo_casadi.vision.camera import Array, Picture, compare_pixels
 from dlo_casadi.vision.centerline import FINE
 from dlo_casadi.vision.image_curve import ImageCurve, other_stretches, places_along
 from dlo_casadi.vision.profiles import (
@@ -158,9 +158,7 @@ def fit_curve_to_images(
         rows = [np.hstack([still.reshape(3 * n, -1), np.zeros((3 * n, 6 * m))])]
         errors, residuals = [np.zeros(3 * n)], []
         for v, seen in enumerate(curves):
-            camera = seen.viewpoint.moved(motions[v])
-            params[v] = _nearest(curve, seen, camera, params[v])
-            by_curve, by_motion, error = _linearise(curve, seen, camera, motions[v], params[v])
+            params[v], error, by_curve, by_motion = _linearise(curve, seen, motions[v], params[v])
             residuals.append(error)
             used = np.isfinite(error)
             whole = np.zeros((len(by_curve), 3 * n + 6 * m))
@@ -208,24 +206,14 @@ def _solve(
 
 
 def _linearise(
-    curve: SpaceCurve, seen: ImageCurve, camera: Viewpoint, motion: Array, t: Array
-) -> tuple[Array, Array, Array]:
-    """Residuals (K,) [px] across the projected curve, nan where no place t is known.
+    curve: SpaceCurve, seen: ImageCurve, motion: Array, t: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Nearest places (K,) on the projected curve, from near ones t; nan beyond its ends.
 
-    Before them minus their slopes, of the others, by coefficients (k, 3 n) and motions (k, 6).
+    Behind them the residuals (K,) [px] across it, nan where no place is known, and minus the slopes
+    of the others by coefficients (k, 3 n) and motions (k, 6).
     """
-    error, used = np.full(len(t), np.nan), np.isfinite(t)
-    basis, points, tangents = curve.design(t[used]), curve.position(t[used]), curve.tangent(t[used])
-    error[used], slopes = compare_pixels(camera, seen.pixels[used], points, tangents, seen.diameter)
-    by_shift = -slopes @ camera.rotation.T
-    turned = points @ camera.rotation.T + camera.translation - motion[3:]
-    by_curve = (basis[:, :, None] * -slopes[:, None, :]).reshape(len(points), -1)
-    return by_curve, np.hstack([np.cross(turned, by_shift), by_shift]), error
-
-
-def _nearest(curve: SpaceCurve, seen: ImageCurve, camera: Viewpoint, t: Array) -> Array:
-    """Nearest places on the projected curve, from near ones; nan beyond its ends."""
-    t = t.copy()
+    camera, t, error = seen.viewpoint.moved(motion), t.copy(), np.full(len(t), np.nan)
     for _ in range(2):
         used = np.nonzero(np.isfinite(t))[0]
         pixels, slopes = camera.project(curve.position(t[used]))
@@ -234,7 +222,13 @@ def _nearest(curve: SpaceCurve, seen: ImageCurve, camera: Viewpoint, t: Array) -
         step = off / np.maximum(np.sum(tangent**2, axis=1), 1e-9)
         moved = t[used] + np.clip(step, -2.0 / _GRID, 2.0 / _GRID)
         t[used] = np.where((moved >= 0.0) & (moved <= 1.0), moved, np.nan)
-    return t
+    used = np.nonzero(np.isfinite(t))[0]
+    basis, points, tangents = curve.design(t[used]), curve.position(t[used]), curve.tangent(t[used])
+    error[used], slopes = compare_pixels(camera, seen.pixels[used], points, tangents, seen.diameter)
+    by_shift = -slopes @ camera.rotation.T
+    turned = points @ camera.rotation.T + camera.translation - motion[3:]
+    by_curve = (basis[:, :, None] * -slopes[:, None, :]).reshape(len(points), -1)
+    return t, error, by_curve, np.hstack([np.cross(turned, by_shift), by_shift])
 
 
 def measure_shared_outlines(

@@ -122,9 +122,8 @@ def rectify(image: Picture, view: View, expected: ExpectedLine) -> WorkPlane:
     half = np.sqrt(spare + focus**2) + expected.scene.around * length
     centre = (fixtures[0] + fixtures[-1]) / 2
     share = np.linspace(0.0, 1.0, 33)
-    zero, one = np.zeros_like(share), np.ones_like(share)
-    u, v = np.concatenate([share, one, share, zero]), np.concatenate([zero, share, one, share])
-    border = view.to_board(np.column_stack([u, v]) * [view.shape[1] - 1, view.shape[0] - 1])
+    seen = np.stack(np.meshgrid(share, share), axis=2) * [width - 1, height - 1]
+    border = view.to_board(seen)
     lower = np.maximum(centre - half, border.min(axis=0))
     upper = np.minimum(centre + half, border.max(axis=0))
     size = np.maximum(upper - lower, diameter)
