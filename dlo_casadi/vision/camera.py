@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import cv2
 import numpy as np
@@ -220,14 +220,8 @@ class Viewpoint(Photograph):
 
     def facing(self, distance: float) -> View:
         """View of the plane q_z = `distance` [m]: the undistorted photograph in metres, y up."""
-        return View(
-            homography=np.diag([1.0, -1.0, distance]),
-            shape=self.shape,
-            camera=self.camera,
-            reprojection_error=self.reprojection_error,
-            markers=self.markers,
-            numbers=self.numbers,
-        )
+        shown = {item.name: getattr(self, item.name) for item in fields(Photograph)}
+        return View(homography=np.diag([1.0, -1.0, distance]), **shown)
 
 
 def project_outline(

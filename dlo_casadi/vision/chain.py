@@ -187,9 +187,8 @@ def order_strands(strands: Sequence[Strand], expected: ExpectedLine) -> Chain | 
     ]
     best: _State | None = None
     for _ in range(len(strands)):
-        states.sort(key=lambda state: state[0])
         following: list[_State] = []
-        for cost, path, supported, total in states[:_BEAM]:
+        for cost, path, supported, total in sorted(states)[:_BEAM]:
             tip = path[-1]
             whole = total + to_end[tip]
             off = max(whole / length - 1.0, 1.0 - whole / expected.shortest)
@@ -199,15 +198,10 @@ def order_strands(strands: Sequence[Strand], expected: ExpectedLine) -> Chain | 
                 best = (closed, path, supported, whole)
             reach = total + gap[tip] + seen
             usable = np.isfinite(link[tip]) & (reach < 1.15 * length + 2 * diameter)
-            for w in np.nonzero(usable)[0]:
-                if any(w // 2 == p // 2 for p in path):
-                    continue
-                step = float(link[tip, w] - worth[w])
-                following.append(
-                    (cost + step, (*path, int(w)), supported + float(seen[w]), float(reach[w]))
-                )
-        if not following:
-            break
+            usable[[w for p in path for w in (p, p ^ 1)]] = False  # a strand and its other way
+            for w in np.flatnonzero(usable).tolist():
+                onwards = cost + float(link[tip, w] - worth[w])
+                following.append((onwards, (*path, w), supported + float(seen[w]), float(reach[w])))
         states = following
     if best is None:
         return None

@@ -83,10 +83,10 @@ class Profiles:
     values: Array  # (K, M, 3), colours
     inside: Flags  # (K,), the cable and its edges lie in the photograph
 
-    def core_and_rim(self, diameter: float) -> tuple[Array, Flags]:
-        """Colours (K, 3) of the cable in each profile, and the offsets (M,) of its surroundings."""
+    def core_and_rim(self, diameter: float) -> tuple[Array, Array]:
+        """Colours (K, 3) of the cable in each profile, and those (K, R, 3) of its surroundings."""
         core = self.values[:, np.abs(self.offset) < 0.3 * diameter].mean(axis=1)
-        return core, np.abs(self.offset) > 0.8 * diameter
+        return core, self.values[:, np.abs(self.offset) > 0.8 * diameter]
 
     def average(self, trusted: Flags, along: float) -> Profiles:
         """Average trusted profiles along the curve, with a Gaussian of deviation `along` [m].
@@ -151,11 +151,10 @@ def cable_direction(profiles: Profiles, trusted: Flags, diameter: float) -> Arra
 
         g ~ (C_cable + C_around)^-1 (mean_cable - mean_around)
     """
-    core, rim = profiles.core_and_rim(diameter)
-    core, beside = core[trusted], profiles.values[trusted][:, rim]
-    around = beside.mean(axis=1)
-    scatter = (beside.reshape(-1, 3) - np.repeat(around, rim.sum(), axis=0)).T
-    spread = np.cov((core - np.median(core, axis=0)).T) + np.cov(scatter)
+    core, rim = (part[trusted] for part in profiles.core_and_rim(diameter))
+    around = rim.mean(axis=1)
+    scatter = np.cov((rim - around[:, None]).reshape(-1, 3).T)
+    spread = np.cov((core - np.median(core, axis=0)).T) + scatter
     step = np.median(core - around, axis=0)
     spread += 4.0 * np.eye(3)
     fisher = np.linalg.solve(spread, step)
@@ -176,9 +175,8 @@ def local_directions(
         g_k = h d_k / |d_k|^2,  d_k the step in all colours
     """
     core, rim = profiles.core_and_rim(diameter)
-    around = profiles.values[:, rim].mean(axis=1)
     deviation = _LOCAL * diameter / float(np.median(np.diff(profiles.t)))
-    step = gaussian_filter1d(core - around, deviation, axis=0, mode="nearest")
+    step = gaussian_filter1d(core - rim.mean(axis=1), deviation, axis=0, mode="nearest")
     usual = float(np.median((step @ direction)[trusted]))
     size = np.sum(step**2, axis=1)
     other = (step @ direction / usual < 0.5) & (size > (_FAINT * usual) ** 2)
