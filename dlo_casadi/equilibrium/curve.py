@@ -196,10 +196,7 @@ def chord_places(points: FloatArray, pose: Pose, length: float) -> FloatArray:
 
     Chords across gaps are shorter than the cable; between two fixtures the whole is scaled.
     """
-    line = [np.array(pose.start)[None], points]
-    if pose.end is not None:
-        line.append(np.array(pose.end)[None])
-    polyline = np.concatenate(line)
+    polyline = pose.joined(points)
     steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
     # Noise lengthens a dense polyline: chords over several points are what counts.
     s = _denoised_length(polyline, steps)

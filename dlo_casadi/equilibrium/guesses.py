@@ -110,7 +110,7 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
     if chord is None:
         found = _hanging(model, u, bent, clamps[0])
     elif model.start == model.end == "pinned":
-        found = [arc_headings(u, 1.0, np.zeros(2), chord, side) for side in sides]
+        found = [arc_headings(u, 1.0, chord, side) for side in sides]
         found += _curved(model.n, u, bent, chord)
     else:
         into = [arc_into_clamps(u, chord, clamps, side) for side in sides]
@@ -149,20 +149,18 @@ def arc_half_angle(chord: float, length: float) -> float:
     return float(np.sqrt(y * total))
 
 
-def arc_headings(
-    places: FloatArray, length: float, start: FloatArray, end: FloatArray, side: int
-) -> FloatArray:
+def arc_headings(places: FloatArray, length: float, chord: FloatArray, side: int) -> FloatArray:
     """Headings (k,) [rad] of the circular arc of the given length through both ends.
 
     Parameters
     ----------
     places : (k,) [m]
         Arc lengths.
-    start, end : (2,) [m]
+    chord : (2,) [m]
+        End minus start.
     side : +1 or -1
         +1 turns counter-clockwise from start to end.
     """
-    chord = end - start
     half = arc_half_angle(float(np.hypot(*chord)), length)
     direction = np.arctan2(chord[1], chord[0])
     return direction + side * half * (2 * places / length - 1)
@@ -196,7 +194,7 @@ def arc_into_clamps(
     float [rad]
         How far the first bends it, in the mean over the clamps, at most pi.
     """
-    arc = arc_headings(np.concatenate([[0.0], u, [1.0]]), 1.0, np.zeros(2), chord, side)
+    arc = arc_headings(np.concatenate([[0.0], u, [1.0]]), 1.0, chord, side)
     excess = [
         (float(clamp[0] - own), (1 - from_clamp) ** _DECAY)
         for clamp, own, from_clamp in zip(clamps, arc[[0, -1]], (u, 1 - u), strict=True)
@@ -383,14 +381,10 @@ def line_nodes(points: FloatArray, pose: Pose, chain: Chain, places: FloatArray)
     plane headings are continuous along the cable; in space the clamps' roll is spread evenly, of
     the twists that reach the end clamp the one nearest to `turns`.
     """
-    line = [np.array(pose.start)[None], points]
-    s = [np.array([0.0]), places]
-    if pose.end is not None:
-        line.append(np.array(pose.end)[None])
-        s.append(np.array([chain.length]))
-    polyline, at = np.concatenate(line), np.maximum.accumulate(np.concatenate(s))
+    last = [] if pose.end is None else [chain.length]
+    at = np.maximum.accumulate(np.concatenate([[0.0], places, last]))
     grid = np.linspace(0.0, at[-1], 31)
-    chords = np.diff([np.interp(grid, at, column) for column in polyline.T]).T
+    chords = np.diff([np.interp(grid, at, column) for column in pose.joined(points).T]).T
     middles = (grid[1:] + grid[:-1]) / 2
     if chain.kind.node is not Frame:
         headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))

@@ -102,6 +102,11 @@ class Pose:
         end_place = None if self.end is None else tuple(end)
         return replace(self, start=tuple(start), end=end_place, **held)
 
+    def joined(self, points: FloatArray) -> FloatArray:
+        """Points (K, d) [m] along the cable with its start before and its end, if held, after."""
+        end = [] if self.end is None else [np.array(self.end)[None]]
+        return np.concatenate([np.array(self.start)[None], points, *end])
+
     def rolled(self, angle: float) -> Pose:
         """The pose with its end clamp, in space, turned about its x axis [rad]."""
         if self.end_orientation is None:

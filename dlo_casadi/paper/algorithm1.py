@@ -132,11 +132,9 @@ class Target:
     @classmethod
     def of(cls, measured: MeasuredPose, gap: float) -> Target:
         """Take the points of a pose; what is missing over more than `gap` [m] is a gap."""
-        start = np.array(measured.pose.start)
-        points, end = measured.points - start, np.array(measured.pose.end) - start
-        line = np.concatenate([np.zeros((1, 2)), points, end[None]])
+        line = measured.pose.joined(measured.points) - np.array(measured.pose.start)
         wide = np.hypot(*np.diff(line, axis=0).T) > gap
-        return cls(points, wide[:-1] | wide[1:], end)
+        return cls(line[1:-1], wide[:-1] | wide[1:], line[-1])
 
     def nearest(self, nodes: FloatArray) -> tuple[NDArray[np.intp], BoolArray]:
         """Index of the nearest point of each node, and whether the node is in view.
@@ -210,7 +208,7 @@ class InnerProblem:
         """Arc through both ends on the pose's branch, or nearer to the measured points."""
         sides = {"ccw": (1,), "cw": (-1,)}.get(pose.branch or "", (1, -1))
         places, length = self.chain.places, self.chain.length
-        arcs = [arc_headings(places, length, np.zeros(2), target.end, side) for side in sides]
+        arcs = [arc_headings(places, length, target.end, side) for side in sides]
         return min(arcs, key=lambda phi: target.residual(self.nodes(phi)[1:-1]))
 
     def solve_ipopt(

@@ -164,7 +164,7 @@ def by_casadi(n: int, kind: str, repeats: int) -> dict[str, Any]:
     reference = CompiledSolver(model, model.nominal, np.zeros(n - 1))
     seconds, errors = [], []
     for end in poses():
-        start = arc_headings(model.chain.places, CABLE.length, np.zeros(2), end, 1)
+        start = arc_headings(model.chain.places, CABLE.length, end, 1)
         p = np.concatenate(
             [model.nominal, np.zeros(n - 1), Pose((0.0, 0.0), end).vector, np.zeros(6)]
         )
@@ -198,7 +198,7 @@ def by_cobyla(n: int) -> dict[str, Any]:
     seconds, reached = [], 0
     for end in poses()[:4]:
         good = reference.solve(Pose((0.0, 0.0), tuple(end), branch="ccw")).x[:, 0]
-        start = arc_headings(model.chain.places, CABLE.length, np.zeros(2), end, 1)
+        start = arc_headings(model.chain.places, CABLE.length, end, 1)
 
         def energy(theta: FloatArray) -> float:
             phi = np.cumsum(theta)

@@ -164,7 +164,7 @@ def cobyla(pose: Pose, n: int) -> FloatArray:
     h = model.chain.h
     k_theta, weight = published.STIFFNESS / h, published.MASS / n * 9.81
     end = np.array(pose.end)
-    start = arc_headings(model.chain.places, published.LENGTH, np.zeros(2), end, 1)
+    start = arc_headings(model.chain.places, published.LENGTH, end, 1)
 
     def energy(theta: FloatArray) -> float:
         rise = h * np.sin(np.cumsum(theta))
