@@ -27,7 +27,7 @@ BENDING_STIFFNESS = "bending_stiffness"
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
 # ln(3): GJ over EI is 1 / (1 + nu) in a solid round rod; strands and jackets make it less or more.
 STIFFNESS_RATIO_STD = float(np.log(3.0))
-# Nobody knows how a cable's own twist was gripped: tolerances.roll by default [rad].
+# Prior std of the end roll [rad]: the twist at which the cable was gripped is unknown.
 ROLL_STD = 1.0
 TORSIONAL_STIFFNESS = "torsional_stiffness"
 STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)

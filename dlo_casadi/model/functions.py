@@ -29,6 +29,7 @@ class Functions:
 
     def __init__(self, model: CableModel) -> None:
         self.model, self.terms = model, lagrangian_of(model)
+        self.node, self.kind = model.node, model.chain.kind
         x, lam, p, deviation = (getattr(self.terms, k) for k in ("x", "lam", "p", "deviation"))
         rest, place = self.terms.rest_strains, self.terms.place
         self._segment_arguments = [x, lam, p, rest, place, deviation]
@@ -59,14 +60,14 @@ class Functions:
     @cached_property
     def _gradient(self) -> ca.SX:
         """Gradient (2b + k,) of the Lagrangian of a segment."""
-        if self.model.chain.kind.framed:
+        if self.kind.framed:
             return self._of_pulls @ self._about_nodes.gradient
         return ca.gradient(self.terms.segment_terms.lagrangian, self._by)
 
     @cached_property
     def segment(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
-        if self.model.chain.kind.framed:
+        if self.kind.framed:
             found, spread = self._about_nodes, self._of_pulls
             value, hessian = found.value, spread @ found.hessian @ spread.T
         else:
@@ -94,7 +95,7 @@ class Functions:
         The unknowns inside are, for an extensible cable, a_e with the axial strain sqrt(C) a_e and
         the energy h a_e^2 / 2, and the element's own.
         """
-        kind, inner = self.model.chain.kind, self.terms.inner
+        kind, inner = self.kind, self.terms.inner
         unknowns = ca.SX.sym("unknowns", self.model.n_inner)
         ratio, axial = self.terms.stretch, ca.SX(0)
         if self.model.extensible:
@@ -148,7 +149,7 @@ class Functions:
     @cached_property
     def segment_sensitivity(self) -> ca.Function:
         """As `segment` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
-        if self.model.chain.kind.framed:
+        if self.kind.framed:
             first, last, pulled = self._framed.by_numbers(self._numbers)
             turns = self._framed.node_turns
             mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
@@ -171,9 +172,9 @@ class Functions:
     @cached_property
     def _rates(self) -> ca.SX:
         """Length ratio of a segment and, in a plane, its turning d phi / ds [1/m]."""
-        if self.model.node.increment > 1:  # no map of the measurement depends on a frame
+        if self.node.increment > 1:  # no map of the measurement depends on a frame
             return self.terms.segment_terms.ratio
-        turning = self.terms.stretch * self.model.chain.kind.strain(self._plain)
+        turning = self.terms.stretch * self.kind.strain(self._plain)
         return ca.vertcat(self.terms.segment_terms.ratio, turning)
 
     @cached_property
@@ -185,7 +186,7 @@ class Functions:
     def segment_curve_slopes(self) -> ca.Function:
         """As `segment` -> the same, derivatives by increments, lam, and by p, rest, deviation."""
         by = (self._by, self._numbers)
-        if self.model.chain.kind.framed:
+        if self.kind.framed:
             # The advance is the Lagrangian's derivative by the force on the end's holder.
             by_nodes = (self._of_pulls @ self._about_nodes.hessian)[:, 6:9].T
             advance = [by_nodes, self._framed.by_numbers(self._numbers)[2][:3, :]]
@@ -198,8 +199,7 @@ class Functions:
     @cached_property
     def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
         """Arguments, place (and slope) in the measurement of one station, and what moves it."""
-        kind = self.model.chain.kind
-        node = self.model.node
+        kind, node = self.kind, self.node
         point, rates = ca.SX.sym("point", node.dimension), ca.SX.sym("rates", self._rates.numel())
         frame = ca.SX.sym("frame", node.coordinates)
         slope = rates[0] * node.tangent(frame)
@@ -233,7 +233,7 @@ class Functions:
     @cached_property
     def segment_strain(self) -> ca.Function:
         """As `segment` -> mean strains of the cell [1/m]."""
-        return self._of_segment("strain", self.model.chain.kind.strain(self._plain))
+        return self._of_segment("strain", self.kind.strain(self._plain))
 
     @property
     def _plain(self) -> Segment:
@@ -245,7 +245,7 @@ class Functions:
     def segment_state(self) -> ca.Function:
         """As `segment` -> rest strains of the cell after it; by increments, rest and p."""
         own = self.terms.rest_strains[::3]
-        strain, mean = self.model.chain.kind.strain(self._plain), own
+        strain, mean = self.kind.strain(self._plain), own
         for effect, local in self.terms.effects_of(StateEffect):
             mean = effect.next_rest(mean, strain, self.model.cable, local)
         rest = ca.SX.sym("mean", own.numel())
@@ -262,7 +262,7 @@ class Functions:
         kept. Moments, about the world's axes, are the slope by turns of the first and last node of
         what the holders add to it: multipliers of clamps, springs of pins.
         """
-        node, x, delta = self.model.node, self.terms.x, self.terms.delta
+        node, x, delta = self.node, self.terms.x, self.terms.delta
         places = -ca.gradient(self.terms.ends_lagrangian, self.terms.pose)[: 2 * node.dimension]
         turns = ca.gradient(self.terms.ends_lagrangian, delta)
         places, turns = ca.substitute([places, turns], [delta], [ca.SX.zeros(delta.shape)])
@@ -283,7 +283,7 @@ class Functions:
     @cached_property
     def _readings(self) -> ca.SX:
         """The same as sensors show them."""
-        rows, of = self._reactions, reaction_rows(self.model.node)
+        rows, of = self._reactions, reaction_rows(self.node)
         for effect, local in self.terms.effects_of(MeasurementEffect):
             parts = effect.feel({name: rows[at] for name, at in of.items()}, local)
             rows = ca.vertcat(*(parts[name] for name in of))
