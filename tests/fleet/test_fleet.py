@@ -19,7 +19,7 @@ from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import fit, main
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet.discover import find_sessions
+from dlo_casadi.fleet.discover import digest_of, find_sessions
 from dlo_casadi.fleet.overview import judge, overview_html, robust_z
 from dlo_casadi.fleet.rows import COLUMNS, empty_row, row_of
 from dlo_casadi.fleet.run import fit_fleet
@@ -178,6 +178,19 @@ def test_two_runs_do_not_write_to_one_folder(fleet, tmp_path):
     sessions = find_sessions(fleet)[1]
     with only_run(tmp_path), pytest.raises(DloError, match="another run is writing"):
         fit_fleet(sessions, tmp_path, InProcess(), QUICK)
+
+
+def test_each_photograph_of_a_pose_decides_the_results(tmp_path):
+    config = tmp_path / "session.yaml"
+    config.write_text(
+        "experiment: {poses: [{file: a.csv}, {files: [b.jpg, c.jpg]}, {role: fit}]}\n"
+    )
+    (session,) = find_sessions(config)[1]
+    digests = {digest_of(session, ())}
+    for name in ("a.csv", "b.jpg", "c.jpg"):
+        (tmp_path / name).write_text("changed")
+        digests.add(digest_of(session, ()))
+    assert len(digests) == 4
 
 
 def test_results_and_hidden_folders_are_no_sessions(tmp_path):
