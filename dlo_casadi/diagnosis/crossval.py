@@ -131,14 +131,12 @@ def cross_validate(
         theta, covariance = _without(fit, total.hessian - h_j, total.gradient - g_j)
         thetas.append(theta)
         covariances.append(covariance)
-    errors: list[tuple[FloatArray, FloatArray] | None] = []
     predicted = _predicted(fit, shapes, thetas, executor or InProcess())
-    for j, seen in zip(problem.used, predicted, strict=True):
-        item = problem.measured[j]
-        found = (
-            None if seen is None else (item.distances(seen.curve), item.misread(seen, fit.noise))
-        )
-        errors.append(found)
+    items = [problem.measured[j] for j in problem.used]
+    errors = [
+        None if seen is None else (item.distances(seen.curve), item.misread(seen, fit.noise))
+        for item, seen in zip(items, predicted, strict=True)
+    ]
     return replace(_validation(errors), expected=fit.expected_with(covariances))
 
 
@@ -167,29 +165,30 @@ def _predicted(
     fit: Fit, shapes: Shapes, thetas: list[FloatArray], executor: Executor
 ) -> list[Observed | None]:
     """What each fitted pose looks like at its own unknowns, from declared end conditions."""
-    problem, equilibria = fit.problem, fit.problem.equilibria
-    unknowns, model = problem.unknowns, fit.model
-    plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
-    if model.has_state:
-        folds = map_in_order(executor, partial(_predict_all, fit, plain), thetas)
+    problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
+    if fit.model.has_state:
+        folds = map_in_order(executor, partial(_predict_all, fit, shapes), thetas)
         return [seen[j] for j, seen in zip(problem.used, folds, strict=True)]
     p = np.repeat(fit.p[None], equilibria.m, axis=0)
     rest = np.repeat(fit.rest[None], equilibria.m, axis=0)
     for j, theta in zip(problem.used, thetas, strict=True):
         p[j], rest[j] = unknowns.p(theta), unknowns.rest(theta)
-    solved, converged = equilibria.solve(plain, p, rest)
+    solved, converged = equilibria.solve(_declared(shapes), p, rest)
     seen = equilibria.seen(solved, p, rest)
     return [seen[j] if converged[j] else None for j in problem.used]
 
 
-def _predict_all(fit: Fit, plain: Shapes, theta: FloatArray) -> list[Observed | None]:
+def _predict_all(fit: Fit, shapes: Shapes, theta: FloatArray) -> list[Observed | None]:
     """All poses in order at one value of the unknowns, a state carried along."""
     equilibria, unknowns = fit.problem.equilibria, fit.problem.unknowns
     p, rest = unknowns.p(theta), unknowns.rest(theta)
-    solved, converged = equilibria.solve(plain, p, rest)
-    if not converged.all():
-        return [None] * equilibria.m
-    return list(equilibria.seen(solved, p, rest))
+    solved, converged = equilibria.solve(_declared(shapes), p, rest)
+    return [*equilibria.seen(solved, p, rest)] if converged.all() else [None] * equilibria.m
+
+
+def _declared(shapes: Shapes) -> Shapes:
+    """Shapes held as declared, from which to solve."""
+    return replace(shapes, deviation=np.zeros_like(shapes.deviation))
 
 
 def _stretches(fit: Fit) -> CrossValidation:
@@ -206,7 +205,6 @@ def _stretches(fit: Fit) -> CrossValidation:
     own = fit.point.shapes.deviation[j, problem.equilibria.used_deviations]
     pull = np.concatenate([fit.point.theta - problem.mean, own])
     errors: list[tuple[FloatArray, FloatArray] | None] = []
-    equilibria = problem.equilibria
     for left_out in np.array_split(points, min(STRETCHES, len(points))):
         kept = np.ones(item.n_residuals, dtype=bool)
         kept[item.on_points] = ~np.isin(item.point_of, left_out)
@@ -216,13 +214,7 @@ def _stretches(fit: Fit) -> CrossValidation:
         step = -np.linalg.solve(hessian, a.T @ e + prior @ pull)
         lower, upper = problem.unknowns.bounds
         theta = np.clip(fit.point.theta + step[:size], lower, upper)
-        shapes = fit.point.shapes
-        plain = replace(shapes, deviation=np.zeros_like(shapes.deviation))
-        p, rest = problem.unknowns.p(theta), problem.unknowns.rest(theta)
-        solved, converged = equilibria.solve(plain, p, rest)
-        if not converged.all():
-            errors.append(None)
-            continue
-        curve = equilibria.seen(solved, p, rest)[j].curve
-        errors.append((item.misses(curve)[left_out], np.zeros(0)))
+        seen = _predict_all(fit, fit.point.shapes, theta)[j]
+        missed = None if seen is None else item.misses(seen.curve)[left_out]
+        errors.append(None if missed is None else (missed, np.zeros(0)))
     return _validation(errors)

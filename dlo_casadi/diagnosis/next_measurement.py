@@ -74,15 +74,11 @@ def hidden_weight(fit: Fit, exclude: Sequence[str] = ()) -> HiddenWeight | None:
     free = model.end == "free" and BENDING_STIFFNESS in fit.problem.unknowns.names
     if not free or not any(model.gravity):
         return None
-    setup = setup_of(model, n_poses=len(fit.problem.used))
-    listed = [
-        item
-        for item in candidates(model, setup, exclude)
-        if isinstance(item.effect, Load) and item.effect.carried
-    ]
-    if not listed:
+    listed = candidates(model, setup_of(model, n_poses=len(fit.problem.used)), exclude)
+    loads = (item for item in listed if isinstance(item.effect, Load) and item.effect.carried)
+    weight = next(loads, None)
+    if weight is None:
         return None  # it is in the model
-    weight = listed[0]
     place = _place(fit, weight)
     fits = [fit, *_with_weights(fit, weight, place)]
     if len(fits) == 1:

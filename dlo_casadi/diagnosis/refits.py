@@ -18,6 +18,7 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -30,18 +31,17 @@ from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit, with_border_of
-from dlo_casadi.estimation.fit import SEARCH_STD, STEPS_OF_A_RIVAL
+from dlo_casadi.estimation.fit import STEPS_OF_A_RIVAL, loosened
 from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import (
     FIRST_LOOK,
-    MORE,
     Guess,
     all_at_once,
     equilibria_near,
     measured_shapes,
 )
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.unknowns import Search, Unknowns
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.parallel import map_in_order
@@ -219,24 +219,15 @@ class Start:
     guess: Guess
 
 
-@dataclass(frozen=True)
-class Origin:
-    """Where starts begin: parameters, and shapes along the measured lines.
+class Origin(NamedTuple):
+    """Where starts begin: parameters by name, and shapes of m poses along the measured lines.
 
-    Parameters
-    ----------
-    values : dict
-        By the names of the base's parameters.
-    x : (m, n_nodes, coordinates)
-    projections : list of (K_j,) [m]
-    indices : tuple of int
-        Places of the m poses in the session.
+    `x` (m, n_nodes, coordinates); `projections` (K_j,) [m] of the points of each fitted pose.
     """
 
     values: dict[str, float]
     x: FloatArray
     projections: list[FloatArray]
-    indices: tuple[int, ...]
 
 
 def origins_of(base: Fit) -> tuple[Origin, ...]:
@@ -249,7 +240,7 @@ def origins_of(base: Fit) -> tuple[Origin, ...]:
     for p, own in ((base.p, turns), (declared, None)):
         values = dict(zip(names, map(float, p), strict=True))
         shapes, projections = measured_shapes(problem, values.get(END_ROLL, 0.0), own)
-        found.append(Origin(values, shapes.x, projections, tuple(problem.indices)))
+        found.append(Origin(values, shapes.x, projections))
     return tuple(found)
 
 
@@ -307,27 +298,20 @@ class _First:
         origins: Sequence[Origin],
         weights: tuple[FloatArray, ...] | None,
     ) -> None:
-        self.problem = replace(_searched_problem(base, model), weights=weights)
-        self.model = model
-        self.begun: list[tuple[FloatArray, Shapes, list[FloatArray]]] = []
-        for origin in origins:
-            p = base.values_in(model, origin.values)
-            if tuple(self.problem.indices) == origin.indices:
-                shapes, projections = (
-                    self.problem.equilibria.start_shapes(origin.x),
-                    origin.projections,
-                )
-            else:  # a state makes shapes depend on those of poses that were held out
-                shapes, projections = measured_shapes(
-                    self.problem, origin.values.get(END_ROLL, 0.0)
-                )
-            self.begun.append((p, shapes, projections))
+        problem = replace(_searched_problem(base, model), weights=weights)
+        self.base, self.model = base, model
+        self.begun: list[tuple[dict[str, float], Shapes, list[FloatArray]]] = []
+        for values, x, projections in origins:
+            shapes = problem.equilibria.start_shapes(x)
+            if len(x) != len(problem.indices):
+                # A state makes shapes depend on those of poses that were held out.
+                shapes, projections = measured_shapes(problem, values.get(END_ROLL, 0.0))
+            self.begun.append((values, shapes, projections))
         if weights is None:
-            p, shapes, projections = self.begun[0]
-            theta = self.problem.unknowns.pack(p, np.zeros(model.n_coefficients))
-            self.problem = self.problem.weighed(Values(theta, shapes, projections))
-        priors = base.model.priors
-        released = {name for name in priors if name not in model.priors}
+            theta = np.zeros(problem.unknowns.size)
+            problem = problem.weighed(Values(theta, *self.begun[0][1:]))
+        self.problem = problem
+        released = set(base.model.priors) - set(model.priors)
         self.kept = set(base.model.names) - released - {END_ROLL}
 
     def looks(self, scans: Sequence[dict[str, float]]) -> list[tuple[Guess, dict[str, float]]]:
@@ -348,12 +332,10 @@ class _First:
         ]
 
     def _look(self, scan: Mapping[str, float], k: int, decade: float = 0.0) -> Guess | None:
-        p, shapes, projections = self.begun[k]
-        p, stiff = p.copy(), self.model.stiffness_indices
+        values, shapes, projections = self.begun[k]
+        p, stiff = self.base.values_in(self.model, {**values, **scan}), self.model.stiffness_indices
         # Torsion goes with bending: their ratio is known better than what a misfit leaves of it.
         p[stiff] = 10**decade * p[0] / self.model.nominal[0] * self.model.nominal[stiff]
-        for name, value in scan.items():
-            p[self.model.names.index(name)] = value
         theta = self.problem.unknowns.pack(p, np.zeros(self.model.n_coefficients))
         held = np.array([name in self.kept or name in scan for name in self.problem.unknowns.names])
         return all_at_once(self.problem, Guess(theta, shapes, projections), held, STEPS[0])
@@ -363,10 +345,12 @@ class _First:
         other = start.problem.unknowns
         ended, rest = other.p(start.guess.theta), other.coefficients(start.guess.theta)
         there, here = f"{smaller.effect.label}.", f"{candidate.effect.label}."
-        values = dict(zip(self.model.names, map(float, self.model.nominal), strict=True))
-        for name, value in zip(other.model.names, map(float, ended), strict=True):
-            values[here + name.removeprefix(there) if name.startswith(there) else name] = value
-        p = np.array([values[name] for name in self.model.names])
+        renamed = (
+            here + name.removeprefix(there) if name.startswith(there) else name
+            for name in other.model.names
+        )
+        known = dict(zip(renamed, ended, strict=True))
+        p = np.array([known.get(q.name, q.nominal) for q in self.model.parameters])
         shapes = with_border_of(start.guess.shapes, other.model, self.model)
         begun = Guess(self.problem.unknowns.pack(p, rest), shapes, start.guess.projections)
         held = np.array([name in self.kept for name in self.problem.unknowns.names])
@@ -387,8 +371,7 @@ class _First:
 
 def _searched_problem(base: Fit, model: CableModel) -> Problem:
     """A model's batch problem as a search weighs it."""
-    known, problem = base.noise.before or base.noise, base.problem
-    noise = known.doubted(SEARCH_STD * model.cable.length)
+    problem, noise = base.problem, loosened(base.noise.before or base.noise, model)
     unknowns = Unknowns(model, base.free_in(model), base.values_in(model))
     return Problem(unknowns, problem.history, noise, Priors.of(problem.priors.tolerances, model))
 
@@ -397,7 +380,7 @@ def fit_from_data(base: Fit, start: Start) -> Fit | None:
     """The fit that a start leads to, weighed as the base; None where it leads to no equilibria."""
     problem = start.problem
     none = np.zeros(problem.unknowns.size, dtype=bool)
-    guess = all_at_once(problem, start.guess, none, MORE)
+    guess = all_at_once(problem, start.guess, none, Search.of(base.model).more)
     point = equilibria_near(problem, guess, start.guess)
     if point is None:
         return None

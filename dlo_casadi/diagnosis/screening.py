@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +65,8 @@ class Screened:
 
 def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
     """Return the fitted model with all candidates at their nominal values."""
-    model = fit.model
-    for candidate in listed:
-        if not candidate.nuisance:
-            model = model.with_effect(candidate.effect.linear())
-    return model
+    new = (candidate.effect.linear() for candidate in listed if not candidate.nuisance)
+    return reduce(CableModel.with_effect, new, fit.model)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.special import ndtri
 
 from dlo_casadi.diagnosis.screening import survival
@@ -118,31 +119,18 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         coefficients.append(basis.T @ lin.residuals[k])
         own.append(covariance)
         arms.append(a)
-    stacked = np.concatenate(coefficients)
     arm = np.concatenate(arms)
-    covariance = -arm @ fit.covariance @ arm.T
-    at = 0
-    for part in own:
-        covariance[at : at + len(part), at : at + len(part)] += part
-        at += len(part)
+    covariance = block_diag(*own) - arm @ fit.covariance @ arm.T
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    kept = values > KEPT_VARIANCE
-    along = vectors[:, kept].T @ stacked
-    statistic, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
+    along, dof = vectors.T @ np.concatenate(coefficients), int((values > KEPT_VARIANCE).sum())
+    statistic = float((along[-dof:] ** 2 / values[-dof:]).sum()) if dof else 0.0
     p_value = survival(statistic, max(dof, 1), noise_dof)
-    energies = np.array(
-        [
-            float((c**2).sum()) / max(float(np.trace(v)), 0.1)
-            for c, v in zip(coefficients, own, strict=True)
-        ]
-    )
-    series = [
-        one
-        for j, e in zip(problem.used, lin.residuals, strict=True)
-        for one in problem.measured[j].along(e)
-    ]
-    names = [problem.measured[j].pose.name for j in problem.used]
-    spans = np.array([problem.measured[j].pose.span for j in problem.used])
+    shares = zip(coefficients, own, strict=True)
+    energies = np.array([float((c**2).sum()) / max(float(np.trace(v)), 0.1) for c, v in shares])
+    items = [problem.measured[j] for j in problem.used]
+    pairs = zip(items, lin.residuals, strict=True)
+    series = [one for item, e in pairs for one in item.along(e)]
+    names, spans = [x.pose.name for x in items], np.array([x.pose.span for x in items])
     return Structure(
         statistic,
         dof,
@@ -153,15 +141,8 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         _rank_score(energies, spans),
         _position_score(fit, noise_dof),
         dict(zip(names, energies.tolist(), strict=True)),
-        _systematic(fit),
+        rest_scatter_of(fit, fit.noise).p_systematic if problem.priors.rest_scatter.std else None,
     )
-
-
-def _systematic(fit: Fit) -> float | None:
-    """Probability of what poses that are alike have in common; None where the cable repeats."""
-    if fit.problem.priors.rest_scatter.std == 0:
-        return None
-    return rest_scatter_of(fit, fit.noise).p_systematic
 
 
 def _position_score(fit: Fit, noise_dof: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,8 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import DECADES, starting_points
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.start import starting_points
+from dlo_casadi.estimation.unknowns import Search, Unknowns
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
@@ -25,10 +26,9 @@ FloatArray = NDArray[np.floating]
 
 # Places kept from the scan for a full fit.
 TRIED = 3
-PULL_PLACES = tuple(float(share) for share in np.linspace(0.1, 0.9, 9))
-COARSE, COARSE_IN_SPACE = 20, 10
-# Standard deviation of a pull about the mean of the poses, in weights of the cable.
-PULL_WEIGHTS = 1.0
+PLACES = tuple(float(share) for share in np.linspace(0.1, 0.9, 9))
+# Standard deviation of a force about the mean of the poses, in weights of the cable.
+FORCE_WEIGHTS = 1.0
 # Gauss-Newton steps along the flat valley of stiffness against force.
 MOST_STEPS = 150
 
@@ -80,7 +80,7 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
     """
     effect = UnknownPull()
     model = base.model.with_effect(effect)
-    coarse = min(COARSE_IN_SPACE if model.in_space else COARSE, model.n)
+    coarse = min(Search.of(model).mesh, model.n)
     search = _Search(base, model.with_mesh(coarse), f"{effect.label}.position")
     length, name = model.cable.length, search.position
     best: Fit | None = None
@@ -107,93 +107,66 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
 class _Search:
     """Fits with the load on a coarse mesh, from places along the cable.
 
-    Parameters
-    ----------
-    base : Fit
-        Without the load.
-    model : CableModel
-        With it.
-    position : str
-        Name of the parameter that holds the place.
+    Of a base without the load; `position` names the parameter that holds its place in the model.
     """
 
     base: Fit
     model: CableModel
     position: str
 
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """Which parameters are estimated: all but those that the base keeps fixed."""
-        return self.base.free_in(self.model)
-
     def run(self, executor: Executor) -> list[Fit]:
         """Fits from the most promising places, the best first."""
-        middle = PULL_PLACES[len(PULL_PLACES) // 2]
-        first = self.start((middle, DECADES))
-        decades = DECADES if first is None else self.decades_about(first)
-        asked = [(share, decades) for share in PULL_PLACES if share != middle]
-        starts = [first, *map_in_order(executor, self.start, asked)]
+        middle, *others = sorted(PLACES, key=lambda share: abs(share - 0.5))
+        decades = Search.of(self.model).force_decades
+        first = self.start(middle, decades)
+        if first and decades:
+            # What was left had one valley; over nine places of a simulated cable with a tether it
+            # moved by a decade at most.
+            own = self.model.names.index(BENDING_STIFFNESS)
+            best = round(float(np.log10(first.p[own] / self.model.nominal[own])))
+            decades = (best, best - 1, best + 1)
+        starts = [first, *map_in_order(executor, partial(self.start, decades=decades), others)]
         likely = sorted((x for x in starts if x), key=lambda start: start.point.objective)
         fits = map_in_order(executor, self.fit_from, likely[:TRIED])
         return sorted(fits, key=lambda fit: fit.point.objective)
 
-    def decades_about(self, start: Fit) -> tuple[float, ...]:
-        """Stiffnesses to start from at other places: at all, what was left had one valley.
-
-        Of a simulated cable with a tether, over nine places; the valley moved by a decade at most.
-        """
-        own = self.model.names.index(BENDING_STIFFNESS)
-        best = round(float(np.log10(start.p[own] / self.model.nominal[own])))
-        return (best, best - 1, best + 1)
-
-    def start(self, way: tuple[float, Sequence[float]]) -> Fit | None:
+    def start(self, share: float, decades: Sequence[float] | None) -> Fit | None:
         """Equilibria near the measured shapes for a load at a share of the length.
 
-        `way` is the share, and in a plane the decades about the prior stiffness to start from.
+        For stiffnesses over decades about the prior's, or for what the base has found.
         """
-        share, decades = way
-        problem = self.held_at(share)
+        problem, base = self.held_at(share), self.base
         unknowns = problem.unknowns
         theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.n_coefficients))
-        if self.model.in_space:
-            # Frames tell the stiffness over the weight better than headings do; a start costs more.
-            theta = unknowns.pack(self.base.values_in(self.model), self.base.coefficients)
-            return next(iter(starting_points(problem, theta, (0,))), None)
-        points = starting_points(problem, theta, decades)
-        return points[0] if points else None
+        if decades is None:
+            theta, decades = unknowns.pack(base.values_in(self.model), base.coefficients), (0,)
+        return next(iter(starting_points(problem, theta, decades)), None)
 
     def fit_from(self, start: Fit) -> Fit:
         """Fit with the load held where it is, then with its place free."""
         held = descend(start)
-        moving = self._problem(Unknowns(self.model, self.free, held.p))
+        moving = self._problem(Unknowns(self.model, self.base.free_in(self.model), held.p))
         theta = moving.unknowns.pack(held.p, held.coefficients)
         return descend(Fit(moving, replace(held.point, theta=theta)), MOST_STEPS)
 
     def held_at(self, share: float) -> Problem:
         """Problem with the load at a share of the length, all else nominal or kept fixed."""
-        free = self.free
+        free = self.base.free_in(self.model)
         values = np.where(free, self.model.nominal, self.base.values_in(self.model))
         place = self.model.names.index(self.position)
-        values[place] = share * self.model.cable.length
-        free[place] = False
+        values[place], free[place] = share * self.model.cable.length, False
         return self._problem(Unknowns(self.model, free, values))
 
     def _problem(self, unknowns: Unknowns) -> Problem:
-        priors = replace(self.base.problem.priors, scatter=pull_scatter(self.base))
-        return replace(self.base.problem, unknowns=unknowns, priors=priors)
+        """With the scatter of ends as in the base, of the force about its mean the cable's weight.
 
-
-def pull_scatter(base: Fit) -> FloatArray:
-    """Scatter of ends as in the base, of a pull about its mean the cable's weight.
-
-    Shapes tell the ratio of forces to stiffness and, by the weight, how large both are; where
-    the weight hardly shows, a force of a hundred times the weight would fit as well. And a force
-    along a taut cable hardly shows: there it should be like that of the other poses.
-    """
-    cable = base.model.cable
-    weight = cable.mass * float(np.linalg.norm(base.model.gravity))
-    scatter = base.problem.priors.scatter.copy()
-    scatter[-base.model.node.dimension :] = PULL_WEIGHTS * max(
-        weight, cable.bending_stiffness / cable.length**2
-    )
-    return scatter
+        Shapes tell the ratio of forces to stiffness and, by the weight, how large both are; where
+        the weight hardly shows, a force of a hundred times the weight would fit as well. And a
+        force along a taut cable hardly shows: there it should be like that of the other poses.
+        """
+        problem, model = self.base.problem, self.model
+        scatter, cable = problem.priors.scatter.copy(), model.cable
+        weight = cable.mass * float(np.linalg.norm(model.gravity))
+        bending = cable.bending_stiffness / cable.length**2
+        scatter[-model.node.dimension :] = FORCE_WEIGHTS * max(weight, bending)
+        return replace(problem, unknowns=unknowns, priors=replace(problem.priors, scatter=scatter))

@@ -15,8 +15,8 @@ from dlo_casadi.estimation.descent import descend, on_other_mesh, refit
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import DECADES, ROLLS, starting_points
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.start import ROLLS, starting_points
+from dlo_casadi.estimation.unknowns import DECADES, Search, Unknowns
 from dlo_casadi.estimation.variances import (
     SCATTER_FLOOR,
     SMOOTH_MODES,
@@ -43,20 +43,8 @@ POSES_OF_A_SEARCH = 40
 # session in space two rivals crept for 40 along a valley in which weight hardly tells. A
 # judgement, not a measured limit.
 STEPS_OF_A_RIVAL = 10
-# Standard deviation of points in a search in space, over the length. Of three sessions in which an
-# effect is missing, one (space_flat) found its minimum at the noise, too; at 3 mm two did, and one
-# with a drift in neither. A judgement.
-SEARCH_STD = 0.004
-# RMS distance over length that a search in space leaves, from which on the model lacks something,
-# and the standard deviation over length by which such a fit weighs the points. In four sessions in
-# which an effect is missing the searches left 0.0025 to 0.0083, in three with nothing or little
-# missing 0.0008 to 0.0013. Either stiffness of such a fit may be far off (a taper's torsion 0.0005
-# of 0.005 N m^2): what is missing is looked for from the measured shapes.
-MISFIT, MISFIT_STD = 0.002, 0.01
-# RMS distance over length from which a search in the plane may have gone astray, because every
-# hanging has a rest curvature of its own. Of 26 sessions 16 left less; no second search led
-# elsewhere there.
-ASTRAY = 0.001
+# Standard deviation of points over length by which a fit weighs them that meets them no better.
+MISFIT_STD = 0.01
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
 # Rise of the objective from a mesh to the next finer one by which a fit has got stuck: of two poses
@@ -126,8 +114,8 @@ def fit_model(
     theta = unknowns.pack(begin, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta, decades)
     different = different_poses(measured, model.cable.length)
-    astray = fit.beyond_noise and fit.residual_rms > ASTRAY * model.cable.length
-    if not model.in_space and different >= DIFFERENT and astray:
+    astray = fit.residual_rms > Search.of(model).astray * model.cable.length
+    if different >= DIFFERENT and fit.beyond_noise and astray:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every repeat had a rest curvature of its own.
         first = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
@@ -158,7 +146,7 @@ def _searched(problem: Problem, theta: FloatArray, decades: Sequence[float]) -> 
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )
-    if model.in_space and _misfits(best):
+    if _misfits(best):
         if END_ROLL in problem.unknowns.names:
             other = _search(problem, theta, decades, FAR_ROLLS, either_way=True)
             lower = other is not None and other.point.objective < best.point.objective
@@ -180,8 +168,8 @@ def _found(problem: Problem, theta: FloatArray, decades: Sequence[float]) -> Fit
 
 
 def _misfits(fit: Fit) -> bool:
-    """Whether a fit leaves more than MISFIT."""
-    return fit.residual_rms > MISFIT * fit.model.cable.length
+    """Whether a fit leaves so much that its model lacks something."""
+    return fit.residual_rms > Search.of(fit.model).misfit * fit.model.cable.length
 
 
 def _search(
@@ -197,14 +185,18 @@ def _search(
     In space the search takes the points for less sure than they are: where an effect is missing,
     shapes that are held to a fraction of a millimetre allow no way to the minimum.
     """
-    model, noise = problem.unknowns.model, problem.noise
-    loosely = noise.doubted(SEARCH_STD * model.cable.length) if model.in_space else noise
+    noise, loosely = problem.noise, loosened(problem.noise, problem.unknowns.model)
     begun = replace(problem, noise=loosely)
     starts: list[Fit] = []
     for tried in (decades, BETWEEN_DECADES):
         starts = starts or starting_points(begun, theta, tried, rolls, either_way=either_way)
     found = fit_from(starts)
     return found if found is None or loosely is noise else found.reweighed(noise)
+
+
+def loosened(noise: NoiseModel, model: CableModel) -> NoiseModel:
+    """Noise by which a search weighs the points."""
+    return noise.doubted(Search.of(model).std * model.cable.length)
 
 
 def fit_from(starts: Sequence[Fit]) -> Fit | None:
@@ -251,8 +243,7 @@ def fitted_closely(fit: Fit) -> Fit:
     known = fit.noise.before
     assert known is not None
     # Through the scale of the search: at the noise a first step would bend all that is left.
-    loosely = known.doubted(SEARCH_STD * fit.model.cable.length)
-    near = descend(fit.reweighed(loosely), STEPS_OF_A_RIVAL, tolerance=1e-2)
+    near = descend(fit.reweighed(loosened(known, fit.model)), STEPS_OF_A_RIVAL, tolerance=1e-2)
     if _misfits(near):
         return fit
     closely = refine(near.reweighed(known, _first_priors(near)), first=True)

@@ -228,6 +228,11 @@ class Fit:
         rows = [raw[on] for raw, on in zip(self.linearization.raw, self._on_points, strict=True)]
         return float(np.sqrt((np.concatenate(rows) ** 2).mean()))
 
+    def _rms_of_points(self, squares: Sequence[FloatArray]) -> float:
+        """Root mean square [m] over the points, by the squares (R_j,) of each pose's residuals."""
+        rows = [square[on] for square, on in zip(squares, self._on_points, strict=True)]
+        return float(np.sqrt(np.concatenate(rows).sum() / self._n_points))
+
     @property
     def compared_std(self) -> float:
         """Standard deviation [m] of what the fit compares: of points, or of means of several."""
@@ -242,9 +247,7 @@ class Fit:
         The scatter of the poses' ends and headings, carried to the curve by the equilibrium. The
         fit estimates each pose's own; of a pose that is only predicted nobody knows them.
         """
-        moved = self._by_fixtures
-        rows = [square[on] for square, on in zip(moved, self._on_points, strict=True)]
-        return float(np.sqrt(np.concatenate(rows).sum() / self._n_points))
+        return self._rms_of_points(self._by_fixtures)
 
     @property
     def _by_fixtures(self) -> list[FloatArray]:
@@ -258,8 +261,7 @@ class Fit:
     @cached_property
     def hanging_error(self) -> float:
         """RMS displacement of points [m] by the rest curvature of each hanging's own."""
-        rows = [square[on] for square, on in zip(self._by_rest, self._on_points, strict=True)]
-        return float(np.sqrt(np.concatenate(rows).sum() / self._n_points))
+        return self._rms_of_points(self._by_rest)
 
     @cached_property
     def _by_rest(self) -> list[FloatArray]:

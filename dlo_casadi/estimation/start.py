@@ -13,6 +13,7 @@ from dlo_casadi.equilibrium.curve import Observed, ObservedChange
 from dlo_casadi.equilibrium.guesses import first_nodes, line_nodes
 from dlo_casadi.estimation.problem import NO_INFORMATION, Point, Problem, Values
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.unknowns import DECADES, Search
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel
 from dlo_casadi.rod.band import Vector
@@ -33,14 +34,10 @@ LONGEST = 0.7
 EITHER_WAY, LOOK = np.pi / 2, 4
 # A step is taken back where the objective has risen beyond this factor, and this part is tried.
 RISE, PART = 1.5, 0.3
-# Decades about the prior stiffness from which fits are started.
-DECADES = (0, -1, 1, -2, 2, -3, 3)
 # Rolls of the end [rad] about which twists are counted in turn: a standard deviation to both sides.
 ROLLS = (0.0, 1.0, -1.0)
-# Iterations of all starts, and how many more the promising ones take in space, where frames take
-# longer: at the true stiffnesses, none of three sessions in which an effect is missing had settled
-# after 6 whole steps, two had after 12 to 20, one had not.
-FIRST_LOOK, MORE = 6, 14
+# Iterations of all starts.
+FIRST_LOOK = 6
 # Starts that are descended from, and unknowns [scaled] within which two starts are one.
 DESCENTS, ALIKE = 3, 1e-2
 
@@ -413,15 +410,15 @@ def _held(problem: Problem) -> NDArray[np.bool_]:
 
 def _equilibria(problem: Problem, guesses: Sequence[Guess]) -> list[Point]:
     """Equilibria that the most promising guesses lead to."""
-    held, found = _held(problem), list[Point]()
+    held, found, more = _held(problem), list[Point](), Search.of(problem.unknowns.model).more
     ranked = sorted(guesses, key=lambda guess: guess.objective)
     for k, guess in enumerate(ranked):
         if len(found) == DESCENTS:
             break
         if any(np.allclose(guess.theta, other.theta, atol=ALIKE) for other in ranked[:k]):
             continue
-        more = all_at_once(problem, guess, held, MORE) if problem.unknowns.model.in_space else None
-        point = equilibria_near(problem, more, guess)
+        further = all_at_once(problem, guess, held, more) if more else None
+        point = equilibria_near(problem, further, guess)
         found += [point] if point else []
     return found
 

@@ -14,6 +14,7 @@ from scipy.optimize import minimize_scalar
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
+from dlo_casadi.estimation.unknowns import Search
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
@@ -21,9 +22,8 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 FloatArray = NDArray[np.floating]
 
-# Steps per decade of the first search, over so many decades to both sides of the prior; in space,
-# where an element takes 17 times the operations, over fewer.
-_PER_DECADE, _DECADES, _DECADES_IN_SPACE = 3, 3, 1
+# Steps per decade of the first search.
+_PER_DECADE = 3
 LEAST_POINTS = 10
 # Degree and largest number of parts of the measured curve: its curvature is a cubic spline of eight
 # coefficients, of fewer where there are fewer than two points for each coefficient of the curve.
@@ -53,7 +53,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     rest = np.zeros(model.chain.n_rests)
     n_points = sum(len(item.traced.points) for item in used)
 
-    stiff = model.stiffness_indices
+    stiff, search = model.stiffness_indices, Search.of(model)
 
     def at(log_ei: float) -> FloatArray:
         # Torsion follows bending.
@@ -71,9 +71,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         )
         moved, converged = equilibria.solve(start, at(log_ei), rest)
         if not converged.all() or not equilibria.stable(moved, at(log_ei), rest).all():
-            if model.in_space:
-                return shapes, np.inf
-            cold = _cold(model, at(log_ei), rest, used)
+            cold = _cold(model, at(log_ei), rest, used) if search.predicts else None
             if cold is None:
                 return shapes, np.inf
             moved = cold
@@ -90,10 +88,9 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         straight = np.tile(model.node.identity, (len(used), model.chain.n_nodes, 1))
         first = equilibria.start_shapes(straight)
     step = np.log(10) / _PER_DECADE
-    decades = _DECADES_IN_SPACE if model.in_space else _DECADES
     for direction in (1, -1):
         shapes = first
-        for k in range(decades * _PER_DECADE + 1):
+        for k in range(search.decades * _PER_DECADE + 1):
             log_ei = prior + direction * k * step
             shapes, total = follow(shapes, log_ei - direction * min(k, 1) * step, log_ei)
             grid[log_ei] = (shapes, total)

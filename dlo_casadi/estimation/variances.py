@@ -19,6 +19,7 @@ from dlo_casadi.estimation.repeats import (
     with_repeats,
 )
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.unknowns import Search
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import MODES, RestScatter
 from dlo_casadi.sensing.noise import (
@@ -70,7 +71,7 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
     MacKay, Neural Computation 4 (1992).
     """
     repeats = fit.problem.priors.rest_scatter.std == 0 and not first
-    rough, estimated = first and fit.model.in_space, not fit.noise.known
+    rough, estimated = first and Search.of(fit.model).settled, not fit.noise.known
     near = descend(fit, tolerance=1e-2)
     fit = near if near.converged or not rough else replace(fit, converged=False)
     for round_ in range(rounds):

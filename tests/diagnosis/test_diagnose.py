@@ -50,7 +50,7 @@ def found(fit):
     return diagnose(fit)
 
 
-def test_held_out_poses_are_not_looked_at(session, found):
+def test_held_out_poses_are_not_looked_at(session, fit):
     """Measured points of held-out poses are moved by a centimetre: nothing changes."""
     _, measured = session
     spoiled = tuple(
@@ -60,7 +60,9 @@ def test_held_out_poses_are_not_looked_at(session, found):
         for item in measured
     )
     assert any(item.held_out for item in measured)
-    again = diagnose(fit_of(session, spoiled))
+    others = tuple(set(EFFECTS) - {"bending_softening", "gravity_tilt"})
+    found, again = (diagnose(one, exclude=others) for one in (fit, fit_of(session, spoiled)))
+    assert found.added
     assert [a.candidate.name for a in found.added] == [a.candidate.name for a in again.added]
     assert found.ranked == again.ranked
     assert found.after.p == pytest.approx(again.after.p, rel=1e-12)
