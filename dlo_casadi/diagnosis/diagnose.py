@@ -145,19 +145,19 @@ def diagnose(
     """
     run_in = executor or InProcess()
     search = Search(fit, center, exclude, significance, max_effects, step, run_in, finest)
-    # Where left-out poses are not even reached no effect can be followed: first what pulls.
+    # Where left-out poses are not even reached no effect can be followed: first the force.
     lost = search.astray and fit.noise.source != "misfit"
-    pull = estimate_unknown_force(fit, search.executor) if lost else None
-    found = search.run(pull)
-    if found.unexplained and pull is not None:
+    force = estimate_unknown_force(fit, search.executor) if lost else None
+    found = search.run(force)
+    if found.unexplained and force is not None:
         found = search.run()
     elif found.unexplained:
-        pull = estimate_unknown_force(fit if found.added else found.fit, search.executor)
-        found = search.with_cause_of(pull, found)
+        force = estimate_unknown_force(fit if found.added else found.fit, search.executor)
+        found = search.with_cause_of(force, found)
     if found.unexplained and found.added:
-        found = search.without_wrong_causes(found, pull)
+        found = search.without_wrong_causes(found, force)
         if found.added or not fit.errors_known:
-            pull = estimate_unknown_force(found.fit, search.executor)
+            force = estimate_unknown_force(found.fit, search.executor)
     tried = {row.name for row in found.ranked}
 
     def named(item: AddedEffect) -> AddedEffect:
@@ -174,7 +174,7 @@ def diagnose(
         added=tuple(map(named, found.added)),
         ranked=found.ranked,
         unexplained=found.unexplained,
-        pull=pull if found.unexplained else None,
+        pull=force if found.unexplained else None,
         weight=None if found.unexplained else hidden_weight(found.fit, exclude),
     )
 
@@ -245,7 +245,7 @@ class Search:
 
     @property
     def several(self) -> bool:
-        """Whether a pull may have a cause: in one pose a force fits as well as any."""
+        """Whether an unknown force may have a cause: in one pose a force fits as well as any."""
         return len(self.declared.problem.used) > 1 and self.max_effects > 0
 
     @property
@@ -267,12 +267,12 @@ class Search:
             return []
         return Screen(current, listed).run(screening_degrees(current), self.executor)
 
-    def run(self, pull: UnknownForce | None = None) -> Found:
+    def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
 
         Parameters
         ----------
-        pull : UnknownForce, optional
+        force : UnknownForce, optional
             Whose causes are tried in the first step; else all effects, followed from the
             declared model.
         """
@@ -284,13 +284,13 @@ class Search:
             self.step("search for a missing effect", k, self.max_effects)
             misfit = current.noise.source == "misfit"
             tried: list[Confirmed | None] = []
-            if misfit and pull is None:
+            if misfit and force is None:
                 screened, tried = self._from_data(current)
             else:
                 screened = self.first if k == 0 else self._screened(current)
             p_values = {x.candidate.name: sidak(x.p_value, len(screened)) for x in screened}
-            if k == 0 and pull is not None:
-                tried = self._causes(pull, screened)
+            if k == 0 and force is not None:
+                tried = self._causes(force, screened)
             elif not misfit:
                 tried = self._leading(current, screened, p_values)
             explaining = explained_by(current, tried)
@@ -312,7 +312,7 @@ class Search:
                 break
             winner, rivals = chosen
             p_value = p_values[winner.candidate.name]
-            if k == 0 and pull is not None:
+            if k == 0 and force is not None:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = sidak(single, len(screened))
             closed = winner.fit if explaining else as_complete(winner.fit)
@@ -373,19 +373,19 @@ class Search:
         tried = list(map_in_order(self.executor, refit, near[:REFITTED]))
         return [item for item, _ in begun], tried
 
-    def _causes(self, pull: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
-        """Refits of all loads at one place, whatever their scores, that give the pull's forces.
+    def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
+        """Refits of all loads at one place, whatever their scores, that explain the forces.
 
         Two free forces in each pose would gain more than their price if the law were wrong.
         """
         loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
-        refit = partial(confirm_cause, self.declared, pull)
+        refit = partial(confirm_cause, self.declared, force)
         free = 2 * len(self.declared.problem.used) + 1
         price = free * np.log(self.declared.problem.n_residuals)
         return [
             item
             for item in map_in_order(self.executor, refit, loads)
-            if item is not None and item.bic >= pull.gain - price
+            if item is not None and item.bic >= force.gain - price
         ]
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
@@ -411,14 +411,14 @@ class Search:
         unexplained |= fit.noise.source == "misfit"
         return Found(fit, tuple(added), ranked, validation, structure, unexplained)
 
-    def with_cause_of(self, pull: UnknownForce | None, found: Found) -> Found:
-        """Return a search that begins with a cause of the pull, if it explains the data."""
-        if pull is None or not self.several:
+    def with_cause_of(self, force: UnknownForce | None, found: Found) -> Found:
+        """Return a search that begins with a cause of the force, if it explains the data."""
+        if force is None or not self.several:
             return found
-        other = self.run(pull)
+        other = self.run(force)
         return found if other.unexplained else other
 
-    def without_wrong_causes(self, found: Found, pull: UnknownForce | None) -> Found:
+    def without_wrong_causes(self, found: Found, force: UnknownForce | None) -> Found:
         """Withdraw effects that do not explain nearly all of what the declared model lacks.
 
         Something is missing still, and a wrong effect may stand for a part of it. Effects stay
@@ -428,7 +428,7 @@ class Search:
         """
         floor = found.fit.expected_error**2
         after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, self.error))
-        if after <= LEFT * before and not self._needless(found, pull):
+        if after <= LEFT * before and not self._needless(found, force):
             return found
         return self._ended(self.declared, [], found.ranked)
 
@@ -436,12 +436,12 @@ class Search:
         """Whether one force per pose on the declared model does better than with the effects."""
         if alone is None or not self.several:
             return False
-        pull = estimate_unknown_force(found.fit, self.executor)
+        force = estimate_unknown_force(found.fit, self.executor)
         n = np.log(self.declared.problem.n_residuals)
         extra = sum(len(item.candidate.frees) for item in found.added) * n
-        if pull is None:
+        if force is None:
             return True
-        if 2 * alone.fit.point.objective >= 2 * pull.fit.point.objective + extra:
+        if 2 * alone.fit.point.objective >= 2 * force.fit.point.objective + extra:
             return False
         p_alone, p_found = (
             structure_of(x, noise_degrees(x)).p_value for x in (alone.fit, found.fit)

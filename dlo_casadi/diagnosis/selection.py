@@ -133,8 +133,8 @@ def improving(
 def shortcoming(item: Confirmed, validation: CrossValidation, doubt: float | None) -> str:
     """Why a refit does not improve both the fit and what it predicts; empty if it does.
 
-    Hangings of one or two poses have in common whatever is wrong with their measurement. There
-    whole hangings decide: a gain as large must have less than the probability `doubt` if those
+    Repeats of one or two poses have in common whatever is wrong with their measurement. There
+    whole repeats decide: a gain as large must have less than the probability `doubt` if those
     left out are predicted no better (Student's t).
     """
     if item.bic <= 0:

@@ -57,7 +57,7 @@ class Structure:
         Slow energy per degree of freedom by pose name.
     p_systematic : float or None
         Where the cable does not repeat: probability of as much that poses which are alike have in
-        common, if each hanging has a rest curvature of its own and nothing else is missing.
+        common, if each repeat has a rest curvature of its own and nothing else is missing.
     """
 
     statistic: float
@@ -73,7 +73,7 @@ class Structure:
 
     @property
     def p_noise(self) -> float:
-        """Probability of the residual if it is noise and rest curvatures of each hanging's own.
+        """Probability of the residual if it is noise and rest curvatures of each repeat's own.
 
         Of the less likely of the tests that were made, for as many (Sidak).
         """

@@ -36,8 +36,8 @@ from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, r
 
 FloatArray = NDArray[np.floating]
 
-# Feet that move less than this share of the noise between solves have settled.
-FEET_TOLERANCE = 1e-3
+# Projections that move less than this share of the noise between solves have settled.
+SHIFT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def solve_batch(problem: Problem, start: Point, max_solves: int = 4) -> BatchSol
             for new, old in zip(moved.projections, point.projections, strict=True)
         )
         point = moved
-        if shift < FEET_TOLERANCE * problem.noise.std or solves == max_solves:
+        if shift < SHIFT_TOLERANCE * problem.noise.std or solves == max_solves:
             return BatchSolution(point, solves, iterations, residual)
 
 
@@ -165,12 +165,8 @@ class _BatchNlp:
             rest = ca.DM(unknowns.rest_slopes) @ theta
         p = unknowns.symbolic_p(theta)
         symbols = PoseSymbols(x, lam * self.force, p, rest, pose, deviation)
-        scale = np.concatenate(
-            [
-                np.full(self.n_x, 1 / (self.force * model.cable.length)),
-                np.full(self.n_lam, 1 / model.cable.length),
-            ]
-        )
+        per_force = np.repeat([1 / self.force, 1.0], [self.n_x, self.n_lam])
+        scale = per_force / model.cable.length
         imbalance = balance(model, symbols) * scale
         z = ca.vertcat(curve(model, symbols), readings(model, symbols))
         after = ca.SX.zeros(0)
@@ -182,13 +178,7 @@ class _BatchNlp:
         blocks = [ca.densify(ca.jacobian(block, both)) for block in (imbalance, z, after)]
         self.slope = ca.Function("slope", given, blocks)
         weights = [ca.SX.sym("w", block.numel()) for block in (imbalance, z, after)]
-        weighted = sum(
-            (
-                ca.dot(weight, block)
-                for weight, block in zip(weights, (imbalance, z, after), strict=True)
-            ),
-            start=ca.SX(0),
-        )
+        weighted = ca.dot(ca.vertcat(*weights), ca.vertcat(imbalance, z, after))
         bend = ca.densify(ca.hessian(weighted, both)[0])
         self.bend = ca.Function("bend", [*given, *weights], [bend])
 
@@ -255,12 +245,8 @@ class _BatchNlp:
             diagonal.append(whole[: self.stride, : self.stride])
             side.append(whole[self.stride :, : self.stride])
             corner += whole[self.stride :, self.stride :]
-        hessian = ca.blockcat(
-            [
-                [corner, ca.horzcat(*side)],
-                [ca.MX(self.stride * m, size), ca.diagcat(*diagonal)],
-            ]
-        )
+        below = ca.MX(self.stride * m, size)
+        hessian = ca.blockcat([[corner, ca.horzcat(*side)], [below, ca.diagcat(*diagonal)]])
         self.solver = ca.nlpsol(
             "batch",
             "ipopt",

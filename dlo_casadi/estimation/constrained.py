@@ -25,7 +25,7 @@ from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.estimation.variances import SETTLED_MODES, refine
+from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES, CableModel
 from dlo_casadi.thresholds import BIC_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
@@ -289,9 +289,8 @@ def _slope(
     p, rest = (base + step for base, step in zip(given, steps, strict=True))
     m, q = len(p), len(p) // 2
     shapes = Shapes.declared(np.repeat(eq.x[None], m, 0), np.repeat(eq.multipliers[None], m, 0))
-    total = assembly_of(model).balance(shapes, Inputs(p, rest, np.repeat(pose.vector[None], m, 0)))[
-        0
-    ]
+    inputs = Inputs(p, rest, np.repeat(pose.vector[None], m, 0))
+    total = assembly_of(model).balance(shapes, inputs)[0]
     return np.asarray((total[:q] - total[q:]) / (2 * _STEP))
 
 
@@ -342,10 +341,6 @@ def _refitted(fit: Fit, gaps: Sequence[EnergyGap]) -> Fit:
         row = gap.slope / (KEPT * gap.std)
         aim = -BELOW * gap.std - gap.value
         told.append((row, float(row @ fit.point.theta) + aim / (KEPT * gap.std)))
-    knowing = refine(
-        fit.reweighed(priors=replace(problem.priors, told=tuple(told))),
-        rounds=2,
-        modes=SETTLED_MODES,
-    )
+    knowing = settle(fit.reweighed(priors=replace(problem.priors, told=tuple(told))))
     plain = knowing.reweighed(priors=replace(knowing.problem.priors, told=()))
     return replace(plain, converged=True)

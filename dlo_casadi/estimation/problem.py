@@ -119,6 +119,15 @@ class Normal:
     gradient: FloatArray
     inner: list[tuple[FloatArray, FloatArray, FloatArray]]
 
+    def own_covariances(self, covariance: FloatArray) -> list[FloatArray]:
+        """Covariance of each fitted pose's own deviations, by that of theta (size, size)."""
+        out: list[FloatArray] = []
+        for block, cross, _ in self.inner:
+            inverse = np.linalg.inv(block)
+            arm = inverse @ cross
+            out.append(inverse + arm @ covariance @ arm.T)
+        return out
+
     @property
     def by_deviations(self) -> float:
         """Decrease of the objective that a step of the deviations alone promises."""
@@ -270,9 +279,10 @@ class Problem:
             self.measured[j].whitening(self.noise, s)
             for j, s in zip(self.used, values.projections, strict=True)
         ]
-        rest = self.priors.rest_scatter
-        for k, way in enumerate(self.moved_by_rest(values) if rest.std > 0 else ()):
-            seen = weights[k] @ (way * np.tile(rest.sizes, way.shape[1] // MODES))
+        for k, way in enumerate(self.rest_errors(values)):
+            if not way.size:
+                continue
+            seen = weights[k] @ way
             factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
             weights[k] = solve_triangular(factor, weights[k], lower=True)
         return replace(self, weights=tuple(weights))
@@ -281,6 +291,14 @@ class Problem:
         """Change (R_j, axes MODES) of the fitted residuals by rest curvatures of the poses' own."""
         along = self.equilibria.by_rest(*self.state(values), modes_in(self.unknowns.model))
         return [change for _, change in self.residuals(values, along)]
+
+    def rest_errors(self, values: Values) -> list[FloatArray]:
+        """The same (R_j, axes MODES) by one standard deviation of each mode; (R_j, 0) for none."""
+        rest = self.priors.rest_scatter
+        if rest.std == 0:
+            return [np.zeros((self.measured[j].n_residuals, 0)) for j in self.used]
+        moved = self.moved_by_rest(values)
+        return [way * np.tile(rest.sizes, way.shape[1] // MODES) for way in moved]
 
     # ---- evaluation --------------------------------------------------------------------------
 

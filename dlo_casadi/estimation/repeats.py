@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import minimize
 from scipy.special import chdtrc, chdtri
 
@@ -70,8 +71,8 @@ def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | No
     return float(np.sqrt(np.concatenate(squares).mean())) if squares else None
 
 
-def hanging_std(measured: Sequence[MeasuredPose], length: float, noise: float) -> float:
-    """RMS of a coordinate [m] across the cable of what hangings of one pose differ by.
+def repeat_std(measured: Sequence[MeasuredPose], length: float, noise: float) -> float:
+    """RMS of a coordinate [m] across the cable of what repeats of one pose differ by.
 
     From the mean of the others, as `repeatability`, less the noise of points [m] in both; 0 where
     no pose was taken twice.
@@ -117,7 +118,7 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
     if different_poses(measured, length) >= DIFFERENT:
-        return noise  # what differs between hangings has its own place there, see `rest_scatter`
+        return noise  # what differs between repeats has its own place there, see `rest_scatter`
     spread = repeatability(measured, length)
     if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise
@@ -272,15 +273,9 @@ class RestLikelihood:
             alike = np.exp(-((self.distances / range_) ** 2) / 2)
             values, vectors = np.linalg.eigh(np.eye(m) + size**2 * alike)
             mix = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-            whole = np.zeros((m, q, m, q))
-            for i in range(m):
-                whole[i, :, i] = np.eye(q)
-                whole[i, :r, :, :r] = np.einsum("j,ab->ajb", mix[i], np.eye(r))
-            spread = whole.reshape((m * q, m * q))
-            blocks = np.zeros((m, q, m, q))
-            for i in range(m):
-                blocks[i, :, i] = inside[i]
-            inside_all = spread @ blocks.reshape((m * q, m * q)) @ spread
+            shared = np.diag((np.arange(q) < r).astype(float))
+            spread = np.kron(mix, shared) + np.kron(np.eye(m), np.eye(q) - shared)
+            inside_all = spread @ block_diag(*inside) @ spread
             factor = np.linalg.cholesky(np.eye(m * q) + inside_all)
             logdet = 2 * float(np.log(np.diag(factor)).sum())
             half = np.linalg.solve(factor, spread @ cross.reshape((m * q, -1)))

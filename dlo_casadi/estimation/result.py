@@ -21,7 +21,7 @@ from dlo_casadi.estimation.problem import (
     Priors,
     Problem,
 )
-from dlo_casadi.estimation.repeats import different_poses, hanging_std
+from dlo_casadi.estimation.repeats import different_poses, repeat_std
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import DIFFERENT, LEAST_NOISE_DEGREES
@@ -149,21 +149,16 @@ class Fit:
         known = problem.precision + self._by_bounds
         effective = problem.unknowns.size - float(np.trace(self.covariance @ known))
         precision = np.diag(1 / problem.deviation_std**2)
-        for block, cross, _ in self.normal.inner:
-            inverse = np.linalg.inv(block)
-            arm = inverse @ cross
-            full = inverse + arm @ self.covariance @ arm.T
-            effective += len(block) - float(np.trace(full @ precision))
-        return effective
+        own = self.normal.own_covariances(self.covariance)
+        return effective + sum(len(full) - float(np.trace(full @ precision)) for full in own)
 
     @cached_property
     def leverages(self) -> list[FloatArray]:
         """What of each fitted residual (R_j,) the unknowns take up: 0 to 1."""
         out = []
-        for k, (taken, b) in enumerate(
-            zip(self._taken, self.linearization.by_deviation, strict=True)
-        ):
-            own = (b * np.linalg.solve(self.normal.inner[k][0], b.T).T).sum(axis=1)
+        rows = zip(self._taken, self.linearization.by_deviation, self.normal.inner, strict=True)
+        for taken, b, (block, _, _) in rows:
+            own = (b * np.linalg.solve(block, b.T).T).sum(axis=1)
             out.append(((taken @ self.covariance) * taken).sum(axis=1) + own)
         return out
 
@@ -171,19 +166,15 @@ class Fit:
     def _taken(self) -> list[FloatArray]:
         """Whitened residuals (R_j, size) by theta, each pose's own deviations following."""
         lin = self.linearization
-        return [
-            a - b @ np.linalg.solve(block, cross)
-            for a, b, (block, cross, _) in zip(
-                lin.by_theta, lin.by_deviation, self.normal.inner, strict=True
-            )
-        ]
+        rows = zip(lin.by_theta, lin.by_deviation, self.normal.inner, strict=True)
+        return [a - b @ np.linalg.solve(block, cross) for a, b, (block, cross, _) in rows]
 
     def variance_degrees(self, name: str) -> float:
         """Degrees of freedom with which the variance of a parameter's estimate is known.
 
             1 / degrees = sum_c (v_c / v)^2 / degrees_c
 
-        of the parts v_c that the noise and the rest curvature of each hanging's own have in it,
+        of the parts v_c that the noise and the rest curvature of each repeat's own have in it,
         degrees_c those of their sizes; at least LEAST_NOISE_DEGREES, inf where both are declared.
         The fixtures' scatter counts as known.
 
@@ -194,17 +185,15 @@ class Fit:
         problem, rest = self.problem, self.problem.priors.rest_scatter
         index = problem.unknowns.names.index(name)
         column = self.covariance[index]
-        errors, hangings = 0.0, 0.0
-        for k, taken in enumerate(self._taken):
+        errors, own = 0.0, 0.0
+        for taken, white, way in zip(
+            self._taken, problem.whitening, self._rest_errors, strict=True
+        ):
             by_errors = taken @ column
             errors += float(by_errors @ by_errors)
-            if rest.std > 0:
-                way = problem.whitening[k] @ self._moved_by_rest[k]
-                sizes = np.tile(rest.sizes, way.shape[1] // len(rest.sizes))
-                hangings += float(((by_errors @ way * sizes) ** 2).sum())
-        parts = ((errors - hangings) ** 2 / self.noise.slow_dof + hangings**2 / rest.dof) / column[
-            index
-        ] ** 2
+            own += float(((by_errors @ white @ way) ** 2).sum())
+        parts = (errors - own) ** 2 / self.noise.slow_dof + own**2 / rest.dof
+        parts /= column[index] ** 2
         return max(LEAST_NOISE_DEGREES, 1 / parts) if parts > 0 else np.inf
 
     @property
@@ -260,24 +249,17 @@ class Fit:
 
     @cached_property
     def hanging_error(self) -> float:
-        """RMS displacement of points [m] by the rest curvature of each hanging's own."""
+        """RMS displacement of points [m] by the rest curvature of each repeat's own."""
         return self._rms_of_points(self._by_rest)
 
-    @cached_property
+    @property
     def _by_rest(self) -> list[FloatArray]:
-        """Variance (R_j,) of each residual by the rest curvature of each hanging's own."""
-        problem = self.problem
-        if problem.priors.rest_scatter.std == 0:
-            return [np.zeros(len(raw)) for raw in self.linearization.raw]
-        sizes = problem.priors.rest_scatter.sizes
-        return [
-            ((way * np.tile(sizes, way.shape[1] // len(sizes))) ** 2).sum(axis=1)
-            for way in self._moved_by_rest
-        ]
+        """Variance (R_j,) of each residual by the rest curvature of each repeat's own."""
+        return [(way**2).sum(axis=1) for way in self._rest_errors]
 
     @cached_property
-    def _moved_by_rest(self) -> list[FloatArray]:
-        return self.problem.moved_by_rest(self.point)
+    def _rest_errors(self) -> list[FloatArray]:
+        return self.problem.rest_errors(self.point)
 
     @property
     def _on_points(self) -> list[NDArray[np.bool_]]:
@@ -410,5 +392,5 @@ def uncertainty_of(fit: Fit) -> Uncertainty:
     history, length = fit.problem.history, fit.model.cable.length
     apart = 0.0
     if different_poses(history, length) < DIFFERENT:
-        apart = hanging_std(history, length, fit.noise.of_points.beside_hangings)
+        apart = repeat_std(history, length, fit.noise.of_points.beside_hangings)
     return Uncertainty(names, covariance, scatter, fit.problem.priors.rest_scatter, apart)

@@ -238,7 +238,7 @@ class Search:
     predicts : bool
         Whether poses that are lost on the way are predicted anew, from their ends.
     settled : bool
-        Whether noise is estimated of a minimum that has not converged.
+        Whether noise is first estimated of minima alone that have converged.
     """
 
     mesh: int

@@ -248,9 +248,7 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     length = model.cable.length
     size = problem.unknowns.size
     bases, left_over = [], []
-    rest = None
-    if problem.priors.rest_scatter.std > 0:
-        rest = problem.moved_by_rest(point)
+    rest = problem.moved_by_rest(point) if problem.priors.rest_scatter.std > 0 else None
     kept = [problem.measured[j].on_points for j in problem.used]
     raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
     ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]
@@ -271,23 +269,12 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     # A direction that the poses' own ones hold already costs no further degree of freedom.
     left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
     blocks = np.split(left[:, values > 1e-6], np.cumsum([len(raw) for raw in raws])[:-1])
-    samples = []
-    for j, raw, s, own, block in zip(
-        problem.used, raws, point.projections, bases, blocks, strict=True
-    ):
-        samples += [
-            NoiseSample(
-                raw[rows],
-                s[points],
-                x.weight,
-                own[rows],
-                block[rows],
-                x.correlation_length,
-                x.count,
-            )
-            for x, points, rows in problem.measured[j].slices
-        ]
-    return samples
+    rows = zip(problem.used, raws, point.projections, bases, blocks, strict=True)
+    return [
+        NoiseSample(e[at], s[on], x.weight, own[at], block[at], x.correlation_length, x.count)
+        for j, e, s, own, block in rows
+        for x, on, at in problem.measured[j].slices
+    ]
 
 
 def roughness_of(fit: Fit) -> float:
@@ -319,11 +306,7 @@ def scatter_of(fit: Fit) -> FloatArray:
     if not columns or len(problem.used) == 1:
         return problem.priors.scatter
     covariance = np.linalg.pinv(normal.hessian, hermitian=True)
-    variance = []
-    for block, cross, _ in normal.inner:
-        inverse = np.linalg.inv(block)
-        arm = inverse @ cross
-        variance.append(np.diag(inverse + arm @ covariance @ arm.T))
+    variance = [np.diag(full) for full in normal.own_covariances(covariance)]
     square = (fit.point.shapes.deviation[np.ix_(problem.used, columns)] ** 2).sum(axis=0)
     determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
     scatter = problem.priors.scatter.copy()

@@ -12,7 +12,7 @@ from dlo_casadi.equilibrium.spread import displacements, spread_across
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
 from dlo_casadi.estimation.repeats import (
     different_poses,
-    hanging_std,
+    repeat_std,
     repeatability,
     with_repeats,
 )
@@ -52,8 +52,8 @@ def test_repeats_tell_size_and_correlation():
     # From the mean of the others: sqrt(1 + 1 / 15).
     assert repeatability(measured, LENGTH) == pytest.approx(truth.std * 1.033, rel=0.3)
     # Nothing differs along the line, nor beyond the noise.
-    assert hanging_std(measured, LENGTH, 0.0) == pytest.approx(truth.std * 1.033, rel=0.3)
-    assert hanging_std(measured, LENGTH, truth.std) < truth.std / 2
+    assert repeat_std(measured, LENGTH, 0.0) == pytest.approx(truth.std * 1.033, rel=0.3)
+    assert repeat_std(measured, LENGTH, truth.std) < truth.std / 2
 
     # The same elsewhere, and nearly the same: ends 0.5 mm apart, of a cable of 1 m.
     moved = []
