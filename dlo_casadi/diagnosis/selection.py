@@ -73,13 +73,8 @@ def explained_by(current: Fit, tried: Iterable[Confirmed | None]) -> list[Confir
     close = [(item, fit) for item, fit in fits if fit.noise.source != "misfit"]
     least = min((fit.log_evidence for _, fit in close), default=0.0)
     return [
-        replace(
-            item,
-            fit=fit,
-            validation=cross_validate(fit),
-            bic=2 * (fit.log_evidence - least),
-        )
-        for item, fit in close
+        replace(x, fit=fit, validation=cross_validate(fit), bic=2 * (fit.log_evidence - least))
+        for x, fit in close
     ]
 
 

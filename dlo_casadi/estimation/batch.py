@@ -13,7 +13,7 @@ interpolation): |R_j z - b_j|^2 equals the sum of squares up to a constant. Proj
 are brought up to date between solves, until they stand still; at a projection the normal distance
 is stationary in s, so that the fixed point is that of the consistent problem.
 
-It has the same minimum as `gauss_newton`, by another route: nothing is eliminated, and the
+It has the same minimum as `descent.descend`, by another route: nothing is eliminated, and the
 Hessian is exact.
 """
 

@@ -144,8 +144,7 @@ def _seen(
     """Equilibria of poses as camera and sensors would see them."""
     if not poses:
         return []
-    x, lam = zip(*((eq.x, eq.multipliers) for eq in equilibria), strict=True)
-    shapes = Shapes.declared(np.array(x), np.array(lam))
+    shapes = stacked(equilibria)
     given = Inputs.of(p, rest, np.array([pose.vector for pose in poses]))
     length, assembly = model.cable.length, assembly_of(model)
     curves, readings = assembly.curve(shapes, given), assembly.readings(shapes, given)
@@ -153,6 +152,12 @@ def _seen(
         Prediction(eq, Observed(NodeCurve.of(length, z), shown), rest)
         for eq, z, shown in zip(equilibria, curves, readings, strict=True)
     ]
+
+
+def stacked(equilibria: Sequence[Equilibrium]) -> Shapes:
+    """Shapes of some equilibria, held as declared."""
+    x, lam = zip(*((eq.x, eq.multipliers) for eq in equilibria), strict=True)
+    return Shapes.declared(np.array(x), np.array(lam))
 
 
 def predicted_shapes(problem: Problem, values: Values) -> Shapes:

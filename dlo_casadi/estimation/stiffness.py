@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
+from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses, stacked
 from dlo_casadi.estimation.unknowns import Search
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
@@ -121,14 +121,9 @@ def _cold(
     """Stable equilibria as predicted or measured, or None if one is missing."""
     predictions = predict_poses(model, p, rest, [item.pose for item in used])
     others = measured_elsewhere(model, p, rest, used, predictions)
-    x, lam = [], []
-    for known, other in zip(predictions, others, strict=True):
-        prediction = other or known
-        if prediction is None:
-            return None
-        x.append(prediction.equilibrium.x)
-        lam.append(prediction.equilibrium.multipliers)
-    return Shapes.declared(np.array(x), np.array(lam))
+    found = [other or known for known, other in zip(predictions, others, strict=True)]
+    equilibria = [prediction.equilibrium for prediction in found if prediction]
+    return stacked(equilibria) if len(equilibria) == len(found) else None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.stats import chi2, t
-from test_gauss_newton import CABLE, STD, measured_from
+from test_problem import CABLE, STD, measured_from
 
 from dlo_casadi.diagnosis.selection import p_with_closed_noise
 from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
