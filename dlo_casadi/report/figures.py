@@ -149,7 +149,9 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
                 said.append(f"{label} {millimetres(error)}")
             row = axes.axhspan(-k - 0.5, 0.5 - k, alpha=0.0, zorder=10)
             row.set(gid=f"choose-{k}", label="; ".join([_name(pose), *said]))
-        axes.set_yticks(range(0, -len(outcome.poses), -1), [_short(x.name) for x in outcome.poses])
+        every = (pose.name for pose in outcome.poses)
+        names = [name if len(name) <= 18 else f"{name[:17]}…" for name in every]
+        axes.set_yticks(range(0, -len(names), -1), names)
         axes.set_ylim(0.6 - len(outcome.poses), 0.6)
         handles = [*(dot(*look) for _, *look in stages), _floor(floor)]
         if any(pose.role == "held_out" for pose in outcome.poses):
@@ -185,10 +187,6 @@ def _floor(floor: float) -> Line2D:
 
 def _name(pose: PoseInput) -> str:
     return f"{pose.name} (held out)" if pose.role == "held_out" else pose.name
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= 18 else f"{name[:17]}…"
 
 
 # ---- residuals ---------------------------------------------------------------------------------
