@@ -20,6 +20,7 @@ from dlo_casadi.config.values import (
     Row,
     Section,
     Vector,
+    checked,
     within,
 )
 from dlo_casadi.errors import counted
@@ -37,35 +38,34 @@ DISTORTION = Range(-1.0e6, 1.0e6, "")
 MARKER = Range(1.0e-4, 10.0, "m")
 
 
+def _no_pinhole(matrix: tuple[Row, Row, Row]) -> str:
+    (fx, skew, cx), (below, fy, cy), last = matrix
+    if fx <= 0.0 or fy <= 0.0 or skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
+        return "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
+    wrong = [*map(FOCAL_LENGTH.complaint, (fx, fy)), *map(PIXELS.complaint, (cx, cy))]
+    return "; ".join(filter(None, wrong))
+
+
+def _unknown_count(distortion: tuple[float, ...]) -> str:
+    if len(distortion) in (0, 4, 5, 8, 12, 14):
+        return ""
+    found = counted(len(distortion), "number")
+    return f"found {found}; OpenCV knows 4, 5 [k1, k2, p1, p2, k3], 8, 12 or 14"
+
+
 class Camera(Section):
     """A pinhole camera with lens distortion, in OpenCV's convention."""
 
-    matrix: tuple[Row, Row, Row]
+    matrix: Annotated[tuple[Row, Row, Row], checked(_no_pinhole)]
     """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel]."""
-    distortion: Annotated[tuple[Number, ...], within(DISTORTION)] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Annotated[tuple[Number, ...], within(DISTORTION), checked(_unknown_count)] = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
     """OpenCV's 4, 5, 8, 12 or 14 coefficients k1, k2, p1, p2, k3, k4, ...; [] for none."""
-
-    @field_validator("matrix")
-    @classmethod
-    def _pinhole(cls, matrix: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
-        (fx, skew, cx), (below, fy, cy), last = matrix
-        if fx <= 0.0 or fy <= 0.0 or skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
-            text = "must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy"
-            raise ValueError(text)
-        wrong = [*map(FOCAL_LENGTH.complaint, (fx, fy)), *map(PIXELS.complaint, (cx, cy))]
-        if any(wrong):
-            raise ValueError("; ".join(filter(None, wrong)))
-        return matrix
-
-    @field_validator("distortion")
-    @classmethod
-    def _known_to_opencv(cls, distortion: tuple[float, ...]) -> tuple[float, ...]:
-        if len(distortion) not in (0, 4, 5, 8, 12, 14):
-            raise ValueError(
-                f"found {counted(len(distortion), 'number')}; OpenCV knows 4, 5 "
-                "[k1, k2, p1, p2, k3], 8, 12 or 14"
-            )
-        return distortion
 
 
 # OpenCV's dictionaries of markers, and how many each has.
@@ -82,10 +82,15 @@ _MOST_MARKERS = max(_DICTIONARIES.values())
 _Centers: TypeAlias = dict[Annotated[int, Field(ge=0)], Annotated[Vector, within(COORDINATE)]]
 
 
+def _unknown_dictionary(name: str) -> str:
+    hint = did_you_mean(name, _DICTIONARIES)
+    return "" if name in _DICTIONARIES else f"OpenCV has no dictionary {name!r}{hint}"
+
+
 class Board(Section):
     """A plane board with ArUco markers; it defines the frame in which everything is measured."""
 
-    dictionary: str
+    dictionary: Annotated[str, checked(_unknown_dictionary)]
     """OpenCV's name of the marker dictionary, such as DICT_4X4_50."""
     marker_size: Annotated[Positive, within(MARKER)]
     """Side of the black square of a marker [m]."""
@@ -94,15 +99,6 @@ class Board(Section):
     photographs from several directions that show it."""
     marker_centers: Annotated[_Centers, Field(min_length=1, max_length=_MOST_MARKERS)]
     """Centre of each marker by its id: {0: [x, y], 1: [x, y], ...} [m]."""
-
-    @field_validator("dictionary")
-    @classmethod
-    def _known(cls, name: str) -> str:
-        if name not in _DICTIONARIES:
-            raise ValueError(
-                f"OpenCV has no dictionary {name!r}{did_you_mean(name, _DICTIONARIES)}"
-            )
-        return name
 
     @field_validator("marker_centers")
     @classmethod
@@ -120,20 +116,21 @@ class Board(Section):
         return centers
 
 
+def _one_point(pair: tuple[Vector, Vector]) -> str:
+    return f"the two points are the same: {list(pair[0])}" if pair[0] == pair[1] else ""
+
+
+_Pixel = Annotated[Vector, within(PIXELS)]
+_Place = Annotated[Vector, within(COORDINATE)]
+
+
 class Reference(Section):
     """Two known points in the photograph: scale, rotation and origin of a similarity transform."""
 
-    pixels: tuple[Annotated[Vector, within(PIXELS)], Annotated[Vector, within(PIXELS)]]
+    pixels: Annotated[tuple[_Pixel, _Pixel], checked(_one_point)]
     """The two points in the photograph [[u, v], [u, v]], u to the right, v down [pixel]."""
-    points: tuple[Annotated[Vector, within(COORDINATE)], Annotated[Vector, within(COORDINATE)]]
+    points: Annotated[tuple[_Place, _Place], checked(_one_point)]
     """The same two points in the board frame [[x, y], [x, y]] [m]."""
-
-    @field_validator("pixels", "points")
-    @classmethod
-    def _distinct(cls, pair: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
-        if pair[0] == pair[1]:
-            raise ValueError(f"the two points are the same: {list(pair[0])}")
-        return pair
 
 
 class Measurement(Section):
