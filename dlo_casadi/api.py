@@ -113,7 +113,7 @@ def fit(
         Told how far the run has come: an object with `step(name, done, total)` and
         `message(text)`.
     executor : Executor, optional
-        Where what can be done at the same time is done; in this process by default. In a script,
+        Runs independent tasks at the same time; by default they run in this process. In a script,
         below `if __name__ == "__main__":`, `with open_executor(2, here=True) as executor` of
         `dlo_casadi.runtime.parallel` opens one.
 
@@ -165,8 +165,8 @@ def predict(
 ) -> PredictedShape:
     """Predict the shape of a fitted cable.
 
-    Of several equilibria the stable one of lowest energy, unless `branch` or `turns` name one;
-    where nobody knows which of two sides is the lower one, with the other one as `other_side`.
+    Of several equilibria this is the stable one of lowest energy, unless `branch` or `turns` name
+    one. Where it is unknown which of two sides is the lower one, `other_side` has the other.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def predict(
     end : (d,) [m]
         Where the end is held, d = 2 or 3 in space; None for a free end.
     start : (d,) [m], optional
-        Where the start is held; where all poses of the session had it, or the origin, by default.
+        Where the start is held; by default where all poses of the session had it, or the origin.
     start_heading, end_heading : float [rad], optional
         Directions of clamped ends in a plane, continuous along the cable; those that all poses of
         the session shared by default.
@@ -183,8 +183,8 @@ def predict(
         Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable;
         those that all poses of the session shared by default.
     turns : float
-        In space, the twist nearest to so many full turns, see `Pose`. A cable may shed two of them
-        over a loop; that is an error.
+        In space, the number of full turns to which the twist shall be nearest, see `Pose`. A cable
+        may shed two of them over a loop; that is an error.
     branch : "ccw" or "cw", optional
         In a plane, which way the cable turns from start to end.
 
@@ -276,7 +276,7 @@ def _directions(cable: FittedCable, asked: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-# By the numbers that turn a node: what declares a clamp's direction, what would elsewhere, where.
+# Size of a node's increment -> key of a clamp's direction, unit, the other dimension's key, words.
 _DIRECTIONS = {
     1: ("heading", " [rad]", "orientation", "a plane (two numbers of gravity)"),
     3: ("orientation", " [qx, qy, qz, qw]", "heading", "space (three numbers of gravity)"),

@@ -30,7 +30,7 @@ class DloError(Exception):
     Attributes
     ----------
     poses : tuple of PoseInput
-        Where a session has failed: its poses as far as they had been read.
+        Of a session that has failed: its poses, with all that had been read of them.
     """
 
     def __init__(self, message: str) -> None:
@@ -62,7 +62,7 @@ class ConfigError(DloError):
 
 
 class MeasurementError(DloError):
-    """A photograph or a centre-line file from which no centre-line can be had.
+    """A photograph or a file that gives no centre-line.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ class OutputError(DloError):
         self.path = path
 
     def retold(self, draft: str, place: str) -> None:
-        """Name the place instead of its draft."""
+        """Replace the name of a draft by that of the place."""
         self.message = self.message.replace(draft, place)
         self.args = (self.message,)
         self.path = None if self.path is None else Path(str(self.path).replace(draft, place))

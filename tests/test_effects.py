@@ -270,7 +270,7 @@ def energies(effects: tuple[Effect, ...], p: list[float], gravity=(0.0, -9.81), 
     return assembly_of(model).energy(*where)[0], assembly_of(model).nodes(*where)[0]
 
 
-# Loads bow quadratic elements at given headings: not for those.
+# At given headings loads move the bubbles of quadratic elements: not for those.
 @pytest.mark.parametrize("element", ["arc", "link"])
 def test_energy_of_loads(element):
     """A mass m at node 2 has -m g . r; a force -f . r; a side load -q int x ds."""
@@ -313,7 +313,7 @@ def test_reactions_carry_the_weight_and_the_pull_of_a_tether(element):
     p = np.array([0.05, 5.0, 0.4, *anchor])
     found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), Pose((0.1, 0.0), (0.6, 0.1)))
     loads = 5.0 * (anchor - found.points[10]) - [0.0, 9.81 * CABLE.mass]
-    # Bows enter the spring's energy to second order: k L bow^4, with bows of 0.01 rad.
+    # Bubbles enter the spring's energy to second order: error k L b^4, with b of 0.01 rad.
     np.testing.assert_allclose(found.lam + found.lam_start, loads, atol=1e-6)
 
 
@@ -357,7 +357,7 @@ def test_a_soft_tether_to_a_far_anchor_is_a_point_force():
 @pytest.mark.parametrize("cable", [CABLE, IN_SPACE], ids=["plane", "space"])
 @pytest.mark.parametrize("name", sorted(k for k, kind in EFFECTS.items() if issubclass(kind, Load)))
 def test_nothing_hangs_beyond_the_end(name, cable):
-    """What a spread load pulls at the part beyond s falls to zero at the end."""
+    """The resultant of a spread load beyond s falls to zero at the end."""
     effect, s = EFFECTS[name](), ca.SX.sym("s")
     params = {q.name: ca.SX(q.nominal + 0.5 * q.scale) for q in effect.parameters(cable)}
     gravity = ca.SX(ca.DM([1.0, -9.0, 2.0][: len(cable.axes)]))

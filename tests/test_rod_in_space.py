@@ -337,7 +337,7 @@ def test_a_straight_cable_between_ball_joints_is_stable_though_it_may_spin(eleme
         np.zeros(planar.chain.n_rests),
         Pose((0.0, 0.0), (level, pose.end[2])),
     )
-    # Arcs are the same in both; what bows inside an element is of the fifth order in h apart.
+    # Arcs are the same in both; the bubbles inside elements differ by the fifth order in h.
     close = 1e-10 if element == "arc" else 1e-3
     assert found.stable
     assert found.energy == pytest.approx(alike.energy, rel=close)

@@ -69,9 +69,9 @@ def test_expressions_are_what_the_assembly_says(element, boundary):
 )
 @pytest.mark.parametrize("held", ["pinned", "clamped"])
 def test_minimum_over_what_is_inside_is_the_lagrangian(element, effect, own, held):
-    """V + lam^T c is quadratic in bows or axial strains; its minimum is L, whatever the nodes.
+    """V + lam^T c is quadratic in bubbles or axial strains; its minimum is L, whatever the nodes.
 
-    Under tension: a compressed bow is kept stiff in the Lagrangian alone. Bows and strains one at
+    Under tension: only the Lagrangian keeps a compressed bubble stiff. Bubbles and strains one at
     a time: the Lagrangian leaves out their product.
     """
     model = CableModel(CABLE, 4, element, held, held, effects=(effect,))

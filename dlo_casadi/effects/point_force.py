@@ -58,9 +58,9 @@ class UnknownPull(PointLoad):
 
     def per_pose(self, cable: Cable) -> tuple[str, ...]:
         """f_j."""
-        return tuple(f"pull_{axis}" for axis in cable.axes)
+        return tuple(f"unknown_force_{axis}" for axis in cable.axes)
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force of this pose."""
-        force = vector(params, "f") + vector(params, "pull_")
+        force = vector(params, "f") + vector(params, "unknown_force_")
         return (PointForceAt(force, params["position"]),)

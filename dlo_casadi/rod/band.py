@@ -3,9 +3,9 @@
     [ A    B ] [ x ]   [ f ]
     [ B^T  C ] [ y ] = [ g ]
 
-A couples neighbouring nodes, B and C belong to the unknowns of the whole pose: multipliers of the
-end conditions. Block cyclic reduction eliminates every other node, log2(n) times, so that the work
-grows linearly with the nodes and all poses and nodes of a level are one array operation. It is a
+A couples neighbouring nodes; B and C belong to the unknowns of the whole pose: the multipliers of
+the end conditions. Block cyclic reduction eliminates every other node, log2(n) times: the work
+grows linearly with the nodes, and one array operation does a level of all nodes and poses. It is a
 congruence of A: the signs of the pivots give the inertia (Sylvester, Haynsworth).
 
 References
@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
 
-# A pivot below this share of the largest entry is moved by this share: the square root of
-# rounding loses half of the digits, which one step of refinement wins back.
+# Smallest pivot, relative to the largest entry; a smaller one is shifted by this. The square root
+# of rounding: half of the digits are lost, and one step of refinement restores them.
 LEAST_PIVOT = 1e-8
-# Steps of iterative refinement at most, and the relative residual at which they end.
+# Maximum number of steps of iterative refinement, and the relative residual at which they end.
 REFINEMENTS = 3
 RESIDUAL = 1e-13
-# Eigenvalues within this share of the largest entry are zero: rounding of the elimination.
+# Eigenvalues below this share of the largest entry count as zero: rounding of the elimination.
 ZERO_PIVOT = 1e-13
 
 
@@ -150,7 +150,7 @@ class BandMatrix:
 
     @property
     def row_sum(self) -> FloatArray:
-        """Largest sum of the sizes of a row of A (m,): no eigenvalue of A is farther from zero."""
+        """Largest row sum of |A| (m,), a bound on the absolute values of its eigenvalues."""
         rows = np.abs(self.diagonal).sum(axis=3)
         rows[:, :-1] += np.abs(self.upper).sum(axis=3)
         rows[:, 1:] += np.abs(self.upper).sum(axis=2)
@@ -217,7 +217,7 @@ class BandFactor:
         self.schur = matrix.corner - _transposed(matrix.columns) @ arm
 
     def _inverse(self, pivots: FloatArray) -> FloatArray:
-        """Inverses of pivots (m, h, b, b); those that are all but singular are moved a little."""
+        """Inverses of pivots (m, h, b, b); nearly singular ones are shifted by `LEAST_PIVOT`."""
         single = pivots.shape[-1] == 1
         values, vectors = (pivots[..., 0], None) if single else np.linalg.eigh(pivots)
         self._eigenvalues.append(values)
@@ -241,10 +241,10 @@ class BandFactor:
         x = _product(self._top, f)
         for level, (taken, even) in zip(self._levels[::-1], halves[::-1], strict=True):
             count, inner = level.counts
-            pull = _product(_transposed(level.left), x[:, :count])
-            pull[:, :inner] += _product(level.right, x[:, 1 : inner + 1])
+            coupling = _product(_transposed(level.left), x[:, :count])
+            coupling[:, :inner] += _product(level.right, x[:, 1 : inner + 1])
             out = np.empty((*even.shape[:1], even.shape[1] + count, *even.shape[2:]))
-            out[:, 0::2], out[:, 1::2] = x, taken - _product(level.inverse, pull)
+            out[:, 0::2], out[:, 1::2] = x, taken - _product(level.inverse, coupling)
             x = out
         return x
 
@@ -292,7 +292,7 @@ class BandFactor:
 
     @cached_property
     def negative(self) -> NDArray[np.intp]:
-        """As `BandMatrix.negative`, of the matrix as it is."""
+        """Number of negative eigenvalues (m,), see `BandMatrix.negative`; without its shift."""
         total = np.zeros(len(self.schur), dtype=np.intp)
         singular = np.zeros(len(self.schur), dtype=bool)
         for values in self._eigenvalues:

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.rod.element import Element, Layout
-from dlo_casadi.rod.elements import Arc, BowedHelix, Helix, Link, Quadratic
+from dlo_casadi.rod.elements import Arc, Helix, Link, Quadratic, QuadraticHelix
 
 FloatArray = NDArray[np.floating]
 
 ELEMENTS: dict[str, Element] = {element.name: element for element in (Quadratic(), Arc(), Link())}
-ELEMENTS_IN_SPACE: dict[str, Element] = {kind.name: kind for kind in (BowedHelix(), Helix())}
+ELEMENTS_IN_SPACE: dict[str, Element] = {kind.name: kind for kind in (QuadraticHelix(), Helix())}
 DEFAULT_ELEMENT = "quadratic"
 
 
@@ -52,7 +52,7 @@ class Chain:
 
     @property
     def kind(self) -> Element:
-        """What the chain is made of."""
+        """The kind of its elements."""
         return (ELEMENTS_IN_SPACE if self.in_space else ELEMENTS)[self.element]
 
     @property
@@ -92,14 +92,14 @@ class Chain:
 
     @property
     def n_rests(self) -> int:
-        """Number of rest strains: the first strain of all cells, then the next."""
+        """Number of rest strains; they are ordered by component first, then by cell."""
         return self.n_cells * len(self.kind.node.strains)
 
     @cached_property
     def rest_stencils(self) -> tuple[NDArray[np.intp], FloatArray]:
-        """Cells (n_segments, 3) that tell the rest curvature inside, and how (n_segments, 3, 3).
+        """Cells (n_segments, 3) that determine the rest curvature inside a segment, with weights.
 
-        From the means m over a cell and its neighbours, for x from -1/2 to 1/2,
+        The weights are (n_segments, 3, 3). From means m over a cell and its neighbours, |x| <= 1/2,
 
             kappa_0(x) = m_e + a x + c (x^2 - 1/12),
             a = (m_(e+1) - m_(e-1)) / 2,   c = (m_(e+1) - 2 m_e + m_(e-1)) / 2

@@ -23,9 +23,9 @@ FloatArray = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Cell:
-    """The stretch of cable that one strain stands for: `width` [m] from `low` [m] on.
+    """Interval of the cable on which one discrete strain acts: `width` [m], beginning at `low` [m].
 
-    `mesh` [m] is the largest width of such a cell, by which kinks are rounded.
+    `mesh` [m] is the largest width of such a cell; kinks are rounded over a share of it.
     """
 
     low: ca.SX
@@ -56,7 +56,7 @@ def one(_: object) -> ca.SX:
 
 @dataclass(frozen=True)
 class Section:
-    """What a section resists bending and twist with.
+    """Energy of a section that is bent and twisted.
 
         W = a (b(|k|) k^T B k + GJ tau^2) / 2                           [N]
 
@@ -69,10 +69,10 @@ class Section:
         B: EI in a plane; in space about the material axes y and z.
     torsion : scalar GJ [N m^2]
     along : callable
-        a, of a cell.
+        Cell -> a.
     of_bend, tangent : callable
-        By the square of the bend: b, and the factor on the stiffness against a small change of
-        such a bend, which is exact of one law.
+        Square of the bend -> b, and -> the factor on the stiffness against a small change of
+        that bend, which is exact for a single law.
     """
 
     bending: ca.SX
@@ -98,7 +98,7 @@ class Layout:
     nodes : (N,) [m]
         Arc lengths of the nodes.
     segments : (S, 5) [m, m, m, m, 1]
-        Of each segment: start and length of the cable that it advances along, start and width of
+        For each segment: start and length of the cable that it advances along, start and width of
         its bending cell, and whether it has one (1 or 0).
     stations : (n + 1, 2) int
         Nodes whose mean direction is the cable's at each element boundary.
@@ -140,13 +140,13 @@ class Segment:
     mesh : float [m]
         Declared length of an element.
     stretch : scalar
-        True length over declared length, the same everywhere.
+        True length over declared length, the same everywhere, without tension.
     ratio : scalar
-        Of this segment, stretching under tension included.
+        True length over declared length of this segment, with its axial strain under tension.
     inner : (n_inner,)
-        Unknowns inside the element.
+        Internal unknowns of the element.
     square : scalar
-        What stands for the square of the inner unknown.
+        Square of the internal unknown, or the expression that replaces it, see `_stiffening`.
     """
 
     local: ca.SX
@@ -191,7 +191,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Condensed:
-    """A Lagrangian with the inner unknowns eliminated, and what they are."""
+    """A Lagrangian with the internal unknowns eliminated, and their values."""
 
     lagrangian: ca.SX
     inner: ca.SX
@@ -207,18 +207,18 @@ class Element(ABC):
     nodes_are : str
         Where its nodes are, in words.
     node : Node
-        What its nodes carry.
+        State of its nodes.
     order : int
         Order of the shape's error in the element's length, measured.
     smooth : bool
-        Whether the cable has a tangent at element boundaries: its curve is then interpolated with
-        it, else by chords.
+        Whether the cable has a tangent at element boundaries. The curve between them is then a
+        cubic Hermite interpolant, else a chord.
     plain : str
-        Name of the element without the inner unknowns, on the same nodes.
+        Name of the element without the internal unknowns, on the same nodes.
     framed : bool
         Whether its Lagrangian is differentiated in the frame in its middle, see `in_frame`.
     n_inner : int
-        Number of unknowns inside an element that are eliminated from it.
+        Number of internal unknowns, which are eliminated.
     rule : (nodes, weights)
         Quadrature on [0, 1] along the element.
     """
@@ -249,7 +249,7 @@ class Element(ABC):
         return Layout(nodes, segments, np.stack([np.arange(n + 1)] * 2, axis=1))
 
     def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
-        """Local coordinates (n_local,) of two nodes: what the element is written in."""
+        """Local coordinates (n_local,) of two nodes, the arguments of all other methods."""
         return ca.vertcat(first, last)
 
     @abstractmethod
@@ -277,17 +277,17 @@ class Element(ABC):
         return segment.has_cell * segment.cell.width * mean * segment.stretch
 
     def bends(self, segment: Segment) -> list[ca.SX]:
-        """Strains minus those at rest [1/m]: of the cell, or at two Gauss points, one a half."""
+        """Strains minus rest strains [1/m]: of the cell, or at a Gauss point in each half."""
         return [self.strain(segment) - segment.rest[::3]]
 
     def condensed(
         self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> Condensed:
-        """Eliminate the inner unknowns from the segment's Lagrangian, which is given with them."""
+        """Eliminate the internal unknowns from the segment's Lagrangian."""
         return Condensed(lagrangian, segment.inner, segment.square)
 
     def expanded(
         self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> ca.SX:
-        """Energy that is minimised over the inner unknowns; the same minimum as `condensed`."""
+        """Energy to be minimised over the internal unknowns, with the minimum of `condensed`."""
         return energy

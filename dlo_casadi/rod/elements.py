@@ -1,4 +1,4 @@
-"""The elements: links, arcs and bowed arcs in a plane, helices and bowed helices in space.
+"""The elements: links, arcs and quadratic arcs in a plane, helices and quadratic ones in space.
 
 Between the frames R_0 and R_1 of two nodes in space the rod is a helix of the rotation vector phi,
 
@@ -34,10 +34,10 @@ from dlo_casadi.rod.node import (
 
 # Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
 _GAUSS = 0.5 / np.sqrt(3)
-# asin(x) / x in powers of x^2. Of a quarter of the half angle of an element that turns by a
-# quarter turn, x = 0.2, what is left out is 1e-13.
+# Coefficients of asin(x) / x in powers of x^2. An element that turns by a quarter turn needs
+# x = 0.2, where the truncation error is 1e-13.
 _ARCSINE = tuple(factorial(2 * k) / (4**k * factorial(k) ** 2 * (2 * k + 1)) for k in range(8))
-# (1 - cos x) / x^2 in powers of x^2: to 2e-15 for x = 0.785, half of a quarter turn.
+# Coefficients of (1 - cos x) / x^2 in powers of x^2: error 2e-15 at x = pi/4.
 _COSINE = tuple((-1) ** k / factorial(2 * k + 2) for k in range(7))
 
 
@@ -68,7 +68,7 @@ class Link(Element):
         if clamped[1]:
             nodes = np.concatenate([nodes, [length]])
             links = np.concatenate([links, [[length, 0.0]]])
-        # Behind the last node there is no cell: its numbers are those of the one before.
+        # There is no cell behind the last node; its numbers repeat those of the cell before.
         low = np.concatenate([nodes[:-1], nodes[-2:-1]])
         width = np.concatenate([np.diff(nodes), nodes[-1:] - nodes[-2:-1]])
         has_cell = np.ones(len(nodes))
@@ -76,7 +76,7 @@ class Link(Element):
         return Layout(nodes, np.column_stack([links, low, width, has_cell]), stations)
 
     def strain(self, segment: Segment) -> ca.SX:
-        """Bend of the hinge over the width of its cell."""
+        """Bend of the hinge divided by the width of its cell."""
         return (
             segment.has_cell
             * (segment.last - segment.first)
@@ -89,7 +89,7 @@ class Link(Element):
 
 
 class Arc(Element):
-    """Between nodal headings the heading is linear, and follows the rest shape's own variation.
+    """Heading linear between the nodes, plus the variation of the rest curvature inside.
 
         phi(u) = phi_0 + u (phi_1 - phi_0) + own(u)
 
@@ -101,7 +101,7 @@ class Arc(Element):
     node = Heading
 
     def strain(self, segment: Segment) -> ca.SX:
-        """Turning over true length."""
+        """Difference of the nodal headings divided by the true length."""
         return (segment.last - segment.first) * (1 / (segment.length * segment.stretch))
 
     def heading(self, segment: Segment, u: ca.SX | float) -> ca.SX:
@@ -118,10 +118,10 @@ class Arc(Element):
 
 
 class Quadratic(Arc):
-    """An arc whose heading in the middle lies by the angle `bow` beyond the mean of its ends.
+    """An arc with a bubble: an internal unknown b adds 4 u (1 - u) b to its heading.
 
-    Positions and energy are taken to second order in the bow, which leaves out what is of fourth
-    order in the element's length. The bow is the minimum for given nodes and multipliers.
+    Positions and energy are expanded to second order in the bubble; the error is of fourth order
+    in the element's length. The bubble minimises the Lagrangian at given nodes and multipliers.
     """
 
     name = "quadratic"
@@ -129,7 +129,7 @@ class Quadratic(Arc):
     n_inner = 1
 
     def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
-        """The arc's, turned by the bow to second order."""
+        """The arc's, turned by the bubble to second order."""
         c, s = ca.vertsplit(Heading.tangent(self.heading(segment, u)))
         form = 4 * u * (1 - u)
         across, back = form * segment.inner, form**2 * segment.square / 2
@@ -137,33 +137,33 @@ class Quadratic(Arc):
         return segment.ratio * ca.vertcat(c, s) + segment.stretch * bowed
 
     def elastic(self, segment: Segment, section: Section) -> ca.SX:
-        """Energy of the bend at two Gauss points, one a half, to second order in the bow."""
+        """Energy of the bend at a Gauss point in each half, to second order in the bubble."""
         (bend,), q = self.bends(segment), ca.SX.sym("q")
         moment = bend * ca.substitute(ca.gradient(section.of_bend(q) * q, q), q, bend**2)
         first, second = (section.along(half) for half in segment.cell.halves)
-        # The bow's own curvature is 4 bow (1 - 2u) / h: at Gauss points, +- 4/sqrt(3) bow / h.
+        # The bubble's curvature is 4 b (1 - 2u) / h: at the Gauss points, +- 4/sqrt(3) b / h.
         bowed = 4 / np.sqrt(3) * segment.inner * (1 / (segment.length * segment.stretch))
         mean = section.of_bend(bend**2) * bend**2 + section.tangent(bend**2) * bowed**2
-        # Where the halves resist differently, a mean bend bows the cell.
+        # Where the stiffness of the halves differs, a mean bend drives the bubble.
         density = (first + second) / 2 * mean + (first - second) * moment * bowed
         return segment.cell.width * section.bending / 2 * density * segment.stretch
 
     def condensed(
         self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> Condensed:
-        """Second-order minimum over the bow, its stiffness kept positive under compression."""
+        """Second-order minimum over the bubble; its stiffness stays positive under compression."""
         torque = ca.gradient(lagrangian, segment.inner)
         own = ca.jacobian(ca.gradient(elastic(segment), segment.inner), segment.inner)
         whole = [lagrangian, torque, ca.jacobian(torque, segment.inner), own]
         given, torque, stiffness, own = ca.substitute(whole, [segment.inner], [ca.SX(0)])
-        factor, slope = _stiffening(stiffness / own - 1)
-        bow = -torque / (own * factor)
-        return Condensed(given + torque * bow / 2, bow, bow**2 * slope)
+        factor, derivative = _stiffening(stiffness / own - 1)
+        bubble = -torque / (own * factor)
+        return Condensed(given + torque * bubble / 2, bubble, bubble**2 * derivative)
 
     def expanded(
         self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> ca.SX:
-        """To second order in the bow, as in `condensed`."""
+        """To second order in the bubble, as in `condensed`."""
         torque = ca.gradient(energy, segment.inner)
         whole = [energy, torque, ca.jacobian(torque, segment.inner)]
         given, torque, stiffness = ca.substitute(whole, [segment.inner], [ca.SX(0)])
@@ -171,10 +171,10 @@ class Quadratic(Arc):
 
 
 def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Stiffness 1 + x of a bow under tension and its slope; compressed, x < 0, it stays above 1/4.
+    """Relative stiffness of a bubble and its derivative: 1 + x, but above 1/4 for any x < 0.
 
-    Elements of a limp cable would buckle one by one on the way to an equilibrium. Twice
-    differentiable, and 1 + x + O(x^3) everywhere.
+    x is positive under tension. Without the lower bound elements of a limp cable buckle one by one
+    on the way to an equilibrium. Twice differentiable, and 1 + x + O(x^3) near 0.
     """
     a = 4 / 3 * ca.fmin(x, 0)
     pressed = 1 - a + a**2
@@ -191,7 +191,7 @@ class Helix(Element):
     def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
         """Frame in the middle (4,), and the rotation vector phi (3,) [rad] from node to node."""
         x, y, z, w = quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(last))
-        # Halving the angle once more leaves an arc sine of which few terms are enough.
+        # The angle is halved once more: the series of the arc sine then needs few terms.
         vector, halves = ca.vertcat(x, y, z), []
         for _ in range(2):
             cosine = ca.sqrt((1 + w) / 2)
@@ -224,15 +224,14 @@ def _turned(phi: ca.SX, x: ca.SX | float) -> ca.SX:
     )
 
 
-class BowedHelix(Helix):
+class QuadraticHelix(Helix):
     """Curvature and twist that change linearly inside the element: fourth order.
 
         h omega(x) = phi - 8 x beta + 2/3 phi x beta,      -1/2 <= x <= 1/2
 
     turns the frame at x, against the helix, by (1 - 4 x^2) (beta - x/3 phi x beta) about its own
-    axes. Positions are taken to first order in the bow beta; it is the minimum of the elastic
-    energy and the work of the loads for given nodes, which leaves out what is of the fifth order
-    in h per element.
+    axes. Positions are expanded to first order in the bubble beta, which minimises the elastic
+    energy minus the work of the loads at given nodes; the error is of fifth order in h per element.
     """
 
     name = "quadratic"
@@ -244,11 +243,11 @@ class BowedHelix(Helix):
         phi, beta = segment.local[4:], segment.inner
         mean = phi + 2 / 3 * ca.cross(phi, beta)
         width = segment.length * segment.stretch
-        rest, slope = segment.rest[::3], segment.rest[1::3]
-        return [(mean - 8 * x * beta) / width - rest - x * slope for x in (-_GAUSS, _GAUSS)]
+        rest, linear = segment.rest[::3], segment.rest[1::3]
+        return [(mean - 8 * x * beta) / width - rest - x * linear for x in (-_GAUSS, _GAUSS)]
 
     def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
-        """The helix's, turned by the bow to first order."""
+        """The helix's, turned by the bubble to first order."""
         middle, phi = segment.local[:4], segment.local[4:]
         x = u - 0.5
         turn = (1 - 4 * x * x) * (segment.inner - x / 3 * ca.cross(phi, segment.inner))
@@ -259,24 +258,24 @@ class BowedHelix(Helix):
     def condensed(
         self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> Condensed:
-        """Minimum over the bow, resisted by the section alone."""
-        given, torque, own = self._of_bow(segment, lagrangian, elastic)
-        bow = -ca.mtimes(inverse_of(own), torque)
-        return Condensed(given + ca.dot(torque, bow) / 2, bow, segment.square)
+        """Minimum over the bubble, whose stiffness is that of the section alone."""
+        given, torque, own = self._of_bubble(segment, lagrangian, elastic)
+        bubble = -ca.mtimes(inverse_of(own), torque)
+        return Condensed(given + ca.dot(torque, bubble) / 2, bubble, segment.square)
 
     def expanded(
         self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> ca.SX:
-        """To second order in the bow, as in `condensed`."""
-        given, torque, own = self._of_bow(segment, energy, elastic)
-        bow = segment.inner
-        return given + ca.dot(torque, bow) + ca.dot(bow, ca.mtimes(own, bow)) / 2
+        """To second order in the bubble, as in `condensed`."""
+        given, torque, own = self._of_bubble(segment, energy, elastic)
+        bubble = segment.inner
+        return given + ca.dot(torque, bubble) + ca.dot(bubble, ca.mtimes(own, bubble)) / 2
 
     @staticmethod
-    def _of_bow(
+    def _of_bubble(
         segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> list[ca.SX]:
-        """Value of an energy at no bow, its slope by the bow, and the section's own stiffness."""
+        """Energy without a bubble, its derivative by the bubble, and the section's stiffness."""
         own, _ = ca.hessian(elastic(segment), segment.inner)
         whole = [energy, ca.gradient(energy, segment.inner), own]
         return list(ca.substitute(whole, [segment.inner], [ca.SX.zeros(3)]))

@@ -1,4 +1,4 @@
-"""Where the ends of a cable are held: the record of positions and frames behind a pose."""
+"""How the ends of a cable are held: their positions and frames, as symbols of one pose."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import casadi as ca
 
 from dlo_casadi.rod.node import Node, quaternion_product
 
-# What the cable does to its fixtures, and a sensor there measures, in the order of `reactions`.
+# Forces and moments of the cable on its fixtures, in the order of `Assembly.reactions`.
 REACTIONS = ("start_force", "start_moment", "end_force", "end_moment")
 
 
@@ -20,11 +20,12 @@ def reaction_rows(node: type[Node]) -> dict[str, slice]:
 
 
 def deviation_names(node: type[Node]) -> tuple[str, ...]:
-    """What may be different in every pose, in the order of `deviation`.
+    """Names of the unknowns that each pose has of its own, in the order of `deviation`.
 
-    Where the ends deviate from what is declared [m, rad], and a force of unknown cause [N].
+    How the ends deviate from what is declared [m, rad], and a force of unknown cause [N].
     """
-    parts = (("end", node.axes), ("start", node.turns), ("end", node.turns), ("pull", node.axes))
+    axes, turns = node.axes, node.turns
+    parts = (("end", axes), ("start", turns), ("end", turns), ("unknown_force", axes))
     return tuple(f"{what}_{name}" for what, names in parts for name in names)
 
 
@@ -44,19 +45,19 @@ class EndConditions:
 
     @staticmethod
     def size(node: type[Node]) -> int:
-        """Numbers that declare both ends."""
+        """Size of `vector`."""
         return 2 * (node.dimension + node.coordinates)
 
     @classmethod
     def of(cls, values: ca.SX, node: type[Node]) -> EndConditions:
-        """From start, end, start frame, end frame in one vector."""
+        """Split a vector of start, end, start frame, end frame."""
         d, c = node.dimension, node.coordinates
         start, end, first, last = ca.vertsplit(values, [0, d, 2 * d, 2 * d + c, 2 * (d + c)])
         return cls(start, end, first, last, node)
 
     @property
     def vector(self) -> ca.SX:
-        """As given to `of`."""
+        """Start, end, start frame, end frame in one vector."""
         return ca.vertcat(self.start, self.end, self.start_frame, self.end_frame)
 
     def rolled(self, angle: ca.SX) -> EndConditions:

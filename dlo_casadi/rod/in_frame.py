@@ -1,9 +1,9 @@
-"""A segment between two frames, differentiated in stages: fewer operations than in one go.
+"""A segment between two frames, differentiated in stages, which takes fewer operations.
 
-The Lagrangian of a segment stays the same when the segment and the forces on it are turned
-together. So it is written in the frame R in its middle, by the rotation vector phi from node to
-node and the forces c = R^T F; CasADi differentiates it there by phi, the inner unknowns and c, the
-inner unknowns are eliminated, and the chain rule to the nodes is in closed form. With increments
+The Lagrangian of a segment does not change when the segment and the forces on it are rotated
+together. It is therefore a function of the rotation vector phi from node to node and of the forces
+c = R^T F in the frame R in its middle. CasADi differentiates it by phi, the internal unknowns and
+c; these are eliminated, and the chain rule to the nodes is in closed form. With increments
 alpha, beta of both nodes about the axes of R,
 
     sigma = (alpha + beta) / 2,   epsilon = beta - alpha,
@@ -34,10 +34,10 @@ from dlo_casadi.rod.node import conjugate, quaternion_product
 
 FloatArray = NDArray[np.floating]
 
-# Energy [J] of a segment of the rotation vector phi (3,), inner unknowns and forces (3, m).
+# (rotation vector phi (3,), internal unknowns, forces (3, m) [N]) -> energy of a segment [J].
 Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
-# Keeps a quotient of two squares of an angle at a straight element finite.
+# Keeps 0 / 0 of two squared angles finite where an element is straight.
 _TINY = 1e-30
 
 
@@ -45,8 +45,8 @@ _TINY = 1e-30
 class SegmentDerivatives:
     """A segment's Lagrangian and its derivatives by rotations of its nodes and by multipliers.
 
-    Rotations are about the axes of the middle frame, or what `about` has made of them;
-    multipliers are in world axes, q vectors one after the other.
+    Rotations are about the axes of the middle frame, or about those given to `about`;
+    multipliers are q vectors (3,) in world axes, one after the other.
 
     Parameters
     ----------
@@ -55,12 +55,12 @@ class SegmentDerivatives:
         From the axes of the middle frame to the world's.
     phi : (3,) [rad]
     slopes : tuple of (3,)
-        By the first node, by the last.
+        First derivatives by the first node and by the last.
     by_lam : (3 q,)
     bends : tuple of (3, 3)
-        By first-first, first-last, last-last.
+        Second derivatives: first-first, first-last, last-last.
     mixed : tuple of (3, 3 q)
-        By first-lam, last-lam.
+        Second derivatives: first-lam, last-lam.
     lam_lam : (3 q, 3 q)
     """
 
@@ -74,7 +74,7 @@ class SegmentDerivatives:
     lam_lam: ca.SX
 
     def about(self, first: ca.SX, last: ca.SX) -> SegmentDerivatives:
-        """The same by rotations about other axes: matrices (3, 3) that lead to them."""
+        """The same by rotations about other axes, given by matrices (3, 3) from these to those."""
         (g, h), (aa, ab, bb), (al, bl) = self.slopes, self.bends, self.mixed
         return replace(
             self,
@@ -105,13 +105,13 @@ class SegmentInFrame:
     kind : Element
         A helix.
     energy : callable
-        Whose minimum over the inner unknowns is the segment's Lagrangian.
+        Its minimum over the internal unknowns is the segment's Lagrangian.
     x : (8,)
         Frames of both nodes.
     forces : (3, m) [N]
-        On the segment in world axes.
+        Forces on the segment, in world axes.
     weights : (m, q)
-        Of q multipliers (3,) in the forces.
+        Derivatives of the forces by q multipliers (3,).
     """
 
     def __init__(
@@ -131,12 +131,12 @@ class SegmentInFrame:
         resisting = ca.jacobian(self._by_inner, inner)
         start = [self._moved.phi, ca.SX.zeros(inner.shape), self._body]
         torque, resisting = ca.substitute([self._by_inner, resisting], self._symbols, start)
-        # Of the second order in the inner unknowns: one Newton step from zero is the minimum.
+        # Quadratic in the internal unknowns: one Newton step from zero gives the minimum.
         self._inverse = inverse_of(resisting) if inner.numel() else ca.SX(0, 0)
         self._there = [self._moved.phi, -self._inverse @ torque, self._body]
 
     def _at(self, expressions: list[ca.SX]) -> list[ca.SX]:
-        """At the segment's own rotation vector and forces, the inner unknowns at their minimum."""
+        """Insert the segment's rotation vector and forces, and the internal unknowns' minimum."""
         return list(ca.substitute(expressions, self._symbols, self._there))
 
     def derivatives(self) -> SegmentDerivatives:
@@ -166,7 +166,7 @@ class SegmentInFrame:
         lam_phi, lam_lam = to_lam.T @ force_phi, to_lam.T @ force_lam
         phi_phi = bend[:3, :3]
         if inner.numel():
-            # The inner unknowns follow.
+            # The internal unknowns follow.
             whole = [
                 [mu_mu, mu_phi, mu_lam],
                 [mu_phi.T, phi_phi, lam_phi.T],
@@ -200,7 +200,7 @@ class SegmentInFrame:
         )
 
     def by_numbers(self, numbers: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Derivatives by numbers (a,) of the slopes (3, a), of both nodes, and of by_lam (3 q, a).
+        """Derivatives by numbers (a,) of both slopes (3, a) each, and of by_lam (3 q, a).
 
         Rotations are about the axes of the middle frame.
         """
@@ -227,16 +227,16 @@ class SegmentInFrame:
         return g_s / 2 - g_e, g_s / 2 + g_e, by_lam
 
     def _to_nodes(self, by_mu: ca.SX, by_phi: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Slopes by the mean and the difference of the nodes' rotations."""
+        """Derivatives by the mean and the difference of the nodes' rotations."""
         return by_mu, self._moved.lever.T @ by_mu + self._moved.stretch @ by_phi
 
 
 class _Kinematics:
-    """What moves with the nodes of a segment, and how.
+    """Quantities that depend on the nodes of a segment, and their derivatives.
 
     `phi` (3,) [rad]; `turn` (3, 3): R; `node_turns`: from it to the nodes' axes; `z` (3,);
-    `stretch` (3, 3): K; `along`: 1 / |phi|^2; `second`: a, b, of the second order of psi, see
-    `_second_order`; `lever` (3, 3): derivative of mu by epsilon.
+    `stretch` (3, 3): K; `along`: 1 / |phi|^2; `second`: a and b in the second-order term of psi,
+    see `_second_order`; `lever` (3, 3): derivative of mu by epsilon.
     """
 
     def __init__(self, kind: Element, x: ca.SX) -> None:

@@ -1,4 +1,4 @@
-"""What a node of the rod carries, and how it moves: by an increment, never by coordinates."""
+"""The state of a node of the rod; it moves by an increment, never by its coordinates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.floating]
 
 _CASADI = (ca.SX, ca.MX, ca.DM)
 
-# sin(x) / x in powers of x^2: to 2e-15 for x = 0.65, to 3e-14 for half of a quarter turn.
+# Coefficients of sin(x) / x in powers of x^2: error 2e-15 at x = 0.65, 3e-14 at pi/4.
 SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(7))
 
 
@@ -32,8 +32,8 @@ class Node(ABC):
     axes, turns : tuple of str
         Names of the components of a position, and of an increment.
     strains, curvatures : tuple of str
-        Names of the components of a strain, which have a value at rest, and of those among them,
-        the last, that are curvatures.
+        Names of the components of a strain, each with a rest value; the last of them are the
+        curvatures.
     identity : tuple of float
         Coordinates of the node whose tangent is the world's x axis.
     """
@@ -52,7 +52,7 @@ class Node(ABC):
     def moved(x: Any, delta: Any) -> Any:
         """Nodes (..., coordinates) moved by increments (..., increment) [rad].
 
-        Arrays, or expressions of one node; so are those of `difference` and `to_world`.
+        Arrays, or expressions of one node; the same holds for `difference` and `to_world`.
         """
 
     @staticmethod
@@ -78,7 +78,7 @@ class Node(ABC):
     @staticmethod
     @abstractmethod
     def to_world(x: Any, moments: Any) -> Any:
-        """Moments (..., increment) about the axes of nodes (..., coordinates), to the world's."""
+        """Moments (..., increment) about the axes of nodes (..., coordinates), in world axes."""
 
     @classmethod
     @abstractmethod
@@ -89,7 +89,7 @@ class Node(ABC):
     def turning(cls, x: FloatArray) -> FloatArray:
         """Angles (...) [rad] by which shapes (..., n_nodes, coordinates) turn from start to end.
 
-        In a plane between the headings, in space about the cable: its twist.
+        In a plane: the difference of the headings. In space: the twist about the cable's axis.
         """
         return np.asarray(cls.difference(x[..., :-1, :], x[..., 1:, :])[..., 0].sum(axis=-1))
 
@@ -134,12 +134,12 @@ class Heading(Node):
 
     @staticmethod
     def to_world(x: Any, moments: Any) -> Any:
-        """A moment in a plane is the same about both."""
+        """In a plane a moment is the same about any axes."""
         return moments
 
     @classmethod
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
-        """Full turns of the whole cable make no difference."""
+        """Compare up to full turns of the whole cable."""
         gap = cls.difference(x, y)
         return bool(np.abs(gap - 2 * np.pi * np.round(gap.mean() / (2 * np.pi))).max() < tolerance)
 
@@ -186,13 +186,13 @@ class Frame(Node):
         *vector, w = quaternion_product(conjugate(components(x)), components(y))
         if isinstance(x, _CASADI):
             return ca.vertcat(*(2 * v / w for v in vector))
-        # Turned by half a turn there is no such increment; it is then as long as can be told.
+        # Half a turn has no finite increment; it is cut at a very long one.
         w = np.where(np.abs(w) < 1e-12, np.where(w < 0, -1e-12, 1e-12), w)
         return np.stack([2 * v / w for v in vector], axis=-1)
 
     @staticmethod
     def interpolated(places: FloatArray, known: FloatArray, x: FloatArray) -> FloatArray:
-        """Turned evenly from node to node, constant beyond."""
+        """Spherical interpolation between nodes, constant beyond."""
         k = np.clip(np.searchsorted(known, places, side="right") - 1, 0, len(known) - 2)
         u = np.clip((places - known[k]) / (known[k + 1] - known[k]), 0.0, 1.0)
         first, last = x[..., k, :], x[..., k + 1, :]
@@ -215,14 +215,14 @@ class Frame(Node):
 
     @staticmethod
     def to_world(x: Any, moments: Any) -> Any:
-        """Turned by the frames."""
+        """Rotate by the frames."""
         if isinstance(x, _CASADI):
             return rotated(x, moments)
         return Rotation.from_quat(x).apply(moments)
 
     @classmethod
     def same(cls, x: FloatArray, y: FloatArray, tolerance: float) -> bool:
-        """Quaternions of either sign; a turn of the whole cable about itself is not seen."""
+        """Compare up to signs of quaternions and a roll of the whole cable about its axis."""
         gap = cls.difference(x, y)
         gap[:, 0] -= gap[:, 0].mean()
         return bool(np.abs(gap).max() < tolerance)
@@ -266,7 +266,7 @@ def rotation(vector: ca.SX) -> ca.SX:
 
 
 def series(coefficients: Sequence[float], y: ca.SX) -> ca.SX:
-    """Sum of coefficients times the powers of y, which is smooth where y is a square."""
+    """Sum of coefficients times powers of y, smooth in x for y = x^2."""
     total = ca.SX(coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total = coefficient + y * total

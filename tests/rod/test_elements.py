@@ -1,6 +1,6 @@
 """Elements: where their nodes are, how the cable runs between them, and what bends.
 
-Kinematics against the paper's SE(3) product, circles and integrals; no mechanics but the bow's.
+Kinematics against the paper's SE(3) product, circles and integrals; no mechanics but the bubble's.
 """
 
 import itertools
@@ -24,12 +24,12 @@ def number(expression) -> np.ndarray:
     return np.array(ca.evalf(ca.SX(expression))).squeeze()
 
 
-def segments_of(chain: Chain, phi: np.ndarray, *, rest=None, stretch=1.0, bow=0.0) -> list[Segment]:
+def segments_of(chain: Chain, phi: np.ndarray, *, rest=None, stretch=1.0, bubble=0.0):
     """All segments of a chain of these headings (n_nodes,) and rest curvatures (n_cells,) [1/m]."""
     kind = chain.kind
     rest = np.zeros(chain.n_cells) if rest is None else rest
     inside = chain.rest_inside(rest[:, None])[..., 0]
-    inner = ca.SX(ca.DM(np.full((kind.n_inner, 1), bow)))
+    inner = ca.SX(ca.DM(np.full((kind.n_inner, 1), bubble)))
     after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)
     return [
         Segment(
@@ -210,7 +210,8 @@ def test_places_are_the_integral_of_the_tangent(element, stretch):
     chain = Chain(LENGTH, 5, element)
     kind, (x, w) = chain.kind, np.polynomial.legendre.leggauss(20)
     rest = np.random.default_rng(1).normal(size=chain.n_cells)
-    for segment in segments_of(chain, 0.5 * wavy(chain), rest=rest, stretch=stretch, bow=0.05)[:5]:
+    segments = segments_of(chain, 0.5 * wavy(chain), rest=rest, stretch=stretch, bubble=0.05)
+    for segment in segments[:5]:
         assert not number(kind.advance(segment, 0.0)).any()
         np.testing.assert_array_equal(
             number(kind.advance(segment, 1.0)), number(kind.advance(segment))
@@ -230,11 +231,11 @@ def test_places_are_the_integral_of_the_tangent(element, stretch):
 
 @SMOOTH
 def test_smooth_elements_have_one_tangent_at_a_node(element):
-    """Neither the bow nor the rest shape's variation turns the ends of an element."""
+    """Neither the bubble nor the rest shape's variation turns the ends of an element."""
     chain = Chain(LENGTH, 4, element)
     rest = np.random.default_rng(1).normal(scale=3.0, size=chain.n_cells)
     phi = wavy(chain)
-    segments = segments_of(chain, phi, rest=rest, stretch=1.1, bow=0.3)
+    segments = segments_of(chain, phi, rest=rest, stretch=1.1, bubble=0.3)
     for j, segment in enumerate(segments):
         for u, heading in ((0.0, phi[j]), (1.0, phi[j + 1])):
             exact = 1.1 * np.array([np.cos(heading), np.sin(heading)])
@@ -291,33 +292,33 @@ def test_rest_curvature_inside_few_cells_and_beside_clamps():
     np.testing.assert_array_equal(chain.rest_inside(many), np.moveaxis(each, 1, -1))
 
 
-# ---- the bow -----------------------------------------------------------------------------------
+# ---- the bubble --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("pull", [0.0, 2.0, 20.0, -0.5, -20.0])
-def test_the_bow_is_the_least_energy_of_its_element(pull):
-    """A load f across and a pull along the chord: the Lagrangian without the bow, minimised.
+@pytest.mark.parametrize("tension", [0.0, 2.0, 20.0, -0.5, -20.0])
+def test_the_bubble_minimises_the_energy_of_its_element(tension):
+    """A load f across the chord and a tension N along it: the Lagrangian, minimised by hand.
 
-    V = EI/2 int (dphi/ds)^2 ds - int (pull, f) . t(u) ds. Under compression the bow's stiffness
-    is kept above a quarter of the section's own, agreeing to the second order of the pull.
+    V = EI/2 int (dphi/ds)^2 ds - int (N, f) . t(u) ds. Under compression the bubble's stiffness
+    is kept above a quarter of the section's own, agreeing to the second order of N.
     """
     chain, stiffness, across = Chain(LENGTH, 2, "quadratic"), 0.05, 0.02
     kind = chain.kind
-    bow = ca.SX.sym("bow")
+    bubble = ca.SX.sym("bubble")
     plain = segments_of(chain, np.zeros(3))[0]
-    segment = Segment(**{**vars(plain), "inner": bow, "square": bow**2})
+    segment = Segment(**{**vars(plain), "inner": bubble, "square": bubble**2})
 
     def elastic(segment: Segment) -> ca.SX:
         return kind.elastic(segment, Section(ca.SX(stiffness), ca.SX(0)))
 
-    lagrangian = elastic(segment) - ca.dot(ca.DM([pull, across]), kind.advance(segment))
+    lagrangian = elastic(segment) - ca.dot(ca.DM([tension, across]), kind.advance(segment))
     found = kind.condensed(segment, lagrangian, elastic)
-    energy = ca.Function("energy", [bow], [lagrangian])
+    energy = ca.Function("energy", [bubble], [lagrangian])
     own = 16 / 3 * stiffness / chain.h  # int (4 (1 - 2u) / h)^2 h du
-    geometric = pull * chain.h * 8 / 15  # int (4u (1 - u))^2 h du
+    geometric = tension * chain.h * 8 / 15  # int (4u (1 - u))^2 h du
     torque = across * chain.h * 2 / 3  # int 4u (1 - u) h du
     x = geometric / own
-    if pull >= 0:
+    if tension >= 0:
         exact = torque / (own + geometric)
         assert number(found.inner) == pytest.approx(exact, rel=1e-12)
         assert number(found.lagrangian) == pytest.approx(float(energy(exact)), abs=1e-15)
