@@ -18,23 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 from dlo_casadi.estimation.stiffness import LEAST_POINTS, law_of, measured_moment_curve
-from dlo_casadi.report import words
-from dlo_casadi.report.canvas import (
-    BLACK,
-    BLUE,
-    GREY,
-    HELD_OUT,
-    ORANGE,
-    STAGE_LINES,
-    STYLES,
-    VERMILLION,
-    chart,
-    dot,
-    draw_marks,
-    frame,
-    line_of,
-    save_figure,
-)
+from dlo_casadi.report import canvas, words
 from dlo_casadi.report.scene import Mark, Scene, next_marks, pull_marks, scene_of
 from dlo_casadi.report.words import NOISE_ALONE, compared, directions, millimetres
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
@@ -75,13 +59,17 @@ def figures_of(outcome: Outcome) -> dict[str, Figure]:
 def write_figures(folder: Path, drawn: Mapping[str, Figure]) -> None:
     """Write figures by their names into a folder."""
     for name, drawing in drawn.items():
-        save_figure(folder / f"{name}.png", drawing, _DPI)
+        canvas.save_figure(folder / f"{name}.png", drawing, _DPI)
 
 
 # ---- errors ------------------------------------------------------------------------------------
 
 
-_KINDS = {"fit": ("o", BLUE), "cross-validated": ("D", BLUE), "held out": ("s", HELD_OUT)}
+_KINDS = {
+    "fit": ("o", canvas.BLUE),
+    "cross-validated": ("D", canvas.BLUE),
+    "held out": ("s", canvas.HELD_OUT),
+}
 
 
 def errors_figure(outcome: Outcome) -> Figure:
@@ -98,11 +86,11 @@ def errors_figure(outcome: Outcome) -> Figure:
         rows += [(k, kind, known[kind]) for kind in own]
     places = [-(i + 0.8 * k) for i, (k, *_) in enumerate(rows)]
     height = 1.6 + 0.2 * len(rows) + 0.2 * len(outcome.stages)
-    with chart(outcome, "error of each stage", height) as (drawing, (axes,)):
+    with canvas.chart(outcome, "error of each stage", height) as (drawing, (axes,)):
         left, right = _error_axis(axes, [value for *_, value in rows], floor, 4.0)
         for y, (_, kind, value) in zip(places, rows, strict=True):
             if value is None or not np.isfinite(value):
-                axes.text(1.1 * left, y, "no value", va="center", color=GREY, bbox=_PAPER)
+                axes.text(1.1 * left, y, "no value", va="center", color=canvas.GREY, bbox=_PAPER)
                 continue
             marker, color = _KINDS[kind]
             at = float(np.clip(1e3 * value, left, right))
@@ -124,7 +112,7 @@ def errors_figure(outcome: Outcome) -> Figure:
         ]
         names = [textwrap.fill(words.label_of(stage, outcome), 18) for stage in outcome.stages]
         axes.set_yticks(middles, names)
-        handles = [dot(kind, *_KINDS[kind]) for kind in shown]
+        handles = [canvas.dot(kind, *_KINDS[kind]) for kind in shown]
         drawing.legend(handles=[*handles, _floor(floor)], loc="outside lower center", ncols=2)
     return drawing
 
@@ -132,16 +120,16 @@ def errors_figure(outcome: Outcome) -> Figure:
 def pose_errors_figure(outcome: Outcome) -> Figure:
     """Error of every pose, before and after; a row of it can be chosen on the page."""
     floor = outcome.measurement.noise_distance
-    looks = {"before": ("^", ORANGE), "after": ("o", BLUE)}
+    looks = {"before": ("^", canvas.ORANGE), "after": ("o", canvas.BLUE)}
     stages = [(stage, label, *looks[kind]) for kind, label, stage in compared(outcome)]
     height = 1.6 + 0.2 * len(stages) + 0.22 * max(3, len(outcome.poses))
-    with chart(outcome, "error of each pose", height) as (drawing, (axes,)):
+    with canvas.chart(outcome, "error of each pose", height) as (drawing, (axes,)):
         found = [[stage.shapes.get(x.name) for stage, *_ in stages] for x in outcome.poses]
         errors = [[None if shape is None else shape.rmse for shape in own] for own in found]
         left, right = _error_axis(axes, (x for own in errors for x in own), floor, 1.6)
         for k, (pose, own) in enumerate(zip(outcome.poses, errors, strict=True)):
             at = np.clip([np.nan if x is None else 1e3 * x for x in own], left, right)
-            axes.plot(at, [-k] * len(at), color=GREY, lw=1.2, zorder=1)
+            axes.plot(at, [-k] * len(at), color=canvas.GREY, lw=1.2, zorder=1)
             said = []
             for x, error, (_, label, marker, color) in zip(at, own, stages, strict=True):
                 fill = "white" if pose.role == "held_out" else color
@@ -153,9 +141,9 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
         names = [name if len(name) <= 18 else f"{name[:17]}…" for name in every]
         axes.set_yticks(range(0, -len(names), -1), names)
         axes.set_ylim(0.6 - len(outcome.poses), 0.6)
-        handles = [*(dot(*look) for _, *look in stages), _floor(floor)]
+        handles = [*(canvas.dot(*look) for _, *look in stages), _floor(floor)]
         if any(pose.role == "held_out" for pose in outcome.poses):
-            handles.append(dot("hollow: held out", "o", GREY, fill="white"))
+            handles.append(canvas.dot("hollow: held out", "o", canvas.GREY, fill="white"))
         drawing.legend(handles=handles, loc="outside lower center", ncols=1)
     return drawing
 
@@ -177,12 +165,12 @@ def _error_axis(
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.grid(visible=False, axis="y")
-    axes.axvline(1e3 * floor, color=BLACK, ls="--", lw=1.2, zorder=0.9)
+    axes.axvline(1e3 * floor, color=canvas.BLACK, ls="--", lw=1.2, zorder=0.9)
     return low, high
 
 
 def _floor(floor: float) -> Line2D:
-    return line_of(f"{NOISE_ALONE} {millimetres(floor)}", color=BLACK, ls="--")
+    return canvas.line_of(f"{NOISE_ALONE} {millimetres(floor)}", color=canvas.BLACK, ls="--")
 
 
 def _name(pose: PoseInput) -> str:
@@ -198,10 +186,10 @@ def residuals_figure(outcome: Outcome) -> Figure:
     panels = [(*found, *way) for found in compared(outcome) for way in ways]
     noise = outcome.measurement.std
     said = f"residuals, noise std {millimetres(noise)} ({outcome.measurement.std_source})"
-    with chart(outcome, said, 1.4 + 1.9 * len(panels), len(panels)) as (drawing, grid):
+    with canvas.chart(outcome, said, 1.4 + 1.9 * len(panels), len(panels)) as (drawing, grid):
         for axes, (kind, label, stage, way, direction) in zip(grid, panels, strict=True):
             axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
-            axes.axhline(0, color=GREY, lw=0.8)
+            axes.axhline(0, color=canvas.GREY, lw=0.8)
             for k, pose in enumerate(outcome.poses):
                 shape = stage.shapes.get(pose.name)
                 if shape is None:
@@ -212,7 +200,7 @@ def residuals_figure(outcome: Outcome) -> Figure:
                 axes.plot(
                     shape.s[every],
                     np.atleast_2d(shape.residual.T)[way, every] / noise,
-                    color=HELD_OUT if held_out else BLUE,
+                    color=canvas.HELD_OUT if held_out else canvas.BLUE,
                     ls="--" if held_out else "-",
                     lw=1.1,
                     alpha=0.85 if held_out else 0.45,
@@ -247,10 +235,12 @@ def _residual_range(stage: Stage, noise: float) -> tuple[float, float]:
 
 def _legend_of_poses(drawing: Figure, poses: Iterable[PoseInput], **style: Any) -> None:
     """Tell fit poses, held-out poses if there are any, and the band of noise apart."""
-    handles = [line_of("fit pose", color=BLUE, **style)]
+    handles = [canvas.line_of("fit pose", color=canvas.BLUE, **style)]
     if any(pose.role == "held_out" for pose in poses):
-        handles.append(line_of("held-out pose", color=HELD_OUT, **({"ls": "--"} | style)))
-    handles.append(line_of("95 % of the noise lies within", color=_BAND, lw=8))
+        handles.append(
+            canvas.line_of("held-out pose", color=canvas.HELD_OUT, **({"ls": "--"} | style))
+        )
+    handles.append(canvas.line_of("95 % of the noise lies within", color=_BAND, lw=8))
     drawing.legend(handles=handles, loc="outside lower center", ncols=2)
 
 
@@ -260,16 +250,16 @@ def readings_figure(outcome: Outcome) -> Figure:
     names = sorted({name for shape in stage.shapes.values() for name in shape.readings})
     poses = [x for x in outcome.poses if x.name in stage.shapes and stage.shapes[x.name].readings]
     said = f"readings, measured minus predicted ({words.label_of(stage, outcome)})"
-    with chart(outcome, said, 0.9 + 2.4 * len(names), len(names), 8.5) as (drawing, grid):
+    with canvas.chart(outcome, said, 0.9 + 2.4 * len(names), len(names), 8.5) as (drawing, grid):
         for axes, name in zip(grid, names, strict=True):
             std, unit = outcome.measurement.std_of(name.split("_")[1])
             axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
-            axes.axhline(0, color=GREY, lw=0.8)
+            axes.axhline(0, color=canvas.GREY, lw=0.8)
             for k, pose in enumerate(poses):
                 if name not in stage.shapes[pose.name].readings:
                     continue
                 known, model = stage.shapes[pose.name].readings[name]
-                color = HELD_OUT if pose.role == "held_out" else BLUE
+                color = canvas.HELD_OUT if pose.role == "held_out" else canvas.BLUE
                 apart = 0.2 * (np.arange(len(known)) - (len(known) - 1) / 2)
                 axes.plot(k + apart, (known - model) / std, ".-", color=color, lw=0.6, ms=6)
             parts = f"{', '.join('xyz'[: len(apart)])} from left to right, "
@@ -293,22 +283,17 @@ def rest_curvature_figure(outcome: Outcome) -> Figure:
         f"rest curvature ({'declared straight, not fitted' if straight else 'shape without load'})"
     )
     shown = [x for x in compared(outcome) if x.kind == "after" or x.stage.name == "batch"]
-    with chart(outcome, said, 1.9 + 1.9 * len(ways), len(ways)) as (drawing, grid):
+    with canvas.chart(outcome, said, 1.9 + 1.9 * len(ways), len(ways)) as (drawing, grid):
         for k, (axes, direction) in enumerate(zip(grid, ways, strict=True)):
             for kind, label, stage in shown:
                 rest = stage.rest_curvature
                 value, std = np.atleast_2d(rest.value)[k], np.atleast_2d(rest.std)[k]
-                axes.plot(rest.s, value, **STAGE_LINES[kind], label=label)
+                axes.plot(rest.s, value, **canvas.STAGE_LINES[kind], label=label)
                 if kind == "after":
-                    edges = (value + sign * NORMAL_95 * std for sign in (-1, 1))
-                    style: dict[str, Any] = {
-                        "color": BLUE,
-                        "alpha": 0.2,
-                        "lw": 0,
-                        "label": "its 95 % band",
-                    }
-                    axes.fill_between(rest.s, *edges, **style)
-            axes.axhline(0, color=GREY, lw=0.8)
+                    low, high = value - NORMAL_95 * std, value + NORMAL_95 * std
+                    look = {"color": canvas.BLUE, "label": "its 95 % band"}
+                    axes.fill_between(rest.s, low, high, alpha=0.2, lw=0, **look)
+            axes.axhline(0, color=canvas.GREY, lw=0.8)
             about = direction and f" k_{direction}"
             axes.set(xlim=(0, outcome.config.cable.length), ylabel=f"rest curvature{about} [1/m]")
         grid[-1].set_xlabel("arc length from the start s [m]")
@@ -324,16 +309,16 @@ def moment_figure(outcome: Outcome) -> Figure | None:
     shown = [p for p in outcome.poses if p.role == "fit" and len(p.points) >= LEAST_POINTS]
     if not weight or not shown or cable.rest_shape != "straight":
         return None  # the moment needs the weight, and the bend the shape without load
-    with chart(outcome, "moment against curvature", 3.8) as (drawing, (axes,)):
+    with canvas.chart(outcome, "moment against curvature", 3.8) as (drawing, (axes,)):
         most = 0.0
         for pose in shown:
             found = measured_moment_curve(pose.points, cable.length, weight, gravity, pose.s)
             label = "from the centre-line alone" if pose is shown[0] else None
-            axes.plot(found.curvature, 1e3 * found.moment, ".", color=BLUE, label=label)
+            axes.plot(found.curvature, 1e3 * found.moment, ".", color=canvas.BLUE, label=label)
             most = max(most, float(found.curvature.max()))
         grid = np.linspace(0.0, most, 200)
         law = law_of(outcome.fit.model, outcome.fit.p, grid)
-        axes.plot(grid, 1e3 * law, color=VERMILLION, label="fitted law of the section")
+        axes.plot(grid, 1e3 * law, color=canvas.VERMILLION, label="fitted law of the section")
         axes.set(xlabel="curvature [1/m]", ylabel="bending moment [N mm]", xlim=(0, None))
         drawing.legend(loc="outside lower center", ncols=1)
     return drawing
@@ -344,33 +329,29 @@ def moment_figure(outcome: Outcome) -> Figure | None:
 
 def candidates_figure(outcome: Outcome) -> Figure:
     """Candidates for a missing effect: score, and cross-validated error where refitted."""
-    added = {effect.name for effect in outcome.effects}
-    tied = {name for effect in outcome.effects for name in effect.indistinguishable_from}
     rows = outcome.candidates
     said = "what the declared model may lack: refits, then by score"
     if outcome.verdict == "unexplained":
         said = "candidates tried; what is left is not explained by any"
     elif not outcome.effects:
         said = "candidates tried; the declared model needs none"
-    looks = [
-        (BLUE, "added to the model"),
-        (ORANGE, "cannot be told apart from it"),
-        (GREY, "refitted, not added"),
-        (_UNTRIED, "not refitted"),
-    ]
-    found = []
-    with chart(outcome, said, 1.9 + 0.36 * len(rows), width=8.5) as (drawing, (axes,)):
+    looks = {
+        "added": (canvas.BLUE, "added to the model"),
+        "tied": (canvas.ORANGE, "cannot be told apart from it"),
+        "refitted": (canvas.GREY, "refitted, not added"),
+        "": (_UNTRIED, "not refitted"),
+    }
+    found = set()
+    with canvas.chart(outcome, said, 1.9 + 0.36 * len(rows), width=8.5) as (drawing, (axes,)):
         for k, row in enumerate(rows):
             error = row.rmse_cross_validated
-            look = 2 if row.reason or error is not None else 3
-            look = 1 if row.name in tied else 0 if row.name in added else look
-            found.append(look)
+            status, said = words.finding_of(outcome, row)
+            look = status or ("refitted" if row.reason or error is not None else "")
+            found.add(look)
             axes.barh(-k, row.score, height=0.5, color=looks[look][0])
-            if look == 2:
-                axes.text(
-                    0, -k - 0.38, f" {words.finding_of(outcome, row)[1]}", va="center", fontsize=7
-                )
-            text = f" {row.score:,.0f}" if row.score >= 100 else f" {row.score:.2g}"
+            if look == "refitted":
+                axes.text(0, -k - 0.38, f" {said}", va="center", fontsize=7)
+            text = f" {words.score_text(row.score)}"
             text += "" if error is None else f"   cross-validated {millimetres(error)}"
             axes.text(row.score, -k, text, va="center", fontsize=9)
         axes.set_yticks([-k for k in range(len(rows))], [row.name for row in rows])
@@ -379,7 +360,7 @@ def candidates_figure(outcome: Outcome) -> Figure:
         axes.grid(visible=False, axis="y")
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
         axes.set_xlabel("score: fall of chi-square that adding it promises")
-        handles = [Patch(color=c, label=label) for k, (c, label) in enumerate(looks) if k in found]
+        handles = [Patch(color=c, label=x) for look, (c, x) in looks.items() if look in found]
         drawing.legend(handles=handles, loc="outside lower center", ncols=2)
     return drawing
 
@@ -394,9 +375,9 @@ def unexplained_figure(outcome: Outcome) -> Figure:
     low, high = load.interval
     size = float(np.linalg.norm(load.force))
     handles = [
-        line_of("measured", **STYLES["taken"]),
-        line_of(f"pulled at {low:.3f} to {high:.3f} m (95 %)", **STYLES["pulled"]),
-        line_of(f"force in each pose, on average {size:.3g} N", **STYLES["pull"]),
+        canvas.line_of("measured", **canvas.STYLES["taken"]),
+        canvas.line_of(f"pulled at {low:.3f} to {high:.3f} m (95 %)", **canvas.STYLES["pulled"]),
+        canvas.line_of(f"force in each pose, on average {size:.3g} N", **canvas.STYLES["pull"]),
     ]
     said = "unexplained, pulled by something that is not in the model"
     return _scene_figure(outcome, pull_marks, handles, said)
@@ -405,10 +386,10 @@ def unexplained_figure(outcome: Outcome) -> Figure:
 def next_pose_figure(outcome: Outcome) -> Figure:
     """Where to hold the end in the next pose, among those that were taken."""
     handles = [
-        line_of("measured", **STYLES["taken"]),
-        dot("next end", "P", VERMILLION),
-        dot("starts", "s", BLACK),
-        dot("ends", "o", BLACK),
+        canvas.line_of("measured", **canvas.STYLES["taken"]),
+        canvas.dot("next end", "P", canvas.VERMILLION),
+        canvas.dot("starts", "s", canvas.BLACK),
+        canvas.dot("ends", "o", canvas.BLACK),
     ]
     return _scene_figure(outcome, next_marks, handles, "which pose to measure next")
 
@@ -419,9 +400,9 @@ def _scene_figure(
     handles: list[Line2D],
     said: str,
 ) -> Figure:
-    with chart(outcome, said, 4.6) as (drawing, (axes,)):
+    with canvas.chart(outcome, said, 4.6) as (drawing, (axes,)):
         scene, under = scene_of(outcome)
-        draw_marks(axes, [*under, *marks(outcome, scene)])
-        frame(axes, scene)
+        canvas.draw_marks(axes, [*under, *marks(outcome, scene)])
+        canvas.frame(axes, scene)
         drawing.legend(handles=handles, loc="outside lower center", ncols=1 + len(handles) // 4)
     return drawing

@@ -16,25 +16,10 @@ from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.equilibrium.spread import EDGE
-from dlo_casadi.report.canvas import (
-    BLACK,
-    BLUE,
-    FORCE,
-    GREY,
-    HELD_OUT,
-    STAGE_LINES,
-    STYLES,
-    VERMILLION,
-    draw_marks,
-    frame,
-    line_of,
-    save_figure,
-    styled,
-)
+from dlo_casadi.report import canvas
 from dlo_casadi.report.scene import (
     Room,
     Scene,
-    around,
     arrow,
     band_outline,
     beside,
@@ -73,18 +58,12 @@ def draw_poses(folder: Path, outcome: Outcome) -> None:
     for page in range(pages):
         name = "poses.png" if pages == 1 else f"poses_{page + 1}.png"
         shown = poses[page * _POSES_A_PAGE : (page + 1) * _POSES_A_PAGE]
-        save_figure(folder / name, _page(outcome, shown))
+        canvas.save_figure(folder / name, _page(outcome, shown))
 
 
 def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
     config, stages = outcome.config, compared(outcome)
-    scenes = scenes_of(config, poses, [item.stage for item in stages])
-    last = stages[-1].stage.shapes if stages else {}
-    declared = {pose.name: pose for pose in config.experiment.poses}
-    marks = [
-        around(scene, declared[pose.name], pose.points, last.get(pose.name))
-        for pose, scene in zip(poses, scenes, strict=True)
-    ]
+    scenes, marks = scenes_of(config, poses, [item.stage for item in stages])
     room = scenes[0] if isinstance(scenes[0], Room) else None
     if room is None:
         shapes = [item.stage.shapes.get(pose.name) for item in stages for pose in poses]
@@ -99,17 +78,17 @@ def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
     rows, columns = _arranged(len(poses))
     size, spaces = _laid_out(rows, columns, float(span[1] / span[0]), ticks=room is None)
     # Asked where every tick and title ends, an engine would take as long as all the drawing.
-    with styled(size, layout=None) as drawing:
+    with canvas.styled(size, layout=None) as drawing:
         grid = drawing.subplots(
             rows, columns, squeeze=False, sharex=True, sharey=True, gridspec_kw=spaces
         )
         shown = zip(grid.flat, poses, scenes, marks, strict=False)
         for axes, pose, scene, (under, over) in shown:
             if room is not None:
-                frame(axes, scene)
-            draw_marks(axes, under)
+                canvas.frame(axes, scene)
+            canvas.draw_marks(axes, under)
             _draw_pose(axes, pose, stages, factor, scene)
-            draw_marks(axes, over)
+            canvas.draw_marks(axes, over)
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
         for axes in grid.ravel()[len(poses) :]:
@@ -135,17 +114,19 @@ def _legend_of(
 ) -> list[Line2D | Patch]:
     experiment, readings = outcome.config.experiment, outcome.measurement.readings
     handles: list[Line2D | Patch] = [
-        line_of("measured", color=BLACK, marker=".", ls="none", ms=7),
-        *(line_of(label, **STAGE_LINES[kind]) for kind, label, _ in stages),
+        canvas.line_of("measured", color=canvas.BLACK, marker=".", ls="none", ms=7),
+        *(canvas.line_of(label, **canvas.STAGE_LINES[kind]) for kind, label, _ in stages),
     ]
     if experiment.in_space and "clamped" in (experiment.boundary.start, experiment.boundary.end):
-        handles += [line_of(f"clamp's {name}", **STYLES[f"axis-{name}"]) for name in "xyz"]
+        handles += [
+            canvas.line_of(f"clamp's {name}", **canvas.STYLES[f"axis-{name}"]) for name in "xyz"
+        ]
     if experiment.in_space or readings:
-        handles.append(line_of("force on the ends", color=FORCE))
+        handles.append(canvas.line_of("force on the ends", color=canvas.FORCE))
     if readings:
-        handles.append(line_of("force as read", color=BLACK, ls=":"))
+        handles.append(canvas.line_of("force as read", color=canvas.BLACK, ls=":"))
     if any(pose.role == "held_out" for pose in poses):
-        handles.append(Patch(fc="white", ec=HELD_OUT, lw=2, label="held out of the fit"))
+        handles.append(Patch(fc="white", ec=canvas.HELD_OUT, lw=2, label="held out of the fit"))
     return handles
 
 
@@ -167,20 +148,20 @@ def _draw_pose(
         if shape is not None:
             magnified = factor != 1 and len(pose.points)
             curve = beside(pose, shape, factor) if magnified else shape.curve
-            axes.plot(*place(curve).T, **STAGE_LINES[kind])
+            axes.plot(*place(curve).T, **canvas.STAGE_LINES[kind])
             spread = shape.spread if factor == 1 and stage is stages[-1].stage else None
             if spread is not None and spread.ndim == 1:
                 outline = place(band_outline(shape.curve, EDGE * spread))
-                axes.fill(*outline.T, color=STAGE_LINES[kind]["color"], alpha=0.2)
+                axes.fill(*outline.T, color=canvas.STAGE_LINES[kind]["color"], alpha=0.2)
     if len(pose.points):
         shown = pose.points[:: max(1, len(pose.points) // _POINTS)]
-        axes.plot(*place(shown).T, ".", color=BLACK, ms=2.5)
+        axes.plot(*place(shown).T, ".", color=canvas.BLACK, ms=2.5)
     axes.set_aspect("equal")
     title = pose.name
     if last is not None:
         ends = place(last.curve[[0, -1]])
-        axes.plot(*ends[0], "s", color=BLACK, ms=4)
-        axes.plot(*ends[1], "o", color=BLACK, ms=4)
+        axes.plot(*ends[0], "s", color=canvas.BLACK, ms=4)
+        axes.plot(*ends[1], "o", color=canvas.BLACK, ms=4)
     if not len(pose.points):
         title += ": not read"
     elif last is None:
@@ -193,9 +174,9 @@ def _draw_pose(
         title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch; true size"
     axes.set_title(title)
     if pose.role == "held_out":
-        axes.title.set_color(HELD_OUT)
+        axes.title.set_color(canvas.HELD_OUT)
         for spine in axes.spines.values():
-            spine.set(visible=True, color=HELD_OUT, linewidth=2)
+            spine.set(visible=True, color=canvas.HELD_OUT, linewidth=2)
 
 
 def _magnification(stages: Sequence[Compared], size: float) -> int:
@@ -288,23 +269,23 @@ def _arranged(count: int) -> tuple[int, int]:
 def outcome_figure(outcome: Outcome) -> Figure:
     """All poses in one frame: measured points, and the shapes predicted from their ends alone."""
     stage = outcome.stages[-1]
-    with styled((7.0, 5.0)) as drawing:
+    with canvas.styled((7.0, 5.0)) as drawing:
         axes = drawing.subplots()
         scene, _ = scene_of(outcome)
-        draw_marks(axes, scene.ground())
+        canvas.draw_marks(axes, scene.ground())
         for pose in outcome.poses:
-            color = HELD_OUT if pose.role == "held_out" else BLUE
+            color = canvas.HELD_OUT if pose.role == "held_out" else canvas.BLUE
             shape = stage.shapes.get(pose.name)
             if shape is not None:
                 axes.plot(*seen(scene.points(shape.curve)).T, color=color, lw=1.4)
             if len(pose.points):
                 shown = pose.points[:: max(1, len(pose.points) // _POINTS_IN_ONE)]
-                axes.plot(*seen(scene.points(shown)).T, ".", color=BLACK, ms=2.5)
-        axes.plot([], [], ".", color=BLACK, label="measured")
-        axes.plot([], [], color=BLUE, label=label_of(stage, outcome))
+                axes.plot(*seen(scene.points(shown)).T, ".", color=canvas.BLACK, ms=2.5)
+        axes.plot([], [], ".", color=canvas.BLACK, label="measured")
+        axes.plot([], [], color=canvas.BLUE, label=label_of(stage, outcome))
         if any(pose.role == "held_out" for pose in outcome.poses):
-            axes.plot([], [], color=HELD_OUT, label="held out of the fit")
-        frame(axes, scene)
+            axes.plot([], [], color=canvas.HELD_OUT, label="held out of the fit")
+        canvas.frame(axes, scene)
         errors = ", ".join(f"{name} {value}" for name, value in error_rows(outcome)[:2])
         axes.set_title(f"{outcome.config.cable.name}: {errors}")
         drawing.legend(loc="outside lower center", ncols=3)
@@ -318,39 +299,39 @@ def prediction_figure(shape: CableShape) -> Figure:
     largest = max(float(np.linalg.norm(force)) for force in forces.values())
     reach = 0.25 * float(np.ptp(points, axis=0).max()) / max(largest, 1e-12)
     in_space = shape.cable.model.in_space
-    with styled((7.0, 6.0)) as drawing:
+    with canvas.styled((7.0, 6.0)) as drawing:
         axes: Any = drawing.add_subplot(projection="3d" if in_space else None)
         if not in_space:
             band = band_outline(points, shape.band())
-            axes.fill(*band.T, color=BLUE, alpha=0.15, lw=0, label="90 % of next hangings")
-        axes.plot(*points.T, color=BLUE, lw=2.5, label="cable")
+            axes.fill(*band.T, color=canvas.BLUE, alpha=0.15, lw=0, label="90 % of next hangings")
+        axes.plot(*points.T, color=canvas.BLUE, lw=2.5, label="cable")
         if shape.other_side is not None:
             other = shape.other_side.points()
-            axes.plot(*other.T, "--", color=BLUE, lw=1.5, label="on the other side")
+            axes.plot(*other.T, "--", color=canvas.BLUE, lw=1.5, label="on the other side")
         for at, (side, force) in zip((points[0], points[-1]), forces.items(), strict=True):
             if side == "end" and shape.pose.end is None:
                 continue
             marker = "s" if side == "start" else "o"
-            axes.plot(*at[:, None], marker, color=BLACK, ms=7, label=side)
+            axes.plot(*at[:, None], marker, color=canvas.BLACK, ms=7, label=side)
             size = float(np.linalg.norm(force))
             if size <= 1e-3 * largest or largest == 0:
                 continue
-            axes.plot(*arrow(at, reach * force).T, color=VERMILLION, lw=1.8)
+            axes.plot(*arrow(at, reach * force).T, color=canvas.VERMILLION, lw=1.8)
             beyond = at + (1 + _BEYOND) * reach * force
             paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
             number = axes.text(*beyond, f"{size:.3g} N", ha="center", va="center", bbox=paper)
-            number.set_color(VERMILLION)
+            number.set_color(canvas.VERMILLION)
             axes.plot(*beyond[:, None], alpha=0)  # a text does not count for the axes' limits
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.12)
         axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})
-        axes.plot([], [], color=VERMILLION, label="force of the cable on its fixtures")
+        axes.plot([], [], color=canvas.VERMILLION, label="force of the cable on its fixtures")
         drawing.legend(loc="outside lower center", ncols=4)
         state = "stable" if eq.stable else "NOT stable"
         axes.set_title(
             f"energy {eq.energy:.4g} J, smallest bend radius {millimetres(eq.min_bend_radius)}, "
             f"{state}",
-            color=GREY if eq.stable else VERMILLION,
+            color=canvas.GREY if eq.stable else canvas.VERMILLION,
         )
         drawing.suptitle(f"{shape.cable.model.cable.name}: predicted shape", fontsize=12)
     return drawing

@@ -120,7 +120,7 @@ def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
             {
                 "name": row.name,
                 "meaning": meaning(row.name),
-                "score": f"{row.score:,.0f}" if row.score >= 100 else f"{row.score:.2g}",
+                "score": words.score_text(row.score),
                 "share": max(row.score, 0.0) / largest if largest > 0 else 0.0,
                 "p_value": f"{row.p_value:.2g}",
                 "validated": millimetres(row.rmse_cross_validated, NOTHING),

@@ -22,7 +22,6 @@ from dlo_casadi.report.scene import (
     Mark,
     Room,
     Scene,
-    around,
     beside,
     held_places,
     next_marks,
@@ -174,13 +173,8 @@ def pose_pictures(
     stages : sequence of Compared
         Whose predictions are drawn.
     """
-    scenes = scenes_of(config, poses, [item.stage for item in stages])
-    last = {} if not stages else stages[-1].stage.shapes
+    scenes, marks = scenes_of(config, poses, [item.stage for item in stages])
     declared = {pose.name: pose for pose in config.experiment.poses}
-    marks = [
-        around(scene, declared[pose.name], pose.points, last.get(pose.name))
-        for pose, scene in zip(poses, scenes, strict=True)
-    ]
     lines = [pose.points for pose in poses if len(pose.points)]
     lines += [shape.curve for item in stages for shape in item.stage.shapes.values()]
     lines += [mark.points for _, over in marks for mark in over]

@@ -214,21 +214,29 @@ def upright(gravity: Sequence[float]) -> FloatArray:
 
 def scenes_of(
     config: Config, poses: Sequence[PoseInput], stages: Sequence[Stage]
-) -> Sequence[Scene]:
-    """A scene for each pose, all on one scale, in which the last stage's forces can be drawn."""
-    shapes = [shape for stage in stages[-1:] for shape in stage.shapes.values()]
-    if not config.experiment.in_space:
-        read = [force for shape in shapes for _, *pair in _forces_read(shape) for force in pair]
-        return [Board(config.cable.length, _scale(_AT_END * config.cable.length, read))] * len(
-            poses
-        )
-    held = {pose.name: held_places(pose) for pose in config.experiment.poses}
-    drawn = [
-        [pose.points, held[pose.name]]
-        + [stage.shapes[pose.name].curve for stage in stages if pose.name in stage.shapes]
-        for pose in poses
+) -> tuple[Sequence[Scene], list[tuple[list[Mark], list[Mark]]]]:
+    """A scene for each pose, all on one scale, and what stands `around` its cable there.
+
+    The last stage's forces are drawn.
+    """
+    last, length = stages[-1].shapes if stages else {}, config.cable.length
+    declared = {pose.name: pose for pose in config.experiment.poses}
+    scenes: Sequence[Scene]
+    if config.experiment.in_space:
+        drawn = [
+            [pose.points, held_places(declared[pose.name])]
+            + [stage.shapes[pose.name].curve for stage in stages if pose.name in stage.shapes]
+            for pose in poses
+        ]
+        scenes = _rooms(config, drawn, [x for shape in last.values() for x in shape.forces])
+    else:
+        pairs = [pair for shape in last.values() for _, *pair in _forces_read(shape)]
+        board = Board(length, _scale(_AT_END * length, [force for pair in pairs for force in pair]))
+        scenes = [board] * len(poses)
+    return scenes, [
+        around(scene, declared[pose.name], pose.points, last.get(pose.name))
+        for pose, scene in zip(poses, scenes, strict=True)
     ]
-    return _rooms(config, drawn, [force for shape in shapes for force in shape.forces])
 
 
 def held_places(pose: Pose) -> FloatArray:

@@ -7,18 +7,7 @@ import math
 import numpy as np
 
 from dlo_casadi.equilibrium.fitted_cable import CableShape
-from dlo_casadi.report.words import (
-    NOISE_ALONE,
-    ON_BRANCH,
-    compared,
-    cross_validated,
-    directions,
-    label_of,
-    millimetres,
-    plus_minus,
-    predicted_share,
-    vector,
-)
+from dlo_casadi.report import words
 from dlo_casadi.session.outcome import MASS, Outcome, ParameterEstimate
 from dlo_casadi.session.pose_shape import BranchShape
 
@@ -36,7 +25,7 @@ def describe(estimate: ParameterEstimate) -> tuple[str, str, str]:
     if estimate.interval_95 is not None:
         ends = ("unbounded" if x is None else f"{x:.4g}" for x in estimate.interval_95)
         interval = f"{' to '.join(ends)}{unit}"
-    value = plus_minus(estimate.value, estimate.std) + unit
+    value = words.plus_minus(estimate.value, estimate.std) + unit
     return (value, interval, "at a bound" if estimate.at_bound else "")
 
 
@@ -63,7 +52,7 @@ def rest_rows(outcome: Outcome) -> list[Row]:
     rest = outcome.stages[-1].rest_curvature
     if not rest.value.size:
         return []
-    names = [f"rest curvature{name and f' k_{name}'}" for name in directions(outcome)]
+    names = [f"rest curvature{name and f' k_{name}'}" for name in words.directions(outcome)]
     parts = zip(names, np.atleast_2d(rest.value), np.atleast_2d(rest.std), strict=True)
     return [
         (
@@ -89,7 +78,7 @@ def nuisance_rows(outcome: Outcome) -> list[Row]:
         value, unit = fit.value(q.name), _after(q.unit)
         moved = round((value - q.nominal) / tolerance, 1) + 0.0
         remark = f"{moved:+.1f} of its tolerance {tolerance:g}{unit}"
-        rows.append((q.name, plus_minus(value, fit.std(q.name)) + unit, "", remark))
+        rows.append((q.name, words.plus_minus(value, fit.std(q.name)) + unit, "", remark))
     return rows
 
 
@@ -99,7 +88,7 @@ def fixed_rows(outcome: Outcome) -> list[Row]:
     kept = {"length": f"{cable.length:g} m", MASS: f"{cable.mass:g} kg"}
     if MASS in outcome.stages[-1].parameters:
         del kept[MASS]
-    kept["gravity"] = vector(outcome.config.experiment.gravity, "g", "m/s^2")
+    kept["gravity"] = words.vector(outcome.config.experiment.gravity, "g", "m/s^2")
     for q, free in zip(fit.model.parameters, fit.problem.unknowns.free, strict=True):
         if not free:
             kept[q.name] = f"{fit.value(q.name):.4g}{_after(q.unit)}"
@@ -178,39 +167,39 @@ def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
 
     def row(label: str, note: str, fit: float | None, held_out: float | None) -> dict[str, str]:
         known = {"fit": fit, "held_out": held_out, "validated": None}
-        cells = {key: millimetres(x, nothing) for key, x in known.items()}
+        cells = {key: words.millimetres(x, nothing) for key, x in known.items()}
         return {"label": label, "mark": "", "note": note, "chi2": nothing, **cells}
 
-    marks = {stage.name: kind for kind, _, stage in compared(outcome)}
-    validated = cross_validated(outcome)
+    marks = {stage.name: kind for kind, _, stage in words.compared(outcome)}
+    validated = words.cross_validated(outcome)
     rows = []
     for stage in outcome.stages:
-        own = row(label_of(stage, outcome), stage.note, stage.rmse_fit, stage.rmse_held_out)
+        own = row(words.label_of(stage, outcome), stage.note, stage.rmse_fit, stage.rmse_held_out)
         own["mark"] = marks.get(stage.name, "")
-        own["held_out"] += predicted_share(outcome, stage)
-        own["validated"] = millimetres(validated.get(stage.name), nothing)
+        own["held_out"] += words.predicted_share(outcome, stage)
+        own["validated"] = words.millimetres(validated.get(stage.name), nothing)
         if stage.chi2_per_dof is not None:
             own["chi2"] = f"{stage.chi2_per_dof:.3g}"
         rows.append(own)
         if stage.other_branch:
             note = f"poses in another equilibrium: {', '.join(stage.other_branch)}"
             errors = stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch
-            rows.append(row(ON_BRANCH, note, *errors))
+            rows.append(row(words.ON_BRANCH, note, *errors))
     return rows
 
 
 def error_rows(outcome: Outcome) -> list[tuple[str, str]]:
     """RMS distance of the measured points from the last stage's shapes, and by noise alone."""
     stage, m = outcome.stages[-1], outcome.measurement
-    rows = [("error of the fit", millimetres(stage.rmse_fit))]
+    rows = [("error of the fit", words.millimetres(stage.rmse_fit))]
     if stage.rmse_held_out is not None:
-        share = predicted_share(outcome, stage)
-        rows.append(("held out", millimetres(stage.rmse_held_out) + share))
+        share = words.predicted_share(outcome, stage)
+        rows.append(("held out", words.millimetres(stage.rmse_held_out) + share))
     if stage.other_branch:
         both = (stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch)
-        known = (millimetres(value) for value in both if value is not None)
-        rows.append((ON_BRANCH, ", ".join(known)))
-    return [*rows, (f"{NOISE_ALONE} ({m.std_source})", millimetres(m.noise_distance))]
+        known = (words.millimetres(value) for value in both if value is not None)
+        rows.append((words.ON_BRANCH, ", ".join(known)))
+    return [*rows, (f"{words.NOISE_ALONE} ({m.std_source})", words.millimetres(m.noise_distance))]
 
 
 def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
@@ -248,24 +237,24 @@ def prediction_rows(shape: CableShape) -> list[tuple[str, str]]:
         if at is None:
             rows.append((side, "free"))
             continue
-        rows.append((side, vector(at, "g", "m")))
+        rows.append((side, words.vector(at, "g", "m")))
         if math.dist(at, reached) > _SHOWN:
-            place = vector(reached, ".5f", "m")
+            place = words.vector(reached, ".5f", "m")
             rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
-        rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
+        rows.append((f"force of the cable on its {side}", words.vector(force, ".4g", "N")))
         held = (getattr(pose, f"{side}_{key}") for key in ("heading", "orientation"))
         if any(direction is not None for direction in held):
-            said = vector(moment, ".4g", "N m") if np.ndim(moment) else f"{moment:.4g} N m"
+            said = words.vector(moment, ".4g", "N m") if np.ndim(moment) else f"{moment:.4g} N m"
             rows.append((f"moment of the cable on its {side}", said))
     rows.append(("energy", f"{eq.energy:.6g} J"))
-    rows.append(("smallest bend radius", millimetres(eq.min_bend_radius)))
+    rows.append(("smallest bend radius", words.millimetres(eq.min_bend_radius)))
     rows.append(("stable", "yes" if eq.stable else "NO: the cable would not stay there"))
     if other is not None and shape.tipping is not None:
         apart = float(np.linalg.norm(other.points() - points, axis=1).max())
         rows.append(("this side", f"`{_side(shape)}`"))
         text = (
-            f"`{_side(other)}`: {other.equilibrium.energy:.6g} J, up to {millimetres(apart)} away; "
-            f"equally low with the clamp turned by {shape.tipping.angle:.2g} rad (known to "
+            f"`{_side(other)}`: {other.equilibrium.energy:.6g} J, up to {words.millimetres(apart)} "
+            f"away; equally low with the clamp turned by {shape.tipping.angle:.2g} rad (known to "
             f"{shape.tipping.std:.2g} rad)"
         )
         rows.append(("also stable", text))

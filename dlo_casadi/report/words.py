@@ -55,6 +55,11 @@ def vector(components: Iterable[float], form: str, unit: str) -> str:
     return f"({', '.join(format(x, form) for x in components)}) {unit}"
 
 
+def score_text(score: float) -> str:
+    """A candidate's score with two digits, or all before the point."""
+    return f"{score:,.0f}" if score >= 100 else f"{score:.2g}"
+
+
 def plus_minus(value: float, std: float) -> str:
     """A value with the digits that its standard deviation leaves: two of the latter."""
     if not std > 0:

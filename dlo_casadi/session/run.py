@@ -24,17 +24,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess, one_thread
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.fitting import (
-    Minimum,
-    confirmed,
-    declared_model,
-    first_mesh,
-    fit_declared,
-    minimum_by_ipopt,
-    not_worse,
-    reweighted,
-    simpler_fits,
-)
+from dlo_casadi.session import fitting, remarks
 from dlo_casadi.session.measure import calibrated, measured_poses, read_inputs
 from dlo_casadi.session.outcome import (
     Discretization,
@@ -46,15 +36,6 @@ from dlo_casadi.session.outcome import (
     found_effects,
 )
 from dlo_casadi.session.plausibility import without_implausible
-from dlo_casadi.session.remarks import (
-    branch_warnings,
-    doubts_of,
-    fit_warnings,
-    held_out_missing,
-    reading_warnings,
-    weight_warning,
-    worse_than_simpler,
-)
 from dlo_casadi.session.stages import fit_stage, fitted_parameters
 
 
@@ -142,19 +123,19 @@ def fit_session(
     inputs, odd = without_implausible(config, inputs)
     measured = measured_poses(config, inputs)
     clock.lap("vision")
-    warnings = [*config.warnings, *reading_warnings(inputs, config.skipped), *odd]
+    warnings = [*config.warnings, *remarks.reading_warnings(inputs, config.skipped), *odd]
     center = _center(inputs)
     pixels = [item.pixel for item in inputs if item.pixel is not None]
-    declared = declared_model(config, center, float(np.median(pixels)) if pixels else None)
+    declared = fitting.declared_model(config, center, float(np.median(pixels)) if pixels else None)
 
     progress.step("fit the declared model", 0, 1)
-    n, refined = config.model.n or first_mesh(declared.model), None
+    n, refined = config.model.n or fitting.first_mesh(declared.model), None
     if config.estimation.robust:
-        fit, _ = fit_declared(config, declared, measured)
-        measured, n, refined = reweighted(fit), fit.model.n, fit.model.n
-    compared = begin(executor, simpler_fits, config.estimation, declared.model, measured, n)
-    fit, error = fit_declared(config, declared, measured, refined)
-    confirming = begin(executor, minimum_by_ipopt, fit)
+        fit, _ = fitting.fit_declared(config, declared, measured)
+        measured, n, refined = fitting.reweighted(fit), fit.model.n, fit.model.n
+    compared = begin(executor, fitting.simpler_fits, config.estimation, declared.model, measured, n)
+    fit, error = fitting.fit_declared(config, declared, measured, refined)
+    confirming = begin(executor, fitting.minimum_by_ipopt, fit)
     progress.step("fit the declared model", 1, 1)
 
     progress.step("compare with simpler fits", 0, 1)
@@ -172,7 +153,7 @@ def fit_session(
     clock.add("algorithm1", simpler.seconds)
     best = _confirmed(fit, confirming, clock)
     own = own if best.point is fit.point else staged(best)
-    fit = not_worse(best, [*stages, own])
+    fit = fitting.not_worse(best, [*stages, own])
     if not config.diagnosis.enabled:
         fit = as_measured(fit)
     stages = [*stages, own if fit is best else staged(fit)]
@@ -203,17 +184,17 @@ def fit_session(
 def judged(outcome: Outcome) -> Outcome:
     """An outcome with what is said of its fit, and its verdict if that stands."""
     fit, stages = outcome.fit, outcome.stages
-    doubts = doubts_of(stages, outcome.poses, fit)
+    doubts = remarks.doubts_of(stages, outcome.poses, fit)
     declared = outcome.config.experiment.measurement.std
-    said = fit_warnings(fit, outcome.discretization.error, declared)
-    said += worse_than_simpler(stages)
+    said = remarks.fit_warnings(fit, outcome.discretization.error, declared)
+    said += remarks.worse_than_simpler(stages)
     if outcome.hidden_weight is not None:
-        said.append(weight_warning(outcome.hidden_weight, fit.expected_error))
+        said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))
     return replace(
         outcome,
         verdict="unexplained" if outcome.verdict and doubts else outcome.verdict,
         doubts=doubts,
-        warnings=(*outcome.warnings, *said, *branch_warnings(stages)),
+        warnings=(*outcome.warnings, *said, *remarks.branch_warnings(stages)),
     )
 
 
@@ -264,7 +245,7 @@ def close_the_loop(
         error = mesh_error(fit)
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
-    confirming = begin(executor, minimum_by_ipopt, fit) if diagnosis.added else None
+    confirming = begin(executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
     next_pose = separating_pose(diagnosis) if diagnosis.added else None
     if diagnosis.added or diagnosis.unexplained:
         parameters = fitted_parameters(declared, profile_intervals(declared), reported)
@@ -299,11 +280,11 @@ def close_the_loop(
     return fit, error, found
 
 
-def _confirmed(fit: Fit, confirming: Callable[[], Minimum], clock: Clock) -> Fit:
+def _confirmed(fit: Fit, confirming: Callable[[], fitting.Minimum], clock: Clock) -> Fit:
     """A fit held against the minimum that IPOPT has found meanwhile."""
     found = confirming()
     clock.add("batch", found.seconds)
-    return confirmed(fit, found)
+    return fitting.confirmed(fit, found)
 
 
 def versions() -> dict[str, str]:
@@ -342,5 +323,5 @@ def _summary(
         readings=len(readings),
         force_std=noise.force if "force" in kinds else None,
         moment_std=noise.moment if "moment" in kinds else None,
-        held_out_missing=held_out_missing(inputs, config.skipped),
+        held_out_missing=remarks.held_out_missing(inputs, config.skipped),
     )

@@ -51,7 +51,7 @@ def test_an_arrow_ends_at_its_tip():
 
 def test_rooms_hold_their_cables_from_wherever_they_are_seen(in_room):
     stage = in_room.stage("batch")
-    standing = scenes_of(in_room.config, in_room.poses, [stage])
+    standing, _ = scenes_of(in_room.config, in_room.poses, [stage])
     assert len({room.radius for room in standing}) == 1
     for room, pose in zip(standing, in_room.poses, strict=True):
         shape = stage.shapes[pose.name]
