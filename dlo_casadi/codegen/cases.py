@@ -9,9 +9,9 @@ from importlib.resources import files
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.kernels import Kernels, kernels_of
 from dlo_casadi.equilibrium.guesses import resting_headings
 from dlo_casadi.equilibrium.solve import coarse_rest
@@ -19,8 +19,6 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
-
-FloatArray = NDArray[np.floating]
 
 
 def template(name: str) -> str:

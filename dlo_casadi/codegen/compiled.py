@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.shapes import (
     STATUSES,
@@ -32,7 +33,6 @@ from dlo_casadi.equilibrium.pose import Branch, Pose
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
 
-FloatArray = NDArray[np.floating]
 # Poses, or rows of numbers laid out as dlo_pose in the C header.
 Poses = Sequence[Pose] | FloatArray
 

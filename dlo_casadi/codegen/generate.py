@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dlo_casadi import __version__
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.cases import Case, case_of, template
 from dlo_casadi.codegen.kernels import c_number, size_of_code, table_to_c, text_of
 from dlo_casadi.codegen.shapes import records_of
@@ -19,8 +19,6 @@ from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
-
-FloatArray = NDArray[np.floating]
 
 # The way of a path from pose to pose is parted into so many at most, as in the templates.
 FINEST = 4096

@@ -12,15 +12,13 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import SegmentNumbers, lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
-
-FloatArray = NDArray[np.floating]
 
 # Numbers that differ by less come from differences of the same mesh.
 _ROUNDING = 1e-14

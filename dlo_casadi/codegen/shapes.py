@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import EndConditions
 
-FloatArray = NDArray[np.floating]
 Place = tuple[float, ...]
 
 # As in the header.

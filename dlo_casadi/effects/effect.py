@@ -14,8 +14,8 @@ from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.errors import counted
@@ -370,9 +370,7 @@ class Fitted:
             return False
         return place < NEAR_END * length if side == "start" else place > (1 - NEAR_END) * length
 
-    def propagated(
-        self, of: Callable[[Params], ca.SX]
-    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    def propagated(self, of: Callable[[Params], ca.SX]) -> tuple[FloatArray, FloatArray]:
         """Value (k,) of an expression of the parameters, and what each std moves it by (k, n)."""
         names = list(self.values)
         own = ca.SX.sym("own", len(names))

@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.minima import TOLERANCE, descend, stepped
@@ -21,8 +21,6 @@ from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
-
-FloatArray = NDArray[np.floating]
 
 # How far nodes may move from where Newton's method has started [rad].
 REACH = 1.5
@@ -116,7 +114,7 @@ class BatchEquilibrium:
         max_iterations: int = 25,
         tolerance: float = TOLERANCE,
         reach: float = REACH,
-    ) -> tuple[Shapes, NDArray[np.bool_]]:
+    ) -> tuple[Shapes, BoolArray]:
         """Newton's method from nearby shapes, for each pose until it has converged or is lost.
 
         A pose's tangent matrix is kept while its steps shrink fivefold; see `CONTRACTION`.
@@ -175,7 +173,7 @@ class BatchEquilibrium:
 
     def settled(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, **options: Any
-    ) -> tuple[Shapes, NDArray[np.bool_]]:
+    ) -> tuple[Shapes, BoolArray]:
         """As `solve`; in space, poses that are lost go downhill to a minimum from where they were.
 
         Newton's method alone loses a pose of ten wherever frames have far to turn.
@@ -196,8 +194,8 @@ class BatchEquilibrium:
         self,
         here: Shapes,
         given: Inputs,
-        active: NDArray[np.intp],
-        fresh: NDArray[np.bool_],
+        active: IntArray,
+        fresh: BoolArray,
         matrix: BandMatrix | None,
     ) -> tuple[Vector, BandMatrix]:
         """Imbalance of the active poses, and all poses' matrices, of some of them evaluated."""
@@ -211,7 +209,7 @@ class BatchEquilibrium:
         return force, new if matrix is None else matrix.replaced(active[fresh], new)
 
     @staticmethod
-    def _newton(force: Vector, matrix: BandMatrix, active: NDArray[np.intp]) -> Vector:
+    def _newton(force: Vector, matrix: BandMatrix, active: IntArray) -> Vector:
         """Newton step of one column of the active poses; not finite where the shape is not."""
         finite = np.isfinite(matrix.diagonal[active]).all(axis=(1, 2, 3))
         step = Vector(np.full_like(force.x, np.nan), np.full_like(force.y, np.nan))
@@ -364,7 +362,7 @@ class BatchEquilibrium:
         )
         return [Observed(NodeCurve.of(length, z), readings) for z, readings in both]
 
-    def stable(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> NDArray[np.bool_]:
+    def stable(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> BoolArray:
         """Whether each pose is a strict minimum of the energy under its end conditions."""
         _, matrix = self.balance(shapes, p, rest)
         negative = matrix.negative()
@@ -373,9 +371,7 @@ class BatchEquilibrium:
         return np.asarray((negative == self.model.n_multipliers) & free)
 
 
-def _settled(
-    size: FloatArray, last: FloatArray, tolerance: float, fresh: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _settled(size: FloatArray, last: FloatArray, tolerance: float, fresh: BoolArray) -> BoolArray:
     """Whether Newton's method has converged with steps of this size after the last ones.
 
     Steps that shrink quadratically, by fresh matrices, or linearly, by those kept, need no

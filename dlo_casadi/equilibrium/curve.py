@@ -8,11 +8,9 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.equilibrium.pose import Pose
-
-FloatArray = NDArray[np.floating]
 
 _NEWTON_STEPS = 12
 # Polynomial coefficients (powers of u, weights) of the interpolants' derivatives by u.
@@ -78,13 +76,13 @@ class NodeCurve:
     def _table(self) -> FloatArray:
         return _LINEAR if self.slopes is None else _HERMITE
 
-    def _local(self, s: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    def _local(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Element index (K,) and the fraction (K,) of its length at s [m]."""
         u = s * (self.n / self.length)
         e = np.minimum(u.astype(np.intp), self.n - 1)
         return e, u - e
 
-    def weights(self, s: FloatArray, derivative: int = 0) -> tuple[NDArray[np.intp], FloatArray]:
+    def weights(self, s: FloatArray, derivative: int = 0) -> tuple[IntArray, FloatArray]:
         """Element index (K,) and weights (K, 4) of [r_e, r_(e+1), h t_e, h t_(e+1)] at s [m]."""
         e, u = self._local(s)
         h = self.length / self.n

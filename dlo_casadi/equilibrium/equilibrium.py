@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.pose import SIGNS, Branch
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
-
-FloatArray = NDArray[np.floating]
 
 # No joint bends by more than this between neighbouring headings (Eq. 8; joints only).
 JOINT_BOUND = np.pi / 2
@@ -136,8 +134,8 @@ def equilibria_of(
     shapes: Shapes,
     given: Inputs,
     *,
-    stable: NDArray[np.bool_],
-    iterations: NDArray[np.intp],
+    stable: BoolArray,
+    iterations: IntArray,
     bound_multipliers: FloatArray | None = None,
 ) -> list[Equilibrium]:
     """What there is to say of each of m shapes.

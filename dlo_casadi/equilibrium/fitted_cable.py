@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -27,8 +28,6 @@ from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.node import Heading
-
-FloatArray = NDArray[np.floating]
 
 # Arc lengths may miss the cable by so many of its lengths: rounding.
 _ROUNDING = 1e-9

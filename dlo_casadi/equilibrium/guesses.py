@@ -9,16 +9,15 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Frame
 
-FloatArray = NDArray[np.floating]
 Clamps = tuple[FloatArray | None, FloatArray | None]
 Turned = tuple[Rotation | None, Rotation | None]
 

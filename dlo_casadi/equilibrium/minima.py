@@ -23,8 +23,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.equilibrium import (
     BALANCE,
     END_TOLERANCE,
@@ -40,9 +40,6 @@ from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
 from dlo_casadi.rod.node import Node
 from dlo_casadi.runtime.executors import interrupts_held
-
-FloatArray = NDArray[np.floating]
-BoolArray = NDArray[np.bool_]
 
 # Longest step of a node [rad].
 LONGEST_STEP = 0.5
@@ -82,7 +79,7 @@ class Minima:
     balanced: BoolArray
     converged: BoolArray
     energy: FloatArray
-    iterations: NDArray[np.intp]
+    iterations: IntArray
 
 
 def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
@@ -143,7 +140,7 @@ def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFa
     shift = np.where(before > LEAST_SHIFT * scale, before / SHRINKAGE, 0.0)
     unit = np.eye(matrix.diagonal.shape[2])
 
-    def shifted(index: NDArray[np.intp]) -> BandFactor:
+    def shifted(index: IntArray) -> BandFactor:
         part = matrix.subset(index)
         diagonal = part.diagonal + shift[index, None, None, None] * unit
         return replace(part, diagonal=diagonal).factor()

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.rod.node import Frame, Heading, Node, quaternion_product
 
-FloatArray = NDArray[np.floating]
 Branch = Literal["ccw", "cw"]
 # In a session a pose may also continue the one before it, see `solve.continued`.
 PoseBranch = Branch | Literal["previous"]

@@ -7,8 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.equilibrium import (
     JOINT_BOUND,
     NEARBY,
@@ -23,9 +23,6 @@ from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import COARSE_MESH, CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import Frame, Heading
-
-FloatArray = NDArray[np.floating]
-IntArray = NDArray[np.intp]
 
 # Farther no end is moved at once [lengths, rad]: shapes near a fold are followed, not jumped over.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
@@ -325,14 +322,12 @@ def _twists(model: CableModel, twist: FloatArray) -> FloatArray:
     return twist.mean(axis=1) * model.cable.length / (2 * np.pi)
 
 
-def _holds(twist: FloatArray, turns: FloatArray | float) -> NDArray[np.bool_]:
+def _holds(twist: FloatArray, turns: FloatArray | float) -> BoolArray:
     """Whether cables of these twists [turns] hold what was asked for; no turns cannot be shed."""
     return (np.abs(twist - turns) <= MOST_SHED) | (turns == 0)
 
 
-def on_other_side(
-    model: CableModel, pose: Pose, x: FloatArray, others: FloatArray
-) -> NDArray[np.bool_]:
+def on_other_side(model: CableModel, pose: Pose, x: FloatArray, others: FloatArray) -> BoolArray:
     """Whether other shapes (m, n_nodes, coordinates) hang on the other side of a shape.
 
     They turn the other way; between two clamps, whole turns apart, by more than half a turn less

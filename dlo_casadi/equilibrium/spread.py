@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -18,8 +18,6 @@ from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import MODES, RestScatter, modes_of
 from dlo_casadi.thresholds import EITHER
-
-FloatArray = NDArray[np.floating]
 
 # Share of the next hangings inside the band, and the standard deviations to its edges.
 COVERED = 0.9

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet import parquet_library
-
-FloatArray = NDArray[np.floating]
 
 # Columns of a pose, as the compiled solver takes them [m, m, m, m, rad, rad].
 COLUMNS = ("start_x", "start_y", "end_x", "end_y", "start_heading", "end_heading")

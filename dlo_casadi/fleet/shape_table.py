@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi import __version__
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.compiled import Branch, CompiledSolver
 from dlo_casadi.codegen.generate import solver_hash
 from dlo_casadi.codegen.shapes import STATUSES, records_of
@@ -29,7 +30,6 @@ from dlo_casadi.runtime.parallel import Tally, map_as_completed
 if TYPE_CHECKING:
     import pyarrow
 
-FloatArray = NDArray[np.floating]
 
 SCHEMA = "dlo-shapes/1"
 # A process holds the shapes of one chunk at a time, of so many bytes as the solver writes them.

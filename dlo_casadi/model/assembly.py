@@ -13,16 +13,14 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame, Heading
-
-FloatArray = NDArray[np.floating]
 
 _NODES = {node.coordinates: node for node in (Heading, Frame)}
 

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.effects import Cable, Effect, Kinematics, Load, SectionLaw, StateEffect
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
@@ -20,7 +20,6 @@ from dlo_casadi.rod.node import Node
 
 StartKind = Literal["pinned", "clamped"]
 EndKind = Literal["pinned", "clamped", "free"]
-FloatArray = NDArray[np.floating]
 
 BENDING_STIFFNESS = "bending_stiffness"
 # ln(1000): a prior of the stiffness may be off by three decades.
@@ -273,7 +272,7 @@ class CableModel:
         return self.n_conditions + self.node.dimension * self.n_springs
 
     @cached_property
-    def are_multipliers(self) -> NDArray[np.bool_]:
+    def are_multipliers(self) -> BoolArray:
         """Which of the border's unknowns are multipliers (n_border,); the others are places."""
         return np.array([".place_" not in name for name in self.border_names], dtype=bool)
 

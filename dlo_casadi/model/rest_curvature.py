@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
+
+from dlo_casadi.arrays import FloatArray
 
 _DEGREE = 3
 # Cosines of a rest curvature, and its correlation lengths that are tried, shares of L.
@@ -37,13 +38,13 @@ class RestCurvature:
         knots = np.concatenate([[0.0] * degree, inner, [self.length] * degree])
         return BSpline(knots, np.eye(self.n_coefficients), degree)
 
-    def basis(self, s: NDArray[np.floating]) -> NDArray[np.floating]:
+    def basis(self, s: FloatArray) -> FloatArray:
         """Values (len(s), n_coefficients) of the basis functions at arc lengths s [m]."""
         if self.n_coefficients == 0:
             return np.zeros((len(s), 0))
         return self._spline(s)
 
-    def cell_means(self, cells: NDArray[np.floating]) -> NDArray[np.floating]:
+    def cell_means(self, cells: FloatArray) -> FloatArray:
         """Means (n_cells, n_coefficients) of the basis functions over cells (n_cells, 2) [m].
 
         The mean, not the value in the middle, makes int (kappa - kappa_0)^2 ds of a curve of
@@ -55,7 +56,7 @@ class RestCurvature:
         return (primitive(cells[:, 1]) - primitive(cells[:, 0])) / np.diff(cells, axis=1)
 
     @property
-    def roughness(self) -> NDArray[np.floating]:
+    def roughness(self) -> FloatArray:
         """Second differences (n_coefficients - 2, n_coefficients) of the coefficients."""
         return np.diff(np.eye(self.n_coefficients), n=2, axis=0)
 
@@ -79,13 +80,13 @@ class RestScatter:
     dof: float = np.inf
 
     @property
-    def sizes(self) -> NDArray[np.floating]:
+    def sizes(self) -> FloatArray:
         """Standard deviation (MODES,) [1/m] of each mode's coefficient."""
         share = np.exp(-((np.arange(MODES) * np.pi * self.smoothness) ** 2) / 2)
         return self.std * np.sqrt(share / share.sum())
 
 
-def modes_of(cells: NDArray[np.floating], length: float) -> NDArray[np.floating]:
+def modes_of(cells: FloatArray, length: float) -> FloatArray:
     """Means of the modes f_k over cells (n_cells, 2) [m]: (n_cells, MODES)."""
     k = np.arange(1, MODES)
     primitive = np.sin(np.pi / length * np.multiply.outer(cells, k)) * length / (k * np.pi)

@@ -24,9 +24,9 @@ from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.effects import Cable
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import arc_headings
@@ -38,9 +38,6 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-
-FloatArray = NDArray[np.floating]
-BoolArray = NDArray[np.bool_]
 
 # Iterations in a row in which alpha must not change, the paper asks for several; and the largest
 # change of ln(k_theta) and of theta_0 [rad] that counts as none.
@@ -136,7 +133,7 @@ class Target:
         wide = np.hypot(*np.diff(line, axis=0).T) > gap
         return cls(line[1:-1], wide[:-1] | wide[1:], line[-1])
 
-    def nearest(self, nodes: FloatArray) -> tuple[NDArray[np.intp], BoolArray]:
+    def nearest(self, nodes: FloatArray) -> tuple[IntArray, BoolArray]:
         """Index of the nearest point of each node, and whether the node is in view.
 
         A node whose nearest point lies beside a gap is in the gap and is left out of r_p.
@@ -219,7 +216,7 @@ class InnerProblem:
         Headings (n,) [rad], and whether IPOPT converged.
         """
         bound = np.concatenate([np.zeros(2), np.full(self.chain.n - 1, JOINT_BOUND)])
-        chosen: tuple[NDArray[np.intp], BoolArray] | None = None
+        chosen: tuple[IntArray, BoolArray] | None = None
         for _ in range(ASSIGNMENTS):
             index, seen = target.nearest(self.nodes(phi)[1:-1])
             if chosen is not None and all(map(np.array_equal, chosen, (index, seen))):

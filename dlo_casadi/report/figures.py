@@ -291,8 +291,8 @@ def rest_curvature_figure(outcome: Outcome) -> Figure:
                 axes.plot(rest.s, value, **canvas.STAGE_LINES[kind], label=label)
                 if kind == "after":
                     low, high = value - NORMAL_95 * std, value + NORMAL_95 * std
-                    look = {"color": canvas.BLUE, "label": "its 95 % band"}
-                    axes.fill_between(rest.s, low, high, alpha=0.2, lw=0, **look)
+                    band = axes.fill_between(rest.s, low, high, color=canvas.BLUE, alpha=0.2, lw=0)
+                    band.set_label("its 95 % band")
             axes.axhline(0, color=canvas.GREY, lw=0.8)
             about = direction and f" k_{direction}"
             axes.set(xlim=(0, outcome.config.cable.length), ylabel=f"rest curvature{about} [1/m]")

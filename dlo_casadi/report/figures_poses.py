@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.equilibrium.spread import EDGE
 from dlo_casadi.report import canvas
@@ -30,8 +31,6 @@ from dlo_casadi.report.scene import (
 from dlo_casadi.report.tables import error_rows
 from dlo_casadi.report.words import Compared, compared, label_of, millimetres
 from dlo_casadi.session.outcome import Outcome, PoseInput
-
-FloatArray = NDArray[np.floating]
 
 _POSES_A_PAGE = 20
 # Points of a measured line that are drawn, about: on a page of poses, with all poses in one frame.

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.errors import counted
@@ -36,7 +36,6 @@ from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput
 from dlo_casadi.session.pose_shape import PoseShape
 from dlo_casadi.vision import nearest_in_order
 
-FloatArray = NDArray[np.floating]
 Box = tuple[float, float, float, float]  # left, top, width, height
 
 # Of a part of a photograph about the cable: its sides over those of the cable.
@@ -385,7 +384,7 @@ def _view_picture(
     )
 
 
-def _nearest(pixels: FloatArray, curve: FloatArray) -> NDArray[np.intp]:
+def _nearest(pixels: FloatArray, curve: FloatArray) -> IntArray:
     """Points (K,) of a projected curve (M, 2) [px] beside the pixels (K, 2), in order."""
     away = np.linalg.norm(pixels[:, None] - curve[None], axis=2)
     nearest = away.min(axis=1)

@@ -8,9 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, dump_yaml
 from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.equilibrium.fitted_cable import FittedCable
@@ -20,8 +18,6 @@ from dlo_casadi.io.parameters import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.report.json_report import fields_of, finite
 from dlo_casadi.session.outcome import Outcome
-
-FloatArray = NDArray[np.floating]
 
 
 def parameters_text(outcome: Outcome) -> str:

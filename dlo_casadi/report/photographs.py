@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from PIL import Image
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.report.canvas import STAGE_LINES, styled
@@ -120,7 +121,7 @@ def _draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome
 
 
 def _window(
-    image: NDArray[np.uint8], lines: Sequence[NDArray[np.floating]]
+    image: NDArray[np.uint8], lines: Sequence[FloatArray]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
     """Corners (left, top), (right, bottom) [px] of a window about all lines, with a margin."""
     size = np.array([image.shape[1], image.shape[0]])

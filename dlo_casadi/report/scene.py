@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from math import cos, radians, sin
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.session.pose_shape import PoseShape
-
-FloatArray = NDArray[np.floating]
 
 # From where a room is seen: name, azimuth and elevation [degrees]. The first one is shown at first.
 VIEWS = (

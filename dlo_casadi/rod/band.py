@@ -19,10 +19,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.floating]
-BoolArray = NDArray[np.bool_]
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 
 # Smallest pivot, relative to the largest entry; a smaller one is shifted by this. The square root
 # of rounding: half of the digits are lost, and one step of refinement restores them.
@@ -120,11 +118,11 @@ class BandMatrix:
     def _parts(self) -> tuple[FloatArray, ...]:
         return self.diagonal, self.upper, self.border, self.corner
 
-    def subset(self, index: NDArray[np.intp] | BoolArray) -> BandMatrix:
+    def subset(self, index: IntArray | BoolArray) -> BandMatrix:
         """Matrices of some of the poses."""
         return BandMatrix(*(part[index] for part in self._parts))
 
-    def replaced(self, index: NDArray[np.intp], other: BandMatrix) -> BandMatrix:
+    def replaced(self, index: IntArray, other: BandMatrix) -> BandMatrix:
         """Matrices of all poses, those of some taken from `other`."""
         parts = [part.copy() for part in self._parts]
         for part, new in zip(parts, other._parts, strict=True):
@@ -187,7 +185,7 @@ class BandMatrix:
         """Eliminate the nodes."""
         return BandFactor(self)
 
-    def negative(self) -> NDArray[np.intp]:
+    def negative(self) -> IntArray:
         """Number of negative eigenvalues of each matrix (m,), border included.
 
         Eigenvalues of A that are zero to rounding count as negative, so that a neutral shape is
@@ -291,7 +289,7 @@ class BandFactor:
         return found
 
     @cached_property
-    def negative(self) -> NDArray[np.intp]:
+    def negative(self) -> IntArray:
         """Number of negative eigenvalues (m,), see `BandMatrix.negative`; without its shift."""
         total = np.zeros(len(self.schur), dtype=np.intp)
         singular = np.zeros(len(self.schur), dtype=bool)

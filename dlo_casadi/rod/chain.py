@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.rod.element import Element, Layout
 from dlo_casadi.rod.elements import Arc, Helix, Link, Quadratic, QuadraticHelix
-
-FloatArray = NDArray[np.floating]
 
 ELEMENTS: dict[str, Element] = {element.name: element for element in (Quadratic(), Arc(), Link())}
 ELEMENTS_IN_SPACE: dict[str, Element] = {kind.name: kind for kind in (QuadraticHelix(), Helix())}
@@ -96,7 +94,7 @@ class Chain:
         return self.n_cells * len(self.kind.node.strains)
 
     @cached_property
-    def rest_stencils(self) -> tuple[NDArray[np.intp], FloatArray]:
+    def rest_stencils(self) -> tuple[IntArray, FloatArray]:
         """Cells (n_segments, 3) that determine the rest curvature inside a segment, with weights.
 
         The weights are (n_segments, 3, 3). From means m over a cell and its neighbours, |x| <= 1/2,

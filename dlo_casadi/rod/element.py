@@ -14,11 +14,9 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.rod.node import Node
-
-FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -106,10 +104,10 @@ class Layout:
 
     nodes: FloatArray
     segments: FloatArray
-    stations: NDArray[np.intp]
+    stations: IntArray
 
     @cached_property
-    def bends(self) -> NDArray[np.intp]:
+    def bends(self) -> IntArray:
         """Segments that have a bending cell, in order."""
         return np.flatnonzero(self.segments[:, 4])
 
@@ -120,7 +118,7 @@ class Layout:
         return np.stack([low, low + width], axis=1)
 
     @cached_property
-    def advancing(self) -> NDArray[np.intp]:
+    def advancing(self) -> IntArray:
         """Segments whose ends are element boundaries, in order (n,)."""
         return np.flatnonzero(self.segments[:, 1])
 

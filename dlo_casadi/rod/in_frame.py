@@ -25,14 +25,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.rod.element import Element
 from dlo_casadi.rod.elements import inverse_of
 from dlo_casadi.rod.node import conjugate, quaternion_product
-
-FloatArray = NDArray[np.floating]
 
 # (rotation vector phi (3,), internal unknowns, forces (3, m) [N]) -> energy of a segment [J].
 Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]

@@ -9,10 +9,9 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-FloatArray = NDArray[np.floating]
+from dlo_casadi.arrays import FloatArray
 
 _CASADI = (ca.SX, ca.MX, ca.DM)
 

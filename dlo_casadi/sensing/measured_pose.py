@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench, line_or_markers
-
-FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class MeasuredPose:
         return len(self.kinds)
 
     @cached_property
-    def point_of(self) -> NDArray[np.intp]:
+    def point_of(self) -> IntArray:
         """Index of the point to which each residual of points belongs: they come first."""
         per_point = [np.full(len(x.points), x.per_point) for x in self.sensors]
         return np.repeat(np.arange(len(self.points)), np.concatenate(per_point))
@@ -120,7 +119,7 @@ class MeasuredPose:
         return np.concatenate([sensor.kinds for sensor in self.sensors])
 
     @property
-    def on_points(self) -> NDArray[np.bool_]:
+    def on_points(self) -> BoolArray:
         """Which residuals (R,) are of points; the others are of readings."""
         return np.asarray(self.kinds == "point")
 

@@ -20,7 +20,8 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dtrtrs
 from scipy.optimize import minimize
 
-FloatArray = NDArray[np.floating]
+from dlo_casadi.arrays import FloatArray
+
 Kernel = Literal["exponential", "matern", "gaussian"]
 Count = FloatArray | float
 Source = Literal["declared", "repeats", "estimated", "misfit"]

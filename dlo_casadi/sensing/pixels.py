@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Sensor
 from dlo_casadi.vision import ImageCurve, Viewpoint, compare_pixels, nearest_in_order
-
-FloatArray = NDArray[np.floating]
 
 _SETTLED = 1e-5  # of the length: a residual feels half the bend times the square of that
 # Standard deviations of the average along the cable. On rendered photographs pixels are 0.014 px

@@ -14,13 +14,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange, chord_places
 from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.node import Node
 from dlo_casadi.sensing.noise import Count, NoiseModel
-
-FloatArray = NDArray[np.floating]
 
 
 class Sensor(ABC):

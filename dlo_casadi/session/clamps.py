@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.errors import counted
 from dlo_casadi.session.hypotheses import (
@@ -31,8 +31,6 @@ from dlo_casadi.thresholds import (
     READ_OTHERWISE,
     READ_SCALE,
 )
-
-FloatArray = NDArray[np.floating]
 
 # A full turn [rad], as somebody may round it; beyond it the line itself must turn so far.
 _TURN = 6.3

@@ -11,10 +11,10 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.errors import counted
 from dlo_casadi.session.hypotheses import (
     Hypothesis,
@@ -37,8 +37,6 @@ from dlo_casadi.thresholds import (
     STRETCHED,
     TOO_LONG,
 )
-
-FloatArray = NDArray[np.floating]
 
 UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
 # A rotation so near to exchanged axes is told by their names [rad].
@@ -253,7 +251,7 @@ def single_poses(session: Session) -> tuple[Suspicion, ...]:
     turned = ~near[:, 0] & near[:, 1]
     if len(ends) < 4 or near[:, 0].sum() < 3 * turned.sum():
         turned = np.zeros(len(ends), dtype=bool)
-    reasons: list[tuple[NDArray[np.bool_], Callable[[int], str]]] = [
+    reasons: list[tuple[BoolArray, Callable[[int], str]]] = [
         (
             lines.lengths > TOO_LONG * lines.length,
             lambda i: (

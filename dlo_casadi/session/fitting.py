@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, EstimationOptions, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
 from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
@@ -59,7 +59,7 @@ class Declared:
     """
 
     model: CableModel
-    start: NDArray[np.floating]
+    start: FloatArray
     free: list[str]
     tolerances: Tolerances
 

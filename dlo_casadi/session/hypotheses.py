@@ -9,9 +9,9 @@ from itertools import permutations, product
 from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.session.measure import line_without_end
 from dlo_casadi.session.outcome import PoseInput
@@ -21,7 +21,6 @@ from dlo_casadi.thresholds import (
     OUT_OF_STEP,
 )
 
-FloatArray = NDArray[np.floating]
 T = TypeVar("T")
 
 # Usual words for axes in a plane that are exchanged: measured x, y read as.
@@ -184,7 +183,7 @@ class Lines:
     lengths: FloatArray
     length: float
     gaps: FloatArray
-    known: NDArray[np.bool_]
+    known: BoolArray
 
     def misfit(self, measured: FloatArray, declared: FloatArray) -> FloatArray:
         """Distance of ends from fixtures over the length: the better order, RMS over both.
@@ -262,7 +261,7 @@ def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, Float
     )
 
 
-def spread(count: int, most: int) -> NDArray[np.intp]:
+def spread(count: int, most: int) -> IntArray:
     """Indices of at most so many of `count`, evenly picked, both ends among them."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(int)
 

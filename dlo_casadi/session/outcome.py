@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import Diagnosis, Verdict
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, NextPose
@@ -23,7 +23,6 @@ from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 from dlo_casadi.thresholds import DIFFERENT
 
-FloatArray = NDArray[np.floating]
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
 # Name of the cable's mass among a stage's parameters.
 MASS = "mass"

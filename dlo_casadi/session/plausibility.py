@@ -13,8 +13,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.errors import EstimationError, MeasurementError, counted
 from dlo_casadi.estimation.fit import fit_model
@@ -46,8 +46,6 @@ from dlo_casadi.thresholds import (
     MUCH_BETTER,
     UNEXPLAINED,
 )
-
-FloatArray = NDArray[np.floating]
 
 NEVERTHELESS = (
     "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless."

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.pose import PoseBranch
 from dlo_casadi.equilibrium.spread import COVERED, Tipping
-
-FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,7 @@ class PoseShape:
     expected: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
 
-    def inside_band(self, length: float, noise: float) -> NDArray[np.bool_]:
+    def inside_band(self, length: float, noise: float) -> BoolArray:
         """Whether each measured point (K,) lies in its 90 % band, noise included."""
         assert self.spread is not None
         places = np.linspace(0.0, length, len(self.spread))

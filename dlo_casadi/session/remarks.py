@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight
 from dlo_casadi.diagnosis.structure import alike, limiting_spread
@@ -18,8 +18,6 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
 from dlo_casadi.thresholds import FIXTURES, UNSEEN
-
-FloatArray = NDArray[np.floating]
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:

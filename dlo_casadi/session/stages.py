@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import (
@@ -42,8 +42,6 @@ from dlo_casadi.session.outcome import (
 )
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, UNSEEN
-
-FloatArray = NDArray[np.floating]
 
 _CURVE_POINTS = 201
 _REST_POINTS = 41

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import VisionError
 
 Array = NDArray[np.float64]
@@ -126,7 +127,7 @@ class View(Photograph):
         return float(np.sqrt(4.0 / area))
 
 
-def _apply(homography: NDArray[np.floating], points: Array) -> Array:
+def _apply(homography: FloatArray, points: Array) -> Array:
     mapped = points @ homography[:, :2].T + homography[:, 2]
     return mapped[:, :2] / mapped[:, 2:]
 

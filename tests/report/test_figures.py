@@ -216,7 +216,9 @@ def with_readings(outcome):
 @pytest.mark.parametrize("count", [1, 8, 21])
 def test_all_names_lie_on_the_page(outcome, tmp_path, monkeypatch, count, size):
     pages = []
-    monkeypatch.setattr(figures_poses.canvas, "save_figure", lambda path, drawing: pages.append(drawing))
+    monkeypatch.setattr(
+        figures_poses.canvas, "save_figure", lambda path, drawing: pages.append(drawing)
+    )
     pose = replace(outcome.poses[0], points=size * outcome.poses[0].points)
     shape = outcome.stages[-1].shapes[pose.name]
     shapes = {pose.name: replace(shape, curve=size * shape.curve)}

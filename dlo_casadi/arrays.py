@@ -1,0 +1,10 @@
+"""Types of arrays: of real numbers, of yes or no, of indices."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.floating]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
