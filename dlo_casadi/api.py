@@ -8,8 +8,6 @@ result.plot().savefig("poses.png")
 result.predict(end=(0.3, -0.1)).points()
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor

@@ -1,7 +1,5 @@
 """Types of arrays: of real numbers, of yes or no, of indices."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

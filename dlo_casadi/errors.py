@@ -1,7 +1,5 @@
 """Errors that the package raises: what happened, with numbers, and what to try."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ Numbers that only steer a search (trial places, steps, meshes) stand beside that
 the noise model in `estimation`. "Measured" means on the sessions of tests/data, by this program.
 """
 
-from __future__ import annotations
-
 # ---- score tests -------------------------------------------------------------------------------
 
 # Probability of a false alarm in a complete model, over all candidates: one session in 200.

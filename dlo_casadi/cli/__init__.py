@@ -3,8 +3,6 @@
 Exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`dlo check`, `dlo calibrate`: what a configuration and its files hold, without fitting."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`dlo reproduce`, `dlo benchmark`: scripts of a checkout, no part of the installed package."""
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

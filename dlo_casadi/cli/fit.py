@@ -1,7 +1,5 @@
 """`dlo fit`, `dlo diagnose`, `dlo fit-many`: from configurations to results."""
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import os

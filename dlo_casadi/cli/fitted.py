@@ -1,7 +1,5 @@
 """`dlo predict`, `dlo shape-table`, `dlo generate-solver`: what a fitted cable is used for."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

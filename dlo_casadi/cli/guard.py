@@ -1,7 +1,5 @@
 """What goes wrong becomes a message and an exit code."""
 
-from __future__ import annotations
-
 import errno
 import io
 import signal

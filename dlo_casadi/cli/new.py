@@ -1,7 +1,5 @@
 """`dlo new`, `dlo schema`: a configuration to start from, and what editors know of it."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

@@ -1,7 +1,5 @@
 """What the subcommands share: their options, the look of their help, and where they print."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """How far a run has come: live on a terminal, line by line elsewhere."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field

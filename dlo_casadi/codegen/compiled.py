@@ -1,7 +1,5 @@
 """CompiledSolver: the generated C solver, compiled and called from Python."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shutil

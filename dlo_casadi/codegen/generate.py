@@ -1,7 +1,5 @@
 """Write the C solver of a model: fill the templates."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

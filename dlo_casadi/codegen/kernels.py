@@ -1,7 +1,5 @@
 """C text of the model's segments: CasADi prints the very functions that all else differentiates."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the compiled solver takes and returns, and how the structures of its C lie in memory."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple

@@ -1,12 +1,10 @@
 """YAML text <-> plain data. The only module that imports yaml."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -80,21 +78,14 @@ _FLOAT = re.compile(
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
 )
 _INT = re.compile(r"^[-+]?[0-9]+$")
+_REPLACED = ("int", "float", "timestamp")
 
 
-def _with_numbers_of_yaml_1_2(resolver: type[yaml.resolver.BaseResolver]) -> None:
-    """Let 1e-3 be a number, 012 twelve, 1:30 and 2024-01-01 text."""
-    replaced = [f"tag:yaml.org,2002:{kind}" for kind in ("int", "float", "timestamp")]
-    resolver.yaml_implicit_resolvers = {
-        first: [(tag, pattern) for tag, pattern in known if tag not in replaced]
-        for first, known in resolver.yaml_implicit_resolvers.items()
-    }
-    resolver.add_implicit_resolver("tag:yaml.org,2002:int", _INT, list("-+0123456789"))
-    resolver.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
+_TAG = "tag:yaml.org,2002:"
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with the numbers of YAML 1.2."""
+    """SafeLoader with the numbers of YAML 1.2: 1e-3 is one, 012 twelve, 1:30, 2024-01-01 text."""
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
@@ -120,9 +111,14 @@ def _float(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> float:
     return float(re.sub(r"\.(?=inf|nan)", "", loader.construct_scalar(node).lower()))
 
 
-_with_numbers_of_yaml_1_2(_Loader)
-_Loader.add_constructor("tag:yaml.org,2002:int", _int)
-_Loader.add_constructor("tag:yaml.org,2002:float", _float)
+_Loader.yaml_implicit_resolvers = {
+    first: [item for item in known if item[0].removeprefix(_TAG) not in _REPLACED]
+    for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(f"{_TAG}int", _INT, list("-+0123456789"))
+_Loader.add_implicit_resolver(f"{_TAG}float", _FLOAT, list("-+.0123456789"))
+_Loader.add_constructor(f"{_TAG}int", _int)
+_Loader.add_constructor(f"{_TAG}float", _float)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -132,7 +128,7 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
+_Dumper.add_implicit_resolver(f"{_TAG}float", _FLOAT, list("-+.0123456789"))
 
 
 @dataclass(frozen=True)
@@ -144,7 +140,7 @@ class Document:
     data: Any
 
     @classmethod
-    def read(cls, source: Path) -> Document:
+    def read(cls, source: Path) -> Self:
         """Read a file, or raise a ConfigError."""
         text = _read_bytes(source)
         try:

@@ -1,7 +1,5 @@
 """A YAML file -> a checked configuration; checks that concern several sections."""
 
-from __future__ import annotations
-
 import difflib
 import math
 import stat

@@ -1,10 +1,8 @@
 """How was measured: camera, board or reference, noise and tolerances."""
 
-from __future__ import annotations
-
 import itertools
 import math
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
@@ -159,7 +157,7 @@ class Images(Measurement):
     """Two known points; or give board."""
 
     @model_validator(mode="after")
-    def _one_frame(self) -> Images:
+    def _one_frame(self) -> Self:
         if (self.board is None) == (self.reference is None):
             found = "neither" if self.board is None else "both"
             raise ValueError(f"kind: images needs either a board or a reference, found {found}")

@@ -1,7 +1,5 @@
 """What is wrong with a file, and how to say it: place, reason, and what to try."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable, Iterator, Sequence

@@ -3,14 +3,12 @@
 How was measured is in `measuring`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
@@ -85,7 +83,7 @@ class Cable(Section):
         return self.torsional_stiffness or self.prior_bending_stiffness / 1.3
 
     @model_validator(mode="after")
-    def _plausible(self) -> Cable:
+    def _plausible(self) -> Self:
         declared, young = self.bending_stiffness, self.youngs_modulus
         problems = implausible_sizes(self.length, self.prior_mass, self.diameter)
         if declared is not None and (wrong := STIFFNESS.complaint(declared)):
@@ -208,7 +206,7 @@ class Pose(Section):
         return files
 
     @model_validator(mode="after")
-    def _shown(self) -> Pose:
+    def _shown(self) -> Self:
         if self.file is None and not self.files:
             raise ValueError(
                 "'file' is missing: a photograph or CSV; or files: [a.jpg, b.jpg] of photographs"
@@ -251,12 +249,10 @@ class EffectParameter(Section):
     """Whether the value is kept; otherwise it is where the fit starts."""
 
 
-def _as_parameter(value: object) -> object:
-    return {"value": value} if not isinstance(value, Mapping | EffectParameter) else value
-
-
-def _as_effect(value: object) -> object:
-    return {"name": value} if isinstance(value, str) else value
+_as_parameter = BeforeValidator(
+    lambda value: value if isinstance(value, Mapping | EffectParameter) else {"value": value},
+    json_schema_input_type=float | EffectParameter,
+)
 
 
 class DeclaredEffect(Section):
@@ -264,14 +260,14 @@ class DeclaredEffect(Section):
 
     name: str
     """Name of the effect, such as lumped_mass."""
-    parameters: dict[
-        str,
-        Annotated[
-            EffectParameter,
-            BeforeValidator(_as_parameter, json_schema_input_type=float | EffectParameter),
-        ],
-    ] = Field(default={})
+    parameters: dict[str, Annotated[EffectParameter, _as_parameter]] = Field(default={})
     """Initial guess of each parameter by its name; {value: ..., fixed: true} keeps a value."""
+
+
+_as_effect = BeforeValidator(
+    lambda value: {"name": value} if isinstance(value, str) else value,
+    json_schema_input_type=str | DeclaredEffect,
+)
 
 
 class ModelOptions(Section):
@@ -282,13 +278,7 @@ class ModelOptions(Section):
     element: ElementName = "quadratic"
     """quadratic (curvature changes in an element: fourth order), arc (it is constant: second
     order, five times cheaper) or link (straight, as in the paper; in a plane only)."""
-    effects: tuple[
-        Annotated[
-            DeclaredEffect,
-            BeforeValidator(_as_effect, json_schema_input_type=str | DeclaredEffect),
-        ],
-        ...,
-    ] = ()
+    effects: tuple[Annotated[DeclaredEffect, _as_effect], ...] = ()
     """Effects beside bending and weight."""
 
 

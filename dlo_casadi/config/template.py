@@ -1,7 +1,5 @@
 """What helps to write a configuration: a commented one to start from, a schema for editors."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from importlib.resources import files as folder_of

@@ -5,8 +5,6 @@ with the range that is allowed. What can be computed but is hardly meant is a wa
 `load_config`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, TypeAlias
@@ -125,6 +123,18 @@ def implausible_quaternion(values: Sequence[float]) -> str:
 # ---- types -------------------------------------------------------------------------------------
 
 
+class Section(BaseModel):
+    """A frozen mapping of the file: unknown keys are errors, the docstring of a key is its help."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class OpenSection(Section):
+    """A section in which other keys may stand beside those that are read."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
 def optional(section: type[Section]) -> BeforeValidator:
     """Let a section be empty: `model:` with nothing behind it."""
     return BeforeValidator(
@@ -214,15 +224,3 @@ Quaternion = Annotated[
     _listed("a quaternion [qx, qy, qz, qw] belongs here", _Four, 4),
     checked(implausible_quaternion),
 ]
-
-
-class Section(BaseModel):
-    """A frozen mapping of the file: unknown keys are errors, the docstring of a key is its help."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
-
-
-class OpenSection(Section):
-    """A section in which other keys may stand beside those that are read."""
-
-    model_config = ConfigDict(extra="ignore")

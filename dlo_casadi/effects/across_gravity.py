@@ -1,7 +1,5 @@
 """What acts across gravity: a uniform load, and gravity turned against the measurement's frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

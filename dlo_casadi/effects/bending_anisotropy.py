@@ -1,7 +1,5 @@
 """A section that bends more easily about one axis than about another."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import atan2, copysign, hypot, pi
 

@@ -1,7 +1,5 @@
 """A section that yields as it is bent: strands that slip."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import casadi as ca

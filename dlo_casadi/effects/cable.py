@@ -1,7 +1,5 @@
 """What is declared of a cable, and the parameters of its models."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf, isfinite, pi

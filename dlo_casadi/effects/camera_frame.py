@@ -1,7 +1,5 @@
 """A camera whose frame is not quite where the robot's is."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Clamps that hold the cable in another direction than declared, or that give way."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self

@@ -1,7 +1,5 @@
 """Where a camera sees an edge depends a little on the edge's direction."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """An end fixture that is not where it is declared to be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import ClassVar
 

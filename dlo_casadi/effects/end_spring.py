@@ -1,7 +1,5 @@
 """A pin that holds the cable's direction."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import casadi as ca

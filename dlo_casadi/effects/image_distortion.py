@@ -1,7 +1,5 @@
 """A lens that is not quite as calibrated."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

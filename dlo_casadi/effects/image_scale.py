@@ -1,7 +1,5 @@
 """A ruler that is off."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """A cable that is longer or shorter than declared, or that stretches."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import casadi as ca

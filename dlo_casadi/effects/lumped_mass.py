@@ -1,7 +1,5 @@
 """A compact mass carried by the cable."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

@@ -1,7 +1,5 @@
 """A cable that is heavier or lighter than declared."""
 
-from __future__ import annotations
-
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable, Parameter

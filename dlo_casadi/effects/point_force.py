@@ -1,7 +1,5 @@
 """Forces at one place of the cable: a constant one, and one that is free in every pose."""
 
-from __future__ import annotations
-
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable, Parameter

@@ -1,7 +1,5 @@
 """A cable that takes a set: with every bend, or where it is bent sharply."""
 
-from __future__ import annotations
-
 import casadi as ca
 
 from dlo_casadi.effects.cable import Cable, Parameter

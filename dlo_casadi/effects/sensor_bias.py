@@ -1,7 +1,5 @@
 """Sensors on the fixtures that do not show nothing where nothing pulls."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self

@@ -1,7 +1,5 @@
 """What effects are told: how a cable is held and measured."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """A cable that is not as far in front of the board as declared."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """A stiffness that changes along the cable: evenly, or within a stretch of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """A spring from the cable to a fixed point."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

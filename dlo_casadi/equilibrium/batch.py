@@ -5,8 +5,6 @@ step eliminates all poses' band matrices together and passes changes of the rest
 order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

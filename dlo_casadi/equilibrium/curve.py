@@ -1,7 +1,5 @@
 """A curve through nodes, where points are closest to it, and what sensors see of a pose."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

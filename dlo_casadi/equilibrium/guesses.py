@@ -3,8 +3,6 @@
 The generated solver tries the same ones, number for number: codegen/templates/*_guesses.c.in.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

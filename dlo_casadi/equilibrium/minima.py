@@ -15,8 +15,6 @@ References
 Inertia-corrected Newton steps: Nocedal and Wright, Numerical Optimization, 2006, section 18.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Equilibria of poses: minima of the energy under the end conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

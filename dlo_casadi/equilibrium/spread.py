@@ -1,7 +1,5 @@
 """How far the next hanging of a pose may lie from its prediction, and on which side."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

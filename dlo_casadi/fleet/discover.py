@@ -1,7 +1,5 @@
 """Which sessions a folder or a pattern holds."""
 
-from __future__ import annotations
-
 import glob
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Fit all sessions that are not fitted yet, and fold what is done into table and page."""
 
-from __future__ import annotations
-
 import time
 import traceback
 from collections.abc import Callable, Sequence

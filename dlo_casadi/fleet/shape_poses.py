@@ -1,7 +1,5 @@
 """Poses to solve: a grid or a list, handed out in chunks and never held as a whole."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

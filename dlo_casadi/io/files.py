@@ -4,8 +4,6 @@ All that the package writes goes through here, so that it fails in one way: the 
 as it was, no draft is left, and the error names the place, the system's reason and a remedy.
 """
 
-from __future__ import annotations
-
 import os
 import secrets
 import shutil

@@ -4,8 +4,6 @@ Prediction, code generation and comparisons of cables read nothing else. Its tex
 `report.parameters_text`.
 """
 
-from __future__ import annotations
-
 import difflib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """CableModel: a cable, its mesh, boundaries and effects; and how well declared values are known."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property

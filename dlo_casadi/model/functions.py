@@ -4,8 +4,6 @@ Every stage differentiates the same expressions, see `lagrangian`; the functions
 cable, see `assembly`.
 """
 
-from __future__ import annotations
-
 from functools import cached_property, lru_cache
 
 import casadi as ca

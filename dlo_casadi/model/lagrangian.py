@@ -6,8 +6,6 @@ with the energy of bending, weight and loads and the end conditions times their 
 equilibrium is a stationary point.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from math import prod

@@ -1,7 +1,5 @@
 """Rest curvature: its basis of B-splines, and how it differs from pose to pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

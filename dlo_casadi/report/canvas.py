@@ -1,7 +1,5 @@
 """Figures without a screen: what all share, and how one becomes a file or a part of a page."""
 
-from __future__ import annotations
-
 import io
 import re
 import textwrap

@@ -3,8 +3,6 @@
 Those of a run are drawn once: the page has them as they are, and each is a file of its own.
 """
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path

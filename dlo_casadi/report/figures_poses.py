@@ -1,7 +1,5 @@
 """Figures of poses: measured points on predicted shapes, all in one frame, one predicted shape."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a run or a check has found, for other programs: report.json (schema "dlo-report/1")."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

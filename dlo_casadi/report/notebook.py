@@ -1,7 +1,5 @@
 """Results as a notebook shows them: a few lines, or a small table."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from html import escape
 

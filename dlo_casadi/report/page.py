@@ -1,7 +1,5 @@
 """report.html and failed.html: one page for the person at the bench, alone in one file."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import inspect

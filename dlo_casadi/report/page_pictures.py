@@ -6,8 +6,6 @@ at any size and can be hidden one by one. A cable in space stands in a room: its
 their places there, and the page draws them anew as the room is turned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

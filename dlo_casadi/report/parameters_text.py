@@ -1,7 +1,5 @@
 """The text of parameters.yaml: a fitted cable, complete enough to compute with."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """Photographs in the report: made smaller for the page, and with all lines drawn over them."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Sequence

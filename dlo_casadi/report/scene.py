@@ -5,8 +5,6 @@ the same marks. A board has metres in its plane. A room has millimetres about th
 the third one up, against gravity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import cos, radians, sin

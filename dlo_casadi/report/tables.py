@@ -1,7 +1,5 @@
 """Rows of the tables of a report: parameters, errors, time, one predicted pose."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

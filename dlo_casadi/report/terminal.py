@@ -1,7 +1,5 @@
 """Tables for the terminal: what was found, how well, what is not known, and how long it took."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 

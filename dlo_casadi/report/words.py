@@ -1,7 +1,5 @@
 """The report in words: numbers, what stages are called, and all sentences."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The folder of results: complete or untouched."""
 
-from __future__ import annotations
-
 import json
 import os
 from concurrent.futures import Executor

@@ -1,7 +1,5 @@
 """A cable cut into elements."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

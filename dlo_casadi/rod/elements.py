@@ -13,8 +13,6 @@ Sonneville, Cardona, Bruels, Comput. Methods Appl. Mech. Eng. 268 (2014). Strain
 to fourth order: Magnus expansion, e.g. Iserles et al., Acta Numerica 9 (2000).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import factorial
 

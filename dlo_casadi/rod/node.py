@@ -1,7 +1,5 @@
 """The state of a node of the rod; it moves by an increment, never by its coordinates."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from math import factorial

@@ -5,8 +5,6 @@ whether this process is one of them (`here`), the errors by which a killed worke
 and where workers keep their `logs`.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import logging
 import multiprocessing

@@ -1,7 +1,5 @@
 """Everything that repeats: one function over many items, wherever the tasks run."""
 
-from __future__ import annotations
-
 import logging
 import multiprocessing
 import threading

@@ -1,7 +1,5 @@
 """A photograph of a cable in space as a sensor: pixels compared across the projected cable."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

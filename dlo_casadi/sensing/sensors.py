@@ -5,8 +5,6 @@ as the places of points along the cable, follow the curve (`located`); derivativ
 fixed own unknowns.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Self

@@ -1,7 +1,5 @@
 """Mistakes of what holds a cable: directions of its clamps, and the sensors of forces in them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ A wrong unit shows as a factor of a thousand, an axis that points the other way 
 once they are mirrored, a list out of step as ends that fit another pose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """The declared model of a configuration, its fit, and the simpler fits beside it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace

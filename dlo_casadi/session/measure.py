@@ -1,7 +1,5 @@
 """Read what a configuration names: its camera, photographs or centre-lines, one pose at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress

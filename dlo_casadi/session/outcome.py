@@ -1,7 +1,5 @@
 """What a session of measurements has led to: plain results, computed elsewhere."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self

@@ -5,8 +5,6 @@ frames and the order of files are in `ends`, those on directions and readings in
 those that quick fits of a few poses decide: exchanged ends, and gravity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """One pose as one stage of a fit sees it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

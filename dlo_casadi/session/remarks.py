@@ -1,7 +1,5 @@
 """What a user should be warned of."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np

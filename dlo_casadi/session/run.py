@@ -1,7 +1,5 @@
 """One session of measurements from configuration to outcome."""
 
-from __future__ import annotations
-
 import platform
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Stages of a fit as results: parameters, predictions and errors of each."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

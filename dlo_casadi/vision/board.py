@@ -1,7 +1,5 @@
 """The board's ArUco markers: where the camera stands."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The camera from a session's own photographs of the board."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 

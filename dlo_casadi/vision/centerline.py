@@ -1,7 +1,5 @@
 """From a photograph to the centre-line of its cable: coarse strands refined profile by profile."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 

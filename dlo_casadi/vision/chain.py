@@ -1,7 +1,5 @@
 """Find the cable coarsely: the chain of strands that fits its width, length and fixtures best."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Photographs: read from disk, whole or not at all; the steps of an extraction drawn."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The centre-line of a cable in space in one photograph, and its pixels matched with others."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The line in space that the photographs of one pose agree on, without any model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations, product

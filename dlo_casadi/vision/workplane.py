@@ -1,7 +1,5 @@
 """The cable's plane as a coarse picture, and the strands that stand out from it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
