@@ -73,10 +73,10 @@ EFFECTS: dict[str, type[Effect]] = {
     )
 }
 
-# What finds a mass that is not declared.
+# The effect that estimates a mass that is not declared.
 UNKNOWN_MASS: type[Effect] = MassError
 
-# What a measurement has beside them: never declared, and never blamed for a residual.
+# Effects of every measurement that are estimated with the others, never declared or diagnosed.
 NUISANCES: dict[str, type[Effect]] = {kind.name: kind for kind in (EdgeBias, SensorBias)}
 
 

@@ -1,4 +1,4 @@
-"""What acts across gravity: a uniform load, and gravity turned against the measurement's frame."""
+"""Loads across gravity: a uniform one, and gravity rotated against the measurement's frame."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -14,20 +14,20 @@ from dlo_casadi.rod.node import rotated, rotation
 
 @dataclass(frozen=True)
 class LoadAcrossGravity(Load):
-    """A load with as many components as there are directions across gravity: one, in space two.
+    """A load with a component for each direction across gravity: one in a plane, two in space.
 
     Parameters
     ----------
     vertical : "x", "y" or "z", optional
-        The world's axis that gravity is most along, in space; z where nobody tells. Components
-        are named after the two others.
+        In space, the world's axis nearest to gravity; z by default. Components are named after
+        the other two.
     """
 
     vertical: str = ""
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """With the axis that gravity is most along."""
+        """Set the axis nearest to gravity."""
         if len(setup.gravity) == 2:
             return cls()
         return cls(vertical="xyz"[int(np.argmax(np.abs(setup.gravity)))])
@@ -66,7 +66,7 @@ class SideLoad(LoadAcrossGravity):
         names = self.components("force_per_length", cable)
         if len(names) == 1:
             return params[names[0]] * (cable.length - s) * ca.vertcat(1, 0)
-        # Of a cable without weight the world's axes themselves.
+        # Without gravity these are the world's axes themselves.
         down = gravity / ca.sqrt(ca.sumsqr(gravity) + 1e-12)
         total = ca.SX.zeros(3)
         for name in names:

@@ -9,7 +9,7 @@ from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Effect, Params, SectionLaw
 from dlo_casadi.effects.setup import Setup
 
-# Ratios of the stiffnesses: a ribbon of the width w and thickness t has (w / t)^2.
+# Largest ratio of the two stiffnesses: a ribbon of width w and thickness t has (w / t)^2.
 LARGEST = 100.0
 
 
@@ -43,7 +43,7 @@ class BendingAnisotropy(SectionLaw):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where a clamp or a rest curvature tells how the section is turned."""
+        """Where a clamp or a rest curvature determines the roll of the section."""
         told = "clamped" in (setup.start, setup.end) or setup.curved
         return super().applies(setup) and told
 
@@ -55,11 +55,11 @@ class BendingAnisotropy(SectionLaw):
         return ca.mtimes(stiffness, _symmetric(mean + c, s, mean - c))
 
     def linear(self) -> Effect:
-        """Return the same section by the deviation from its mean stiffness."""
+        """Return the same section, in terms of its deviation from the mean stiffness."""
         return _LinearAnisotropy(label=self.label)
 
     def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
-        """Ratio and angle of the axis nearer to y; ratios beyond the largest are cut."""
+        """Ratio and angle of the axis nearer to y; the ratio is at most LARGEST."""
         a, b = values["difference"], values["coupling"]
         size = min(hypot(a, b), (LARGEST - 1) / (LARGEST + 1))
         angle, ratio = atan2(b, a) / 2, (1 - size) / (1 + size)
@@ -69,9 +69,9 @@ class BendingAnisotropy(SectionLaw):
 
 
 class _LinearAnisotropy(SectionLaw):
-    """A stiffness matrix in what it is linear in: EI (1 + a, b; b, 1 - a), EI the mean.
+    """The same law in parameters a, b in which it is linear: EI (1 + a, b; b, 1 - a).
 
-    To first order EI takes up what of the mean changes with the ratio.
+    EI is here the mean stiffness; its fit absorbs the change of the mean with the ratio.
     """
 
     name = "linear_anisotropy"

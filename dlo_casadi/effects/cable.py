@@ -1,4 +1,4 @@
-"""What is declared of a cable, and the parameters of its models."""
+"""The declared data of a cable, and the parameters of its models."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -7,15 +7,15 @@ from typing import Self
 
 from dlo_casadi.errors import DloError
 
-# Bounds of a bending stiffness [N m^2]: below a carbon fibre's, above a steel bar's.
+# Bounds of a bending stiffness [N m^2]: below that of a carbon fibre, above that of a steel bar.
 STIFFNESS_BOUNDS = (1e-12, 1e9)
-# So many typical changes from its nominal value a parameter without bounds may be declared.
+# Largest distance of a declared value from the nominal one, in `scale`, for an unbounded parameter.
 _FARTHEST = 1e6
 
 
 @dataclass(frozen=True)
 class Cable:
-    """What is declared of a cable.
+    """The declared data of a cable.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class Parameter:
 
     @property
     def range(self) -> tuple[float, float]:
-        """From where to where a declared value may lie: finite, where a bound is not."""
+        """Lowest and highest value that may be declared; finite even where a bound is not."""
         away = _FARTHEST * self.scale
         return max(self.lower, self.nominal - away), min(self.upper, self.nominal + away)
 
@@ -105,5 +105,5 @@ class Parameter:
     def symmetric(
         cls, names: Iterable[str], unit: str, scale: float, bound: float = inf
     ) -> tuple[Self, ...]:
-        """Parameters that vanish at 0, of one scale, and as far to either side as the bound."""
+        """Parameters of equal scale that vanish at 0 and lie between -bound and bound."""
         return tuple(cls(name, unit, scale=scale, lower=-bound, upper=bound) for name in names)

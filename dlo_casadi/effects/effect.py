@@ -1,9 +1,9 @@
 """The contract of an effect and its six kinds.
 
-An effect declares parameters and fills one kind of the model. It sees the curve, never the
-solver's coordinates; it creates no symbol, keeps no state and calls no solver. What else concerns
-it is its own: where it applies, where it is looked for, what it may be taken for, how it is told.
-All of that has defaults, so that most effects declare `name`, `parameters` and their law.
+An effect declares parameters and is of one kind. It sees the curve, never the solver's coordinates;
+it creates no symbol, keeps no state and calls no solver. It also says where it applies, which
+values a diagnosis tries, and which other effects may stand for it. All of that has defaults: most
+effects declare only `name`, `parameters` and their law.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dlo_casadi.thresholds import NEAR_END
 Params = Mapping[str, ca.SX]
 Scan = dict[str, float]
 
-# Places along the cable at which loads at one place are tried, as shares of its length.
+# Places at which point loads are tried, as shares of the length.
 PLACES = np.linspace(0.06, 0.94, 23)
 
 
@@ -45,11 +45,11 @@ class PointForceAt:
 
 @dataclass(frozen=True)
 class SpringAt:
-    """A spring from the arc length `position` [m] of the cable, at the place y (dimension,) [m].
+    """A spring on the cable at the arc length `position` [m], whose place is y (dimension,) [m].
 
         V(y) = stiffness |y|^2 / 2 - force . y + constant               [J]
 
-    of the stiffness k [N/m] and the force (dimension,) [N] on it at the origin: k times the anchor.
+    of the stiffness k [N/m] and the force (dimension,) [N] at y = 0: k times the anchor.
     """
 
     stiffness: ca.SX
@@ -61,14 +61,14 @@ class SpringAt:
         """Energy [J] at a place."""
         return self.stiffness * ca.sumsqr(place) / 2 - ca.dot(self.force, place) + self.constant
 
-    def pull(self, place: ca.SX) -> ca.SX:
-        """Force (dimension,) [N] on the cable at a place: minus the slope of the energy."""
+    def on_cable(self, place: ca.SX) -> ca.SX:
+        """Force (dimension,) [N] on the cable at a place: minus the gradient of the energy."""
         return self.force - self.stiffness * place
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """From where the points of a pose are measured: symbols of one pose.
+    """Where the camera of a pose stands: symbols of one pose.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Viewpoint:
     camera : (2,) [1]
         The camera's centre (x, y) over its distance z from the cable's declared plane.
     nearness : scalar [1/m]
-        1/z. Both are zero where no camera is known: it then sees from infinity, straight on.
+        1/z. Both are zero where no camera is known: the projection is then orthogonal.
     """
 
     start: ca.SX
@@ -87,7 +87,7 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class Effect:
-    """Something that acts on a cable. Subclasses fill the kind that gives them their base.
+    """Something that acts on a cable or its measurement. Subclasses derive from one of the kinds.
 
     Parameters
     ----------
@@ -97,17 +97,17 @@ class Effect:
 
     name: ClassVar[str]
     kind: ClassVar[str]
-    # Own parameters that lie within a declared tolerance, by its name there: until more is needed
-    # the effect is a nuisance of every model that it applies to.
+    # Parameters with a declared tolerance -> the tolerance's name. Such an effect is a nuisance of
+    # every model that it applies to, unless larger values are needed.
     tolerances: ClassVar[Mapping[str, str]] = {}
-    # Parameters that are estimated as the inverse of what is known: its name and unit.
+    # Parameter -> name and unit of its inverse, for those that are better known by it.
     inverses: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    # Whether tables of parameters show it while it is a nuisance.
+    # Whether it is listed in tables of parameters while it is a nuisance.
     shown: ClassVar[bool] = True
-    # Whether there is such an effect on a cable in a plane, 2, and on one in space, 3.
+    # Whether the effect applies in the plane (2), in space (3).
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
 
-    # Parameters that are alike for every cable, see `parameters`.
+    # Parameters that do not depend on the cable, see `parameters`.
     declared: ClassVar[tuple[Parameter, ...]] = ()
 
     label: str = ""
@@ -123,17 +123,17 @@ class Effect:
         return self.declared
 
     def per_pose(self, cable: Cable) -> tuple[str, ...]:
-        """Unknowns of each pose that it uses beside its parameters, of `deviation_names`."""
+        """Names of its unknowns in each pose, out of `deviation_names`."""
         return ()
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Whether the effect makes sense in a setup, and measurements there can show it."""
+        """Whether the effect is possible in a setup, and visible in its measurements."""
         return len(setup.gravity) in cls.dimensions
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """Return the effect as it acts in a setup."""
+        """Return the effect with the options that suit a setup."""
         return cls()
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
@@ -148,7 +148,7 @@ class Effect:
         )
 
     def prior(self, setup: Setup) -> dict[str, float]:
-        """Standard deviations of what is known of it before any shape; empty where nothing is."""
+        """Standard deviations of the prior on its parameters; empty without a prior."""
         return {
             q.name: setup.tolerances[self.tolerances[q.name]]
             for q in self.parameters(setup.cable)
@@ -156,27 +156,27 @@ class Effect:
         }
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Values of the parameters by which it enters nonlinearly, at each of which to look."""
+        """Trial values of the parameters in which it is nonlinear."""
         return ({},)
 
     def place(self, values: Mapping[str, float]) -> float | None:
-        """Arc length [m] about which it acts; None if that is no single place."""
+        """Arc length [m] at which it acts; None if it acts at more than one place."""
         return None
 
     def may_be(self, found: Fitted) -> bool:
-        """Whether another effect that was found may stand for this one, as the shapes go."""
+        """Whether another effect that was found may have the same cause, judged by the shapes."""
         return False
 
     def linear(self) -> Effect:
-        """Return the same effect, of the same label, in parameters for its score test.
+        """Return the same effect, of the same label, in the parameters of its score test.
 
-        Those are another choice where a parameter tells nothing at the value at which the effect
-        vanishes although the effect is linear in several at once.
+        They differ where the derivative by a parameter is zero when the effect vanishes, although
+        the effect is linear in a combination of several parameters.
         """
         return self
 
     def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
-        """Own parameters from those of `linear`."""
+        """Convert parameters of `linear` to those of this effect."""
         return dict(values)
 
 
@@ -185,12 +185,12 @@ class SectionLaw(Effect):
 
         W = along (of_bend k^T B k + GJ tau^2) / 2                      [N]
 
-    of the curvature k and the twist tau beyond those at rest. Where a cable is thicker it resists
-    both more, `along`; what a bend does to the section, `of_bend`, acts on bending alone.
+    of the curvature k and the twist tau beyond those at rest. `along` changes both stiffnesses with
+    the arc length; `of_bend` changes the bending stiffness with the bend.
     """
 
     kind: ClassVar[str] = "section"
-    # Whether the section bends alike about all axes.
+    # Whether the bending stiffness is the same about all axes.
     isotropic: ClassVar[bool] = True
 
     def along(self, cell: Cell, cable: Cable, params: Params) -> ca.SX:
@@ -203,7 +203,7 @@ class SectionLaw(Effect):
         Parameters
         ----------
         square : scalar [1/m^2]
-            Square of the curvature minus the rest curvature, in space of the size of that vector.
+            |curvature - rest curvature|^2.
         """
         return ca.SX(1)
 
@@ -222,7 +222,7 @@ class SectionLaw(Effect):
 
 
 class Kinematics(Effect):
-    """Kind `kinematics`: stretch and length."""
+    """Kind `kinematics`: true length and axial strain."""
 
     kind: ClassVar[str] = "kinematics"
     extensible: ClassVar[bool] = False
@@ -240,14 +240,14 @@ class Load(Effect):
     """Kind `load`: forces with a potential. Loads add; all share one gravity."""
 
     kind: ClassVar[str] = "load"
-    # Whether it is a weight that the cable carries beside its own.
+    # Whether it is an added weight, beside the cable's own.
     carried: ClassVar[bool] = False
-    # Number of `springs`; without any the forces stay the same whatever the shape.
+    # Number of `springs`.
     n_springs: ClassVar[int] = 0
 
     @property
     def dead(self) -> bool:
-        """Whether the forces stay the same whatever the shape."""
+        """Whether the forces do not depend on the shape."""
         return self.n_springs == 0
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
@@ -255,19 +255,19 @@ class Load(Effect):
         return gravity
 
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX | float:
-        """Force (dimension,) [N] of what is spread along the cable, on its part beyond s [m].
+        """Force (dimension,) [N] of a distributed load on the part of the cable beyond s [m].
 
-        A dead load has the energy V = - int resultant . dr/ds ds, up to the start's place: a sum
-        over elements, whatever the load.
+        A dead load has the energy V = - int resultant . dr/ds ds, a sum over elements, plus a term
+        of the place of the start.
         """
         return 0.0
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
-        """Forces of the load on single places of the cable."""
+        """Point forces of the load."""
         return ()
 
     def springs(self, params: Params) -> tuple[SpringAt, ...]:
-        """Springs from single places of the cable."""
+        """Springs at single places of the cable."""
         return ()
 
 
@@ -280,7 +280,7 @@ class PointLoad(Load):
         return Parameter("position", "m", length / 2, 0.1 * length, 0.0, length)
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Look for it all along the cable."""
+        """Try places all along the cable."""
         return tuple({"position": float(share * setup.cable.length)} for share in PLACES)
 
     def place(self, values: Mapping[str, float]) -> float:
@@ -290,8 +290,8 @@ class PointLoad(Load):
     def force(self, place: ca.SX, gravity: ca.SX, params: Params) -> ca.SX:
         """Force (dimension,) [N] on the cable when its place is at `place` (dimension,) [m]."""
         dead = (item.force for item in self.forces(gravity, params))
-        pulls = (spring.pull(place) for spring in self.springs(params))
-        return sum((*dead, *pulls), start=ca.SX.zeros(place.numel()))
+        elastic = (spring.on_cable(place) for spring in self.springs(params))
+        return sum((*dead, *elastic), start=ca.SX.zeros(place.numel()))
 
 
 class BoundaryEffect(Effect):
@@ -318,23 +318,23 @@ class MeasurementEffect(Effect):
     kind: ClassVar[str] = "measurement"
 
     def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
-        """Where the camera believes the true point (dimension,) [m] to be. Maps apply in order.
+        """Measured point of the true point (dimension,) [m]. Effects are applied in order.
 
         Parameters
         ----------
         frame : (coordinates,)
-            Of the cable at the point, as a node would carry it: in a plane its heading [rad].
-            How a map by it changes along the cable is known in a plane only.
+            State of a node at that point: in a plane its heading [rad]. Only in a plane are maps
+            that depend on it differentiated along the cable.
         """
         return point
 
     def feel(self, reactions: Mapping[str, ca.SX], params: Params) -> dict[str, ca.SX]:
-        """What sensors show of forces and moments on the fixtures, by `ends.REACTIONS`."""
+        """Measured from true forces and moments on the fixtures, by `ends.REACTIONS`."""
         return dict(reactions)
 
 
 class StateEffect(Effect):
-    """Kind `state`: what a pose leaves behind in the rest curvature."""
+    """Kind `state`: the change of the rest curvature by each pose."""
 
     kind: ClassVar[str] = "state"
 
@@ -347,13 +347,13 @@ class StateEffect(Effect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where the rest curvature is free to move, from one pose to another."""
+        """Where there is a rest curvature, and more than one pose."""
         return super().applies(setup) and setup.n_poses > 1 and setup.curved
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """An effect as a fit has found it, by its own parameters' names.
+    """An effect with its fitted parameters.
 
     `values` and `stds` hold each parameter's value and standard deviation.
     """
@@ -364,14 +364,14 @@ class Fitted:
     stds: Mapping[str, float]
 
     def near(self, side: str) -> bool:
-        """Whether it acts so near to the start, or end, that it may be the fixture's."""
+        """Whether it acts so near to the start, or end, that the fixture may be the cause."""
         place, length = self.effect.place(self.values), self.setup.cable.length
         if place is None:
             return False
         return place < NEAR_END * length if side == "start" else place > (1 - NEAR_END) * length
 
     def propagated(self, of: Callable[[Params], ca.SX]) -> tuple[FloatArray, FloatArray]:
-        """Value (k,) of an expression of the parameters, and what each std moves it by (k, n)."""
+        """Value (k,) of an expression of the parameters, and its change by each std (k, n)."""
         names = list(self.values)
         own = ca.SX.sym("own", len(names))
         result = of(dict(zip(names, ca.vertsplit(own), strict=True)))

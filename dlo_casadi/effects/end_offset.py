@@ -1,4 +1,4 @@
-"""An end fixture that is not where it is declared to be."""
+"""An end fixture whose true position differs from the declared one."""
 
 from dataclasses import replace
 from typing import ClassVar

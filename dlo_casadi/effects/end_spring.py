@@ -8,7 +8,7 @@ from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import BoundaryEffect, Fitted, Params, Scan
 from dlo_casadi.effects.setup import Setup
 
-# Directions in which a pin may hold the cable, relative to the mean heading there [rad].
+# Trial headings of the relaxed spring, relative to the mean heading of the cable there [rad].
 HEADINGS = (-1.2, -0.6, 0.0, 0.6, 1.2)
 
 
@@ -43,12 +43,12 @@ class _PinSpring(BoundaryEffect):
         return super().applies(setup) and getattr(setup, cls.side) == "pinned"
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Look about the cable's mean heading at that end."""
+        """Try headings about the cable's mean one at that end."""
         mean = setup.directions[self.side == "end"]
         return tuple({"heading": mean + turn} for turn in HEADINGS)
 
     def may_be(self, found: Fitted) -> bool:
-        """A local effect beside the pin may be the pin's."""
+        """A local effect beside the pin may be caused by the pin."""
         return found.near(self.side)
 
     def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:

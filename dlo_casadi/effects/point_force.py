@@ -36,14 +36,14 @@ class UnknownPull(PointLoad):
 
         V_j = - (f + f_j) . r(s)                                      [J]
 
-    It assumes no cause: it tells where and how the cable is pulled when no effect explains the
-    residual. The forces are unknowns of the poses, not parameters of the cable, so that nothing
-    can be predicted from them.
+    It assumes no cause: where no effect explains the residual, it gives the place and the size of
+    an unknown force. The forces are unknowns of the poses, not parameters of the cable: they
+    predict nothing.
 
     Parameters
     ----------
     fx, fy (, fz) : scalar [N]
-        Mean over the poses, at most ten weights; f_j is what each deviates from it.
+        Mean over the poses, at most ten weights; f_j is the deviation of pose j from it.
     position : scalar [m], in [0, L]
     """
 

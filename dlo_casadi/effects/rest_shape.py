@@ -9,7 +9,7 @@ from dlo_casadi.effects.setup import Setup
 # A kink max(x, 0) is rounded to (x + sqrt(x^2 + d^2)) / 2 with d this share of one turn per length:
 # off by d / 2 at the kink, by d^2 / (4 |x|) away from it.
 _ROUNDING = 0.01
-# Yield curvatures that are tried, as shares of the largest bend.
+# Trial yield curvatures, as shares of the largest bend.
 YIELDS = (0.15, 0.3, 0.45, 0.6, 0.75)
 
 
@@ -68,7 +68,7 @@ class PlasticSet(StateEffect):
         )
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Look for a yield below the largest bend; without one, a turn per length."""
+        """Try yield curvatures below the largest bend; without one, below a turn per length."""
         bend = setup.largest_bend or setup.cable.curvature_scale
         return tuple({"yield_curvature": share * bend} for share in YIELDS)
 

@@ -1,4 +1,4 @@
-"""Sensors on the fixtures that do not show nothing where nothing pulls."""
+"""Sensors on the fixtures that do not show zero without a load."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ class SensorBias(MeasurementEffect):
 
         measured = true + bias
 
-    in world axes, the same in all poses: a nuisance of every reading within tolerances.force_bias
-    and moment_bias, and never blamed for a residual.
+    in world axes, the same in all poses: a nuisance of all wrench measurements, with the prior
+    tolerances.force_bias and moment_bias, and never a finding of a diagnosis.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class SensorBias(MeasurementEffect):
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """For what is measured."""
+        """Set which components are measured."""
         return cls("", *(name in setup.readings for name in REACTIONS))
 
     def prior(self, setup: Setup) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What effects are told: how a cable is held and measured."""
+"""Setup: how a cable is held and measured, the argument of an effect's methods."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,23 +19,22 @@ class Setup:
     curved : bool
         Whether a rest curvature is fitted.
     n_poses : int
-        That are fitted. What a pose leaves behind, and how a force changes with the shape, takes
-        two to be seen.
+        Number of fitted poses. A change of the rest curvature, or of a force with the shape, is
+        visible only with two or more.
     center : (float, float), optional [m]
         Middle of the photographs in the board frame; absent without photographs.
     pixel : float, optional [m]
         Size of a pixel on the board; absent without photographs.
     camera : bool
-        Whether it is known from where the photographs were taken.
+        Whether the place of the camera is known.
     readings : tuple of str
         Which forces and moments on the fixtures were measured, of `ends.REACTIONS`.
     tolerances : mapping
-        How well declared values are known, one standard deviation, by the names of `tolerances`
-        in a configuration.
+        Standard deviations of declared values, by the names of `tolerances` in a configuration.
     directions : (float, float) [rad]
         Mean headings at start and end.
     largest_bend : float, optional [1/m]
-        Of all poses, curvature minus rest curvature.
+        Largest |curvature - rest curvature| of all poses.
     """
 
     cable: Cable

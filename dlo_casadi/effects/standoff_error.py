@@ -41,7 +41,7 @@ class StandoffError(MeasurementEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where it is known from where the photographs were taken."""
+        """Where the place of the camera is known."""
         return super().applies(setup) and setup.camera
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:

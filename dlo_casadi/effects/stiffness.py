@@ -9,7 +9,7 @@ from dlo_casadi.effects.effect import PLACES, Params, Scan, SectionLaw
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.element import Cell
 
-# Lengths of sections that are tried, as shares of the cable's length.
+# Trial lengths of sections, as shares of the cable's length.
 SECTIONS = (0.08, 0.2)
 
 
@@ -71,7 +71,7 @@ class StiffSection(SectionLaw):
         )
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Look for short and long sections all along the cable."""
+        """Try short and long sections all along the cable."""
         length = setup.cable.length
         return tuple(
             {

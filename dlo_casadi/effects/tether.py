@@ -9,8 +9,8 @@ from dlo_casadi.effects.cable import Cable, Parameter
 from dlo_casadi.effects.effect import Effect, Params, PointLoad, SpringAt, vector
 from dlo_casadi.effects.setup import Setup
 
-# How far an anchor may lie from the board's origin, in lengths of the cable: the force of one
-# that far changes by a tenth in direction and size where the cable moves by its own length.
+# Largest distance of an anchor from the board's origin, in lengths of the cable: its force then
+# changes by a tenth in direction and size where the cable moves by its own length.
 FARTHEST = 10.0
 
 
@@ -64,10 +64,10 @@ class Tether(PointLoad):
 
 
 class _LinearTether(PointLoad):
-    """A tether in the parameters that its energy is linear in: V = k |r(s)|^2 / 2 - f . r(s).
+    """The same spring in parameters in which its energy is linear: V = k |r(s)|^2 / 2 - f . r(s).
 
-    With f = k a it differs from the tether's by a constant; at k = 0, where an anchor tells
-    nothing, f is a dead force.
+    With f = k a it differs from the tether's energy by a constant; at k = 0, where the anchor has
+    no effect, f is a dead force.
     """
 
     name = "linear_tether"

@@ -1,8 +1,8 @@
 """Equilibria of many poses at once: one Newton method over the stacked poses.
 
-All poses share the parameters; a state carries the rest curvature from pose to pose. The Newton
-step eliminates all poses' band matrices together and passes changes of the rest curvature on in
-order.
+All poses share the parameters; a state carries the rest curvature from pose to pose. A Newton step
+eliminates the band matrices of all poses together, then passes changes of the rest curvature from
+pose to pose.
 """
 
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 
-# How far nodes may move from where Newton's method has started [rad].
+# Largest distance of a node from the start of Newton's method [rad].
 REACH = 1.5
-# Steps by a matrix that is kept shrink by this factor at least, or it is evaluated anew: five
-# gradients cost less than one matrix. Steps longer than NEAR [rad] change the matrix too much.
+# Largest ratio of successive steps with the same matrix, and longest step [rad] after which it may
+# be kept; otherwise it is evaluated again. Five gradients cost less than one matrix.
 CONTRACTION = 0.2
 NEAR = 0.1
-# Iterations of a descent to a minimum: the poses of one session in space took 7 to 23.
+# Maximum number of iterations of a descent to a minimum: poses of a session in space took 7 to 23.
 DOWNHILL = 40
 
 
@@ -56,16 +56,16 @@ class BatchEquilibrium:
     # ---- state -----------------------------------------------------------------------------------
 
     def rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Rest curvature (m, n_rests) that each pose finds, from the first on.
+        """Rest curvature (m, n_rests) before each pose, from that before the first one.
 
-        A `rest` that is given per pose already, (m, n_rests), is returned as it is.
+        A `rest` that is given for each pose, (m, n_rests), is returned unchanged.
         """
         if rest.ndim == 2:
             return rest
         out = np.repeat(rest[None], self.m, axis=0)
         if not self.model.has_state:
             return out
-        # Poses that leave what they find need not be gone through in order.
+        # Where poses leave the rest curvature unchanged, all of them have the same.
         after = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))[0]
         for j in range(self.m - 1 if np.any(after != out) else 0):
             out[j + 1] = self._after(j, shapes, p, out)[0]
@@ -77,11 +77,11 @@ class BatchEquilibrium:
         return self.assembly.state_after(shapes.subset([j]), given)[0]
 
     def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Rest curvature (n_rests,) that the last pose leaves behind."""
+        """Rest curvature (n_rests,) after the last pose."""
         return self._after(self.m - 1, shapes, p, self.rests(shapes, p, rest))[0]
 
     def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """Size (m, n_cells) [1/m] of curvature minus the rest curvature that each pose finds."""
+        """Size (m, n_cells) [1/m] of the curvature minus the rest curvature before each pose."""
         given = self._given(shapes, p, rest)
         bends = self.assembly.strain(shapes, given) - given.rest
         return np.asarray(np.linalg.norm(self.assembly.chain.curvatures(bends), axis=1))
@@ -96,7 +96,7 @@ class BatchEquilibrium:
         return self.assembly.balance(shapes, self._given(shapes, p, rest))[1:]
 
     def imbalance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Vector:
-        """Imbalance alone, for a small part of the cost."""
+        """Imbalance alone, which costs far less."""
         return self.assembly.imbalance(shapes, self._given(shapes, p, rest))
 
     def moved(self, shapes: Shapes, step: Vector) -> Shapes:
@@ -127,7 +127,7 @@ class BatchEquilibrium:
         tolerance : float [rad]
             Largest step at convergence.
         reach : float [rad]
-            A pose whose nodes move farther is lost: it runs for another equilibrium, or none.
+            A pose whose nodes move farther is lost: its way leads to another equilibrium, or none.
 
         Returns
         -------
@@ -172,9 +172,9 @@ class BatchEquilibrium:
     def settled(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, **options: Any
     ) -> tuple[Shapes, BoolArray]:
-        """As `solve`; in space, poses that are lost go downhill to a minimum from where they were.
+        """As `solve`; in space, the energy of lost poses descends to a minimum from their start.
 
-        Newton's method alone loses a pose of ten wherever frames have far to turn.
+        Newton's method alone loses one pose of ten wherever frames have far to rotate.
         """
         now, converged = self.solve(shapes, p, rest, **options)
         lost = np.flatnonzero(~converged)
@@ -208,7 +208,7 @@ class BatchEquilibrium:
 
     @staticmethod
     def _newton(force: Vector, matrix: BandMatrix, active: IntArray) -> Vector:
-        """Newton step of one column of the active poses; not finite where the shape is not."""
+        """Newton step, one column, of the active poses; not finite where the shape is not."""
         finite = np.isfinite(matrix.diagonal[active]).all(axis=(1, 2, 3))
         step = Vector(np.full_like(force.x, np.nan), np.full_like(force.y, np.nan))
         right = Vector(-force.x[finite], -force.y[finite])
@@ -217,7 +217,7 @@ class BatchEquilibrium:
         return step
 
     def _handed_on(self, here: Shapes, given: Inputs, matrix: BandMatrix, step: Vector) -> Vector:
-        """Newton step with the change of rest curvature handed from pose to pose."""
+        """Newton step that includes the change of the rest curvature by the poses before."""
         after = self.assembly.state_after(here, given)
         if not after[1].any():
             return step
@@ -235,9 +235,9 @@ class BatchEquilibrium:
         slopes: FloatArray,
         rest_slopes: FloatArray,
     ) -> Tangents:
-        """How the equilibria move with the unknowns and with each pose's own deviations.
+        """Derivatives of the equilibria by the unknowns and by each pose's own deviations.
 
-        By the implicit function theorem: -K^-1 d(imbalance).
+        From the implicit function theorem: -K^-1 d(imbalance).
 
         Parameters
         ----------
@@ -264,7 +264,7 @@ class BatchEquilibrium:
             _, _, matrix = self.assembly.balance(shapes, given)
             found = self._in_order(shapes, given, matrix, still, after)
             return replace(found, tangent=matrix)
-        # A state that is not there yet hands on what it finds, and its own parameters' part.
+        # A state without effect so far passes the rest curvature on, and its parameters change it.
         left = after[3] @ still.p
         still.rest[1:] += left[:-1].cumsum(axis=0)
         return self._solved(shapes, given, still)
@@ -278,10 +278,9 @@ class BatchEquilibrium:
         by_p: FloatArray | None = None,
         by_deviation: FloatArray | None = None,
     ) -> Tangents:
-        """How each equilibrium moves with its own rest curvature along modes (n_rests, q).
+        """Derivatives of each equilibrium by its own rest curvature along modes (n_rests, q).
 
-        And with the parameters (n_parameters, q) and deviations (n_deviations, q) that go with
-        them, if any.
+        A mode may also change the parameters (n_parameters, q) and deviations (n_deviations, q).
         """
         given = self._given(shapes, p, rest)
         return self._solved(shapes, given, self._still(given, modes, by_p, by_deviation))
@@ -293,7 +292,7 @@ class BatchEquilibrium:
         by_p: FloatArray | None = None,
         by_deviation: FloatArray | None = None,
     ) -> Tangents:
-        """Directions (rows, q), alike for all poses, along which nodes and multipliers stay."""
+        """Directions (rows, q), the same for all poses, at fixed nodes and multipliers."""
         a, q = self.assembly, by_rest.shape[1]
         counts = (given.p.shape[1], len(by_rest), len(self.model.deviation_names))
         p, rest, deviation = (
@@ -306,7 +305,7 @@ class BatchEquilibrium:
     def _solved(
         self, shapes: Shapes, given: Inputs, still: Tangents, matrix: BandMatrix | None = None
     ) -> Tangents:
-        """Directions with the way that nodes and multipliers take along them, beside their own."""
+        """Directions with the change of nodes and multipliers along them."""
         matrix = self.assembly.balance(shapes, given)[2] if matrix is None else matrix
         found = matrix.factor().solve(self.assembly.imbalance_by(shapes, given, still))
         return replace(still, x=still.x - found.x, lam=still.lam - found.y, tangent=matrix)
@@ -319,7 +318,7 @@ class BatchEquilibrium:
         along: Tangents,
         after: tuple[FloatArray, ...],
     ) -> Tangents:
-        """As `_solved`; each pose finds the rest curvature that the one before it has left."""
+        """As `_solved`; the rest curvature of each pose follows from the pose before."""
         x, lam, rest = along.x.copy(), along.lam.copy(), along.rest.copy()
         for j in range(self.m):
             one = np.array([j])
@@ -330,14 +329,14 @@ class BatchEquilibrium:
             if j + 1 < self.m:
                 slopes = tuple(part[one] for part in after)
                 rest[j + 1] = self.assembly.state_along(slopes, now.x, now.rest, now.p)[0]
-                # What a pose's own deviation leaves behind is left out of the later ones.
+                # The effect of a pose's own deviation on later poses is neglected.
                 rest[j + 1][:, along.deviation.any(axis=(0, 1))] = 0.0
         return replace(along, x=x, lam=lam, rest=rest)
 
     def observe(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Tangents
     ) -> list[tuple[Observed, ObservedChange]]:
-        """What sensors see of each pose, and how it changes along directions."""
+        """Predicted measurements of each pose, and their change along directions."""
         given, length = self._given(shapes, p, rest), self.model.cable.length
         slopes = self.assembly.curve_slopes(shapes, given)
         each = zip(
@@ -353,7 +352,7 @@ class BatchEquilibrium:
         ]
 
     def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
-        """What sensors see of each pose."""
+        """Predicted measurements of each pose."""
         given, length = self._given(shapes, p, rest), self.model.cable.length
         both = zip(
             self.assembly.curve(shapes, given), self.assembly.readings(shapes, given), strict=True
@@ -370,10 +369,10 @@ class BatchEquilibrium:
 
 
 def _settled(size: FloatArray, last: FloatArray, tolerance: float, fresh: BoolArray) -> BoolArray:
-    """Whether Newton's method has converged with steps of this size after the last ones.
+    """Whether Newton's method has converged, by the sizes of this step and of the last one.
 
-    Steps that shrink quadratically, by fresh matrices, or linearly, by those kept, need no
-    further one to show that it would be too small; steps at rounding no longer shrink.
+    Steps shrink quadratically with a fresh matrix and linearly with a kept one, so that the size of
+    the next step is predicted and it need not be made; steps at rounding no longer shrink.
     """
     rate = size / last
     ahead = size * np.where(fresh, rate**2, rate)

@@ -1,4 +1,4 @@
-"""A curve through nodes, where points are closest to it, and what sensors see of a pose."""
+"""A curve through nodes, projections of points onto it, and predicted measurements of a pose."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ _LINEAR = np.array(
 
 @dataclass(frozen=True)
 class NodeCurve:
-    """A curve given by its nodes and, of smooth elements, the slopes dr/ds there.
+    """A curve given by its nodes and, for smooth elements, the derivatives dr/ds there.
 
-    Between nodes with slopes the curve is the cubic Hermite interpolant, which
-    differs from an arc of curvature k by less than h^4 k^3 / 384; others are joined by chords.
+    With derivatives the curve is the cubic Hermite interpolant, which differs from an arc of
+    curvature k by less than h^4 k^3 / 384; without them it consists of chords.
     """
 
     length: float
@@ -44,7 +44,7 @@ class NodeCurve:
 
     @classmethod
     def of(cls, length: float, z: FloatArray) -> Self:
-        """Curve of places, and slopes where there are any: (n + 1, d or 2 d), d = 2 or 3."""
+        """Curve from rows of places, or of places and dr/ds: (n + 1, d or 2 d), d = 2 or 3."""
         if z.shape[1] < 4:
             return cls(length, z, None)
         d = z.shape[1] // 2
@@ -52,7 +52,7 @@ class NodeCurve:
 
     @property
     def numbers(self) -> FloatArray:
-        """Nodes and slopes as one array (n + 1, d or 2 d)."""
+        """Nodes and dr/ds as one array (n + 1, d or 2 d)."""
         return self.nodes if self.slopes is None else np.hstack([self.nodes, self.slopes])
 
     @property
@@ -67,7 +67,7 @@ class NodeCurve:
 
     @cached_property
     def grid(self) -> FloatArray:
-        """Arc lengths [m] of eight places an element, among which the nearest one is sought."""
+        """Arc lengths [m] of eight places per element, the candidates of `nearest`."""
         return np.linspace(0.0, self.length, 8 * self.n + 1)
 
     @property
@@ -112,7 +112,7 @@ class NodeCurve:
         return self.frame(s, derivative)[derivative]
 
     def moved(self, s: FloatArray, slopes: FloatArray) -> FloatArray:
-        """Change (K, d, q) [m] of positions at fixed s for one (n + 1, d or 2 d, q) of it."""
+        """Change (K, d, q) [m] at fixed s, from the change (n + 1, d or 2 d, q) of `numbers`."""
         e, w = self.weights(s)
         w = w[:, :, None, None]
         out = w[:, 0] * slopes[e, : self.d] + w[:, 1] * slopes[e + 1, : self.d]
@@ -126,7 +126,7 @@ class NodeCurve:
     ) -> FloatArray:
         """Arc lengths (K,) [m] after Newton steps from a guess, within [0, L].
 
-        No step is longer than half an element; `tolerance` is that over the length of the last.
+        No step is longer than half an element; the last is below `tolerance` times the length.
         """
         s, limit = guess.copy(), 0.5 * self.length / self.n
         for _ in range(_NEWTON_STEPS):
@@ -155,15 +155,15 @@ class NodeCurve:
     def nearest(self, points: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] of the nearest places on the whole curve."""
         line = self.at(self.grid)
-        # Square distances but for those of the points from the origin.
+        # Squared distances minus the squared norms of the points.
         square = (line**2).sum(axis=1) - 2 * points @ line.T
         return self.projections(points, self.grid[square.argmin(axis=1)])
 
     def normals(self, s: FloatArray) -> FloatArray:
         """Unit normals (K, d - 1, d): in the plane to the left of the direction of travel.
 
-        In space the pair turns with the tangent from point to point, without twist: errors of
-        neighbouring points are then compared in the same directions.
+        In space the pair is transported along the curve without twist: errors of neighbouring
+        points are then compared in the same directions.
         """
         t = self.at(s, 1)
         t = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
@@ -190,11 +190,11 @@ class NodeCurve:
 def chord_places(points: FloatArray, pose: Pose, length: float) -> FloatArray:
     """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L.
 
-    Chords across gaps are shorter than the cable; between two fixtures the whole is scaled.
+    Chords across gaps are shorter than the cable: with two fixtures, lengths are scaled to L.
     """
     polyline = pose.joined(points)
     steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
-    # Noise lengthens a dense polyline: chords over several points are what counts.
+    # Noise lengthens a dense polyline: lengths are those of a smoothed one.
     s = _denoised_length(polyline, steps)
     places = s[1 : len(points) + 1]
     if pose.end is not None:
@@ -220,9 +220,9 @@ def _denoised_length(polyline: FloatArray, steps: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Observed:
-    """What a model says of one pose: its curve, and `readings` (n_reactions,) [N, N m].
+    """Predicted measurements of one pose: its curve, and `readings` (n_reactions,) [N, N m].
 
-    Readings are what forces and moments on the fixtures a sensor would show, see `ends.REACTIONS`.
+    Readings are the forces and moments on the fixtures as sensors measure them, `ends.REACTIONS`.
     """
 
     curve: NodeCurve
@@ -231,7 +231,7 @@ class Observed:
 
 @dataclass(frozen=True)
 class ObservedChange:
-    """How that changes along q directions.
+    """Change of an `Observed` along q directions.
 
     `curve` (n + 1, d or 2 d, q), `readings` (n_reactions, q).
     """

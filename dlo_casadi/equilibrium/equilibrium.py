@@ -1,4 +1,4 @@
-"""What there is to say of a cable's shape in one pose."""
+"""The equilibrium of a cable in one pose: its shape, forces, energy and stability."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
 
-# No joint bends by more than this between neighbouring headings (Eq. 8; joints only).
+# Largest angle between neighbouring headings (Eq. 8; joints only) [rad].
 JOINT_BOUND = np.pi / 2
 # Largest violation of an end condition [m or rad] of an accepted equilibrium.
 END_TOLERANCE = 1e-8
 # Largest imbalance of an accepted equilibrium, relative to the tangent matrix.
 BALANCE = 1e-12
-# Shapes that lie within this are the same one [rad].
+# Largest difference of two shapes that count as the same one [rad].
 NEARBY = 0.05
 
 
@@ -50,7 +50,7 @@ class Equilibrium:
         Of the cable on its clamps (start, end), in space about the world's axes; zero at pins.
         In a plane (2,).
     multipliers : (n_border,)
-        Of the end conditions, places and pulls of springs: in the order of `model.border_names`.
+        Of the end conditions, then places and multipliers of springs: see `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
         Of the joint bounds; zero where a joint bends freely.
     curvature : (axes n_cells,) [1/m]
@@ -65,8 +65,8 @@ class Equilibrium:
     status : Status
     iterations : int
     other_side : Equilibrium or None
-        The stable equilibrium of the same pose if it tells the other side, see
-        `CableModel.tipped_by`; None where there is none, and where the pose tells its side.
+        The stable equilibrium of the same pose on its other side, see `CableModel.tipped_by`;
+        None where there is none, and where the pose names its side.
     """
 
     x: FloatArray
@@ -138,7 +138,7 @@ def equilibria_of(
     iterations: IntArray,
     bound_multipliers: FloatArray | None = None,
 ) -> list[Equilibrium]:
-    """What there is to say of each of m shapes.
+    """Equilibria of m shapes.
 
     Parameters
     ----------

@@ -29,13 +29,13 @@ from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.node import Heading
 
-# Arc lengths may miss the cable by so many of its lengths: rounding.
+# Rounding error allowed in arc lengths beyond the ends, as a share of the length.
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a parameters.yaml tells beside the model.
+    """Contents of a parameters.yaml beside the model.
 
     Parameters
     ----------
@@ -45,14 +45,14 @@ class Metadata:
     covariance : (N, N)
         In the products of the parameters' units.
     uncertainty : Uncertainty
-        The same with what differs from pose to pose.
+        The same with the scatter from pose to pose.
     std : dict
         Standard deviation of each parameter by name [SI]; 0 where it was not fitted.
     coefficients : (n_coefficients,) [1/m]
         Of the rest curvature before the first pose; in space about the axis y, then about z.
     fixtures : dict
-        What all poses of the session share of `start` [m] and `start_heading`, `end_heading` [rad],
-        in space `start_orientation`, `end_orientation`.
+        Those of `start` [m] and `start_heading`, `end_heading` [rad], in space `start_orientation`,
+        `end_orientation`, that are the same in all poses of the session.
     identifiable : bool or None
         Whether the shapes determine the bending stiffness.
     interval_95 : (float or None, float or None) or None [N m^2]
@@ -93,8 +93,8 @@ class FittedCable(NamedTuple):
     p : (n_parameters,)
         In the order of `model.names` (SI).
     rest : (n_rests,) [1/m]
-        Rest curvature that the next pose finds; in space the rest strains twist, k_y, k_z of all
-        cells in turn.
+        Rest curvature before the next pose; in space the rest strains: the twist of all cells,
+        then k_y, then k_z.
     metadata : Metadata
     """
 
@@ -149,20 +149,20 @@ class CableShape:
     cable : FittedCable
         The fitted cable.
     pose : Pose
-        How its ends are held; where the cable may hang on either side, with the `turns` or the
-        `branch` of this one.
+        How its ends are held; with the `turns` or the `branch` of this shape where the cable may
+        hang on either of two sides.
     equilibrium : Equilibrium
         Nodes, reactions, energy and stability.
     curve : CableCurve
         The cable itself, at any arc length: `curve.at(s)`.
     seen : CableCurve
-        The same as the session's camera would measure it.
+        The same curve as measured by the session's camera.
     other_side : CableShape or None
-        The same pose on the other side: between two clamps in space twisted the other way round,
-        of a free end fallen to the other side. Only where the uncertain parameters and fixtures do
-        not tell which side is the lower one, and the pose does not name its side.
+        The same pose on the other side: with a free end fallen to the other side, between two
+        clamps in space twisted the other way round. None unless it is uncertain, by the parameters
+        and fixtures, which side is the lower one, and the pose does not name its side.
     tipping : Tipping or None
-        How near the clamp then is to where both are equally low.
+        Then, the angle of the clamp from where both sides are equally low.
     """
 
     cable: FittedCable
@@ -174,9 +174,9 @@ class CableShape:
     tipping: Tipping | None = None
 
     def band(self, count: int = 101) -> FloatArray:
-        """Half width (count,) [m] of the band across the cable that holds 90 % of next hangings.
+        """Half width (count,) [m] of the band across the cable that holds 90 % of new repeats.
 
-        Uncertain parameters, scatter of the fixtures and how the cable repeats; first order.
+        First order in the parameters' errors, the fixtures' scatter and the scatter of repeats.
         """
         model, p, rest, metadata = self.cable
         s = np.linspace(0.0, self.curve.length, count)
@@ -237,7 +237,7 @@ class CableShape:
 
 
 def shape_in(cable: FittedCable, pose: Pose) -> CableShape:
-    """Solve a pose of a fitted cable; where it may hang on either side, for both.
+    """Solve a pose of a fitted cable, for both sides where it may hang on either.
 
     Raises
     ------
@@ -249,7 +249,7 @@ def shape_in(cable: FittedCable, pose: Pose) -> CableShape:
     try:
         eq = solve_equilibrium(model, p, rest, pose)
     except EquilibriumError as error:
-        # What the solver advises concerns a configuration; there is none here.
+        # The solver's advice is about a configuration, and there is none here.
         happened = error.message.partition("\n  Try:")[0]
         other = "headings or branch" if pose.node is Heading else "orientations, fewer turns"
         raise EquilibriumError(
@@ -257,7 +257,7 @@ def shape_in(cable: FittedCable, pose: Pose) -> CableShape:
             p_des=error.p_des,
         ) from None
     effects = tuple(x for x in model.effects if not isinstance(x, MeasurementEffect))
-    # The curve itself is that of the same model without what the camera adds.
+    # The true curve is that of the same model without the effects of the camera.
     plain = replace(model, effects=effects, priors={}) if effects != model.effects else model
     kept = [name in plain.names for name in model.names]
 

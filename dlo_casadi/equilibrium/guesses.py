@@ -1,6 +1,6 @@
 """First guesses of the nodes of a cable held at the ends of a pose, or along a measured line.
 
-The generated solver tries the same ones, number for number: codegen/templates/*_guesses.c.in.
+The generated solver tries the same ones with the same numbers: codegen/templates/*_guesses.c.in.
 """
 
 from collections.abc import Sequence
@@ -19,20 +19,20 @@ from dlo_casadi.rod.node import Frame
 Clamps = tuple[FloatArray | None, FloatArray | None]
 Turned = tuple[Rotation | None, Rotation | None]
 
-# First guesses that seldom lead to the lowest equilibrium are left out, see `guesses` [rad].
-# Of 300 random problems with a clamp at the end or at both ends this loses none.
+# Angles [rad] below which some first guesses are left out, see `guesses`: they seldom lead to the
+# lowest equilibrium. Of 300 random problems with a clamp at the end or both ends none is lost.
 FAR, CURVED = 1.5, 1.0
-# Joints of a first guess stay within this: 0.9 of the bound of an equilibrium's joints [rad].
+# Largest joint angle of a first guess [rad]: 0.9 of the bound of an equilibrium.
 LARGEST_BEND = 0.9 * np.pi / 2
-# A clamp's turning decays as (1 - s/L)^5 from it. Of 1200 random problems with clamps, the lowest
-# equilibrium was missed in 9, 2, 0, 0, 1 with the power 3, 4, 5, 6, 8; high ones seldom converge.
+# Power of the decay (1 - s/L)^5 of a clamp's bend. In 1200 random problems with clamps the lowest
+# equilibrium was missed 9, 2, 0, 0, 1 times with the power 3, 4, 5, 6, 8; high ones converge less.
 _DECAY = 5
-# Rolls so near to half a turn [rad] are as near to none the other way round: arcs to four sides
-# differ by as much, 1.2 rad in a pose whose lowest equilibrium is the other one.
+# Distance of a roll from half a turn [rad] within which it is tried both ways round: rolls of arcs
+# to four sides differ by as much, 1.2 rad in a pose whose lowest equilibrium is the other one.
 HALF_TURN = 1.0
-# Turns by which one twist must be nearer than another: arcs to two sides may lie half a turn apart.
+# Rounding error allowed when twists are compared [turns]: two may be equally near to half a turn.
 _ROUNDING = 1e-6
-# Least squares of half_angle / sqrt(1 - ratio), squared, in powers of 1 - ratio; to 2e-4 rad.
+# Coefficients of half_angle^2 / (1 - ratio) in powers of 1 - ratio, by least squares; to 2e-4 rad.
 _HALF_ANGLE = (
     *(5.9998487866413575, 1.818549938733748, 0.45541329964829563, 3.159529741805951),
     *(-9.268767992481754, 17.431184753381647, -15.583929636428092, 5.856747675543661),
@@ -50,9 +50,9 @@ def first_nodes(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) 
 def _held(
     model: CableModel, p: FloatArray, pose: Pose
 ) -> tuple[FloatArray, FloatArray | None, Clamps]:
-    """What guesses are made of: arc lengths of the nodes, end minus start, and clamped frames.
+    """Inputs of guesses: arc lengths of the nodes, end minus start, and frames of clamps.
 
-    Lengths are over the cable's own; no chord leads to a free end, no frame to a pinned one.
+    Lengths are relative to the cable's; the chord of a free end and the frame of a pin are None.
     """
     ends, length = lagrangian_of(model).held(p, pose.ends, 0)
     d, c = model.node.dimension, model.node.coordinates
@@ -83,8 +83,8 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> l
 
     1. the counter-clockwise arc, bent into the headings of the clamps (`arc_into_clamps`), and
     2. the clockwise one; a pose that names its branch swaps them;
-    3. and 4. the same on the other way around: where the nearer one bends the cable by more than
-       1.5 rad, or the rest shape turns by more than 1 rad.
+    3. and 4. the same with the next k: where the nearer one bends the cable by more than 1.5 rad,
+       or the rest shape turns by more than 1 rad.
 
     With a free end:
 
@@ -187,9 +187,9 @@ def arc_into_clamps(
     (k,) [rad]
         With the k that bends the cable least at its clamps.
     (k,) [rad]
-        With the next k, that bends it the other way.
+        With the next k, which bends it the other way.
     float [rad]
-        How far the first bends it, in the mean over the clamps, at most pi.
+        Bend of the first at the clamps, the mean over them, at most pi.
     """
     arc = arc_headings(np.concatenate([[0.0], u, [1.0]]), 1.0, chord, side)
     excess = [
@@ -250,11 +250,11 @@ def guessed_frames(
 ) -> list[FloatArray]:
     """First guesses of the frames (n_nodes, 4) of a cable in space.
 
-    Between two ends, four arcs of the cable's length, the first sagging along gravity, the others
-    turned about the chord by quarter turns; bent into the clamps, the roll of the end clamp that
-    is nearest to `turns` spread evenly; of no turns, where that is nearly half a turn, also with
-    the one the other way round. With a free end: the rest shape, the cable fallen down, and
-    straight on. Turns are counted along the first arc, and as near to that along the others.
+    Between two ends: four arcs of the cable's length, the first sagging along gravity, the others
+    rotated about the chord by quarter turns. They are bent into the clamps; the roll of the end
+    clamp nearest to `turns` is spread evenly. Without turns, a roll of nearly half a turn is tried
+    both ways round. With a free end: the rest shape, the cable fallen down, and straight on.
+    Turns are counted along the first arc, and to the nearest value along the others.
     """
     u, chord, frames = _held(model, p, pose)
     clamps = _rotation(frames[0]), _rotation(frames[1])
@@ -323,10 +323,9 @@ def _hanging_frames(
 
 
 def _carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotation, float]:
-    """Frames (k,) along tangents bent into the clamps, without twist, and the end clamp's roll.
+    """Frames (k,) without twist along tangents bent into the clamps, and the end clamp's roll.
 
-    It is the angle [rad], within (-pi, pi], about the cable by which the end clamp is turned
-    against the last of them.
+    The roll is the angle [rad] about the cable from the last frame to the clamp, in (-pi, pi].
     """
     bends = [
         decay[:, None] * _smallest_turn(tangents[end], clamp.apply(_FORWARD)).as_rotvec()
@@ -347,22 +346,22 @@ def _carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotat
 
 
 def _rolled(u: FloatArray, frames: Rotation, clamps: Turned, roll: float) -> FloatArray:
-    """Frames (k, 4) with a roll [rad] at the end: spread evenly from a clamp, alike from a pin."""
+    """Frames (k, 4) with a roll [rad] at the end, linear from a clamp, constant from a pin."""
     share = np.ones_like(u) if clamps[0] is None else u
     about = Rotation.from_rotvec(np.outer(roll * share, _FORWARD))
     return same_sign((frames * about).as_quat())
 
 
 def _nearest(roll: float, aimed: float) -> float:
-    """The roll [rad], by whole turns more or less, nearest to those aimed at [turns].
+    """The roll [rad], up to full turns, that is nearest to `aimed` [turns].
 
-    Of two that are as near to rounding the larger.
+    The larger of two that are equally near up to rounding.
     """
     return roll + 2 * np.pi * float(np.floor(aimed - roll / (2 * np.pi) + 0.5 + _ROUNDING))
 
 
 def same_sign(quaternions: FloatArray) -> FloatArray:
-    """Quaternions (k, 4) of which neighbours have the same sign."""
+    """Quaternions (k, 4) with signs such that neighbours have a positive product."""
     flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(axis=1))
     signs = np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])
     return quaternions * signs[:, None]
@@ -374,9 +373,9 @@ def same_sign(quaternions: FloatArray) -> FloatArray:
 def line_nodes(points: FloatArray, pose: Pose, chain: Chain, places: FloatArray) -> FloatArray:
     """Nodes (n_nodes, coordinates) along a measured line, from its chords.
 
-    Those of some hundredths of the length; `places` (K,) [m] are the points' arc lengths. In a
-    plane headings are continuous along the cable; in space the clamps' roll is spread evenly, of
-    the twists that reach the end clamp the one nearest to `turns`.
+    The chords are some hundredths of the length; `places` (K,) [m] are the points' arc lengths. In
+    a plane headings are continuous along the cable; in space the roll of the end clamp nearest to
+    `turns` is spread evenly.
     """
     last = [] if pose.end is None else [chain.length]
     at = np.maximum.accumulate(np.concatenate([[0.0], places, last]))

@@ -1,4 +1,4 @@
-"""Minima of the energy from far away: by Newton's method on many poses at once, and by IPOPT.
+"""Minima of the energy from distant starts: Newton's method on many poses at once, and IPOPT.
 
 Each step of Newton's method on many poses or first guesses solves
 
@@ -6,9 +6,9 @@ Each step of Newton's method on many poses or first guesses solves
     [ B^T         C ] [ dlam ] = - [ dL/dlam ]
 
 with the least tau found for which the matrix has as many negative eigenvalues as there are
-multipliers: dx then lowers the energy along the end conditions, and a converged shape of tau = 0
-is a strict minimum under them. IPOPT minimises what it does not bring to one within the bounds of
-the joints.
+multipliers: dx then lowers the energy along the end conditions, and a shape that converges with
+tau = 0 is a strict minimum under them. IPOPT solves the poses for which this gives no minimum
+within the bounds of the joints.
 
 References
 ----------
@@ -41,26 +41,26 @@ from dlo_casadi.runtime.executors import interrupts_held
 
 # Longest step of a node [rad].
 LONGEST_STEP = 0.5
-# A step below this has converged [rad].
+# Longest step at convergence [rad].
 TOLERANCE = 1e-10
-# First shift of the diagonal over its largest entry, how fast it grows and shrinks, and below
-# what it is dropped.
+# Shift tau relative to the largest entry of the diagonal: the first, its factors of growth and
+# shrinkage, and the smallest before it becomes zero.
 FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
-# A tangent matrix larger than the first guess's by this factor is made of multipliers that run
-# away: nothing of the cable's own stiffness is left in double precision. Four of 336 descents of
-# very soft cables with a tether came back from beyond 1e6.
+# Growth of the Hessian from the first guess beyond which the multipliers diverge: the stiffness of
+# the cable is then below rounding. Four of 336 descents of very soft cables with a tether came
+# back from beyond 1e6.
 RUNAWAY = 1e16
-# Newton's method after IPOPT.
+# Maximum number of Newton steps after IPOPT.
 NEWTON_STEPS = 8
-# In 690 solves of random problems of all boundaries IPOPT took 7 iterations (median), at most 84.
+# Maximum number of IPOPT iterations: 690 random problems of all boundaries took 7 (median) to 84.
 IPOPT_ITERATIONS = 300
-# A joint so near to its bound is at it [rad].
+# Distance within which a joint is at its bound [rad].
 AT_BOUND = 1e-6
 
 
 @dataclass(frozen=True)
 class Minima:
-    """Where the descents have led.
+    """Results of the descents.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Minima:
     balanced : (m,) bool
         Whether the forces balance.
     converged : (m,) bool
-        Whether the shape is a strict minimum, too; a neutral one is none.
+        Whether the shape is also a strict minimum; a neutral one is not.
     energy : (m,) [J]
     iterations : (m,) int
     """
@@ -112,7 +112,7 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
         step = factor.solve(Vector(-force.x, -force.y))
         size = np.abs(step.x).max(axis=(1, 2, 3))
         now.x[active], now.lam[active] = stepped(node, here, step, size)
-        # A shift makes steps small where forces do not balance, too.
+        # A shift makes steps small even where forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
         iterations[active[done]] = iteration + 1
@@ -129,10 +129,10 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
 
 
 def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFactor, FloatArray]:
-    """Elimination of the matrices shifted until their inertia is a minimum's, and the shifts.
+    """Factors of the matrices, shifted until their inertia is that of a minimum, and the shifts.
 
-    No shift exceeds what makes the nodes' part positive definite: where the inertia is wrong
-    still, the conditions are the cause.
+    No shift exceeds the one that makes the nodes' part positive definite: if the inertia is wrong
+    even then, the conditions are the cause.
     """
     scale, most = matrix.scale, matrix.row_sum
     shift = np.where(before > LEAST_SHIFT * scale, before / SHRINKAGE, 0.0)
@@ -158,7 +158,7 @@ def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFa
 def stepped(
     node: type[Node], shapes: Shapes, step: Vector, size: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Nodes and border of shapes after a step of one column, none of them beyond LONGEST_STEP.
+    """Nodes and border of shapes after a step of one column, cut at LONGEST_STEP.
 
     `size` (m,) [rad] is the longest step of each shape's nodes.
     """
@@ -197,7 +197,7 @@ def run_ipopt(solver: ca.Function, **given: Any) -> tuple[dict[str, ca.DM], dict
     Raises
     ------
     KeyboardInterrupt
-        After a run that was interrupted: CasADi would take the signal for a failure of the solver.
+        After an interrupted run, which CasADi reports as a failure of the solver.
     """
     with interrupts_held():
         out = solver(**given)
@@ -207,11 +207,11 @@ def run_ipopt(solver: ca.Function, **given: Any) -> tuple[dict[str, ca.DM], dict
 def by_ipopt(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, phi: FloatArray
 ) -> Equilibrium | None:
-    """Equilibrium of a planar cable that IPOPT reaches from one first guess; None if there is none.
+    """Equilibrium of a planar cable that IPOPT reaches from one first guess; None if it does not.
 
     IPOPT minimises the potential under the end conditions and the bounds of the joints: the same
     functions of segments as everywhere, stated as one problem of the whole pose. Newton's method on
-    the Lagrangian settles the shape to rounding.
+    the Lagrangian then converges to rounding.
 
     Parameters
     ----------
@@ -240,11 +240,11 @@ def by_ipopt(
 def _balanced(
     model: CableModel, start: Shapes, bound_multipliers: FloatArray, given: Inputs, iterations: int
 ) -> Equilibrium | None:
-    """Newton's method from the potential's minimum, whose bows are stiff under compression too.
+    """Newton's method from IPOPT's minimum, on a Lagrangian that keeps compressed bubbles stiff.
 
-    Joints at their bound are held there; one whose multiplier pulls it back is let go. Whatever
-    IPOPT says of its end (on fine meshes of stiff cables its tolerance lies below rounding), what
-    counts is whether the shape that is returned balances: None if it does not.
+    Joints at their bound are held there, and released if their multiplier has the wrong sign. The
+    status of IPOPT does not count (on fine meshes of stiff cables its tolerance lies below
+    rounding), only the balance of the shape: None if it does not balance.
     """
     assembly, node = assembly_of(model), model.node
 
@@ -252,35 +252,36 @@ def _balanced(
         """Angles (n_nodes - 1,) [rad] between neighbouring nodes."""
         return node.difference(shapes.x[0, :-1], shapes.x[0, 1:])[:, 0]
 
-    def linearized(shapes: Shapes, pulls: FloatArray) -> tuple[Vector, BandMatrix]:
+    def linearized(shapes: Shapes, moments: FloatArray) -> tuple[Vector, BandMatrix]:
         """Imbalance and tangent with the joints that are held as further conditions."""
         _, force, matrix = assembly.balance(shapes, given)
         arms = np.zeros((1, model.chain.n_nodes, 1, len(held)))
         arms[0, held, 0, np.arange(len(held))] = -1.0
         arms[0, held + 1, 0, np.arange(len(held))] = 1.0
         gap = (bends(shapes)[held] - bound)[None, :, None]
-        whole = Vector(force.x + (arms @ pulls)[..., None], np.concatenate([force.y, gap], axis=1))
+        nodes = force.x + (arms @ moments)[..., None]
+        whole = Vector(nodes, np.concatenate([force.y, gap], axis=1))
         return whole, matrix.with_border(arms)
 
     bent = bends(start)
     held = np.flatnonzero(np.abs(bent) > JOINT_BOUND - AT_BOUND)
     while True:
-        bound, pulls, now = np.copysign(JOINT_BOUND, bent[held]), bound_multipliers[held], start
+        bound, moments, now = np.copysign(JOINT_BOUND, bent[held]), bound_multipliers[held], start
         for _ in range(NEWTON_STEPS):
-            force, matrix = linearized(now, pulls)
+            force, matrix = linearized(now, moments)
             step = matrix.factor().solve(Vector(-force.x, -force.y))
             size = float(np.abs(step.x).max())
             if not size < NEARBY:
                 break
             x, lam = node.moved(now.x, step.x[..., 0]), step.y[:, : model.n_border, 0]
             now = replace(now, x=x, lam=now.lam + lam)
-            pulls = pulls + step.y[0, model.n_border :, 0]
+            moments = moments + step.y[0, model.n_border :, 0]
             if size < 1e-12:
                 break
-        if not np.any(pulls * np.sign(bound) < 0):
+        if not np.any(moments * np.sign(bound) < 0):
             break
-        held = held[pulls * np.sign(bound) >= 0]
-    force, matrix = linearized(now, pulls)
+        held = held[moments * np.sign(bound) >= 0]
+    force, matrix = linearized(now, moments)
     residual = float(np.abs(force.y).max(initial=0.0))
     imbalance = float(np.abs(force.x).max())
     inside = bool(np.abs(bends(now)).max() < JOINT_BOUND + AT_BOUND)
@@ -289,7 +290,7 @@ def _balanced(
         return None
     stable = int(matrix.negative()[0]) == model.n_multipliers + len(held)
     bound_lam = np.zeros((1, len(bent)))
-    bound_lam[0, held] = pulls
+    bound_lam[0, held] = moments
     return equilibria_of(
         model,
         now,

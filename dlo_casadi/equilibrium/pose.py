@@ -33,12 +33,12 @@ class Pose:
     start_orientation, end_orientation : (4,) or None
         Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable.
     turns : float
-        In space, of the twists about the cable's axis that bring its end into the clamp, the one
-        nearest to so many full turns is meant; +-0.5 tell the ways of half a turn apart. Of 0, and
-        a clamp rolled by half a turn within 1 rad, the way of lower energy.
+        In space, selects the twist about the cable's axis that brings its end into the clamp: the
+        one nearest to this number of full turns; +-0.5 select either way of half a turn. With 0,
+        and a clamp rolled by half a turn within 1 rad, the way of lower energy.
     branch : "ccw", "cw" or "previous", optional
-        Which way the cable turns from start to end: the sign of `Equilibrium.turn`; or as in the
-        pose before it, from which whoever predicts a series of poses follows it.
+        Which way the cable turns from start to end: the sign of `Equilibrium.turn`; or "previous",
+        the equilibrium that follows from the pose before, see `solve.continued`.
     name : str
     camera_center : (float, float, float), optional [m]
         Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
@@ -57,7 +57,7 @@ class Pose:
 
     @property
     def node(self) -> type[Node]:
-        """What the nodes of a cable carry that is held so: headings in a plane, frames in space."""
+        """The kind of nodes of a cable that is held so: headings in a plane, frames in space."""
         return Heading if len(self.start) == 2 else Frame
 
     @property
@@ -68,7 +68,7 @@ class Pose:
 
     @property
     def directions(self) -> dict[str, Any]:
-        """What tells the directions of the ends, by its name in a session."""
+        """Directions of the ends by their keys in a session."""
         known = {name: getattr(self, name) for name in self._direction_names}
         known = {name: list(x) if isinstance(x, tuple) else x for name, x in known.items()}
         return known if self.node is Heading else {**known, "turns": self.turns}
@@ -95,7 +95,7 @@ class Pose:
         return first / max(np.linalg.norm(first), least), last / max(np.linalg.norm(last), least)
 
     def moved(self, start: FloatArray, end: FloatArray, frames: Sequence[FloatArray]) -> Pose:
-        """The same pose elsewhere; what is free stays free."""
+        """The same pose with other ends; what is free stays free."""
         values = (float(x[0]) if self.node is Heading else tuple(x) for x in frames)
         held: dict[str, Any] = dict(zip(self._direction_names, values, strict=True))
         end_place = None if self.end is None else tuple(end)
@@ -116,9 +116,9 @@ class Pose:
 
     @property
     def vector(self) -> FloatArray:
-        """The model's argument `pose`: the ends, then what `effects.Viewpoint` says of the camera.
+        """The model's argument `pose`: the ends, then the camera, see `effects.Viewpoint`.
 
-        Its centre (x, y, z) enters as (x, y, 1) / z: zeros for none, which sees from infinity.
+        The camera's centre (x, y, z) enters as (x, y, 1) / z: zeros if it is not known.
         """
         x, y, z = self.camera_center or (0.0, 0.0, np.inf)
         return np.concatenate([self.ends, np.array([x, y, 1.0]) / z])

@@ -22,15 +22,15 @@ from dlo_casadi.model.cable_model import COARSE_MESH, CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import Frame, Heading
 
-# Farther no end is moved at once [lengths, rad]: shapes near a fold are followed, not jumped over.
+# Largest move of an end in one step [lengths, rad], so that shapes are followed up to a fold.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
-# In space first guesses are followed on a coarse mesh, and so many of the lowest minima that they
-# lead to, and the lowest on the other side, on the model's own.
+# Number of lowest minima of the coarse mesh, in space, that are solved on the model's own mesh,
+# beside the lowest on the other side.
 FEW = 2
-# Turns that tell which way round a clamp is rolled by half a turn, see `Pose`.
+# Values of `Pose.turns` for the two ways round of half a turn.
 WAYS_ROUND = (0.5, -0.5)
-# Turns by which the twist of a cable may differ from those asked for until it has shed some. Of
-# 7,500 random problems with up to four turns 1,369 differ by more than 1.35, 7 by 1.15 to 1.35.
+# Largest difference [turns] of a twist from the one asked for before turns count as shed. Of 7,500
+# random problems with up to four turns 1,369 differ by more than 1.35, 7 by 1.15 to 1.35.
 MOST_SHED = 1.3
 
 
@@ -77,9 +77,9 @@ def solve_equilibrium(
         min V(phi)   s.t.   r(L) = end, clamped headings, |phi_(i+1) - phi_i| <= pi/2
 
     Of the equilibria that the first guesses lead to (see `guesses`), the stable one of lowest
-    energy is returned, an unstable one where no other is found. A pose that names its branch
-    gets one of that branch or none; between two pins the first stable one, as a rule that of the
-    branch's own arc. With `x_init`, the equilibrium that it leads to, on whichever branch.
+    energy is returned, an unstable one if no other is found. For a pose that names its branch it
+    is on that branch, or an error; between two pins the first stable one, as a rule that of the
+    branch's own arc. With `x_init` it is the equilibrium reached from there, on any branch.
 
     Parameters
     ----------
@@ -115,10 +115,10 @@ def solve_equilibria(
     poses: Sequence[Pose],
     starts: Sequence[FloatArray | None] | None = None,
 ) -> list[Equilibrium | EquilibriumError]:
-    """`solve_equilibrium` of many poses at once: of each its shape, or why there is none.
+    """`solve_equilibrium` for many poses at once: for each its shape, or why there is none.
 
-    The energy descends from all first guesses of all poses together. In a plane, guesses that it
-    does not bring to a minimum within the bounds of the joints are solved by IPOPT.
+    The energy descends from all first guesses of all poses together. In a plane, IPOPT solves the
+    guesses from which that gives no minimum within the bounds of the joints.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def solve_equilibria(
 
 
 def ways_of(model: CableModel, pose: Pose) -> list[Pose]:
-    """A pose with each branch, or way round, that it may tell: first the counter-clockwise one."""
+    """Copies of a pose with each branch, or way round, that it may name; ccw first."""
     if pose.node is Heading:
         return [replace(pose, branch=name) for name in SIGNS]
     return [replace(pose, turns=turns) for turns in WAYS_ROUND] if model.tipped_by else []
@@ -167,9 +167,9 @@ def ways_of(model: CableModel, pose: Pose) -> list[Pose]:
 def _chosen(
     model: CableModel, pose: Pose, start: FloatArray | None, found: list[Equilibrium]
 ) -> Equilibrium | EquilibriumError:
-    """The equilibrium that a pose's first guesses have found, see `solve_equilibrium`.
+    """The equilibrium chosen among those found from a pose's first guesses, or the error.
 
-    Or why there is none, or none on the branch that the pose names.
+    See `solve_equilibrium`; an error also if none is on the branch that the pose names.
     """
     named = None if start is not None or pose.branch == "previous" else pose.branch
     where = "its end free" if pose.end is None else f"its end at {pose.end} m"
@@ -215,7 +215,7 @@ def _chosen(
 
 @dataclass(frozen=True)
 class _Search:
-    """The equilibria of a cable, from the first guesses of all poses together."""
+    """Search for the equilibria of a cable from the first guesses of all poses together."""
 
     model: CableModel
     p: FloatArray
@@ -242,7 +242,7 @@ class _Search:
     def _first(
         self, poses: Sequence[Pose], starts: Sequence[FloatArray | None]
     ) -> tuple[IntArray, Shapes]:
-        """First guesses of all poses, or what they start from, and of which pose each is."""
+        """First guesses of all poses, or the given starts, and the pose of each."""
         rows = [
             first_nodes(self.model, self.p, self.rest, pose) if start is None else [start]
             for pose, start in zip(poses, starts, strict=True)
@@ -283,7 +283,7 @@ class _Search:
         return out
 
     def _likely(self, poses: Sequence[Pose]) -> tuple[IntArray, Shapes]:
-        """The lowest minima of a coarse mesh that differ, on the model's mesh, of which pose."""
+        """The lowest distinct minima of a coarse mesh on the model's mesh, and the pose of each."""
         model, coarse = self.model, self.model.coarse
         search = _Search(coarse, self.p, coarse_rest(model, coarse, self.rest))
         of, shapes = search._first(poses, [None] * len(poses))
@@ -309,7 +309,7 @@ class _Search:
 
 
 def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:
-    """Rest strains (n_rests,) of the coarse cells: means of those of the fine ones."""
+    """Rest strains (n_rests,) of the coarse cells: means over the fine ones."""
     (low, high), (start, end) = model.chain.cells.T, coarse.chain.cells.T[..., None]
     shares = np.clip(np.minimum(high, end) - np.maximum(low, start), 0.0, None) / (end - start)
     return np.concatenate([shares @ part for part in np.split(rest, len(model.node.strains))])
@@ -321,15 +321,15 @@ def _twists(model: CableModel, twist: FloatArray) -> FloatArray:
 
 
 def _holds(twist: FloatArray, turns: FloatArray | float) -> BoolArray:
-    """Whether cables of these twists [turns] hold what was asked for; no turns cannot be shed."""
+    """Whether cables of these twists [turns] have shed none of the turns asked for."""
     return (np.abs(twist - turns) <= MOST_SHED) | (turns == 0)
 
 
 def on_other_side(model: CableModel, pose: Pose, x: FloatArray, others: FloatArray) -> BoolArray:
     """Whether other shapes (m, n_nodes, coordinates) hang on the other side of a shape.
 
-    They turn the other way; between two clamps, whole turns apart, by more than half a turn less
-    or more. None does where the pose tells its side, or the cable has none.
+    With a free end these turn the other way; between two clamps, where twists differ by full
+    turns, by more than half a turn. None does if the pose names its side or there are no two.
     """
     turn, turns = float(model.node.turning(x)), model.node.turning(others)
     least = 0.0 if pose.end is None else np.pi
@@ -340,10 +340,10 @@ def on_other_side(model: CableModel, pose: Pose, x: FloatArray, others: FloatArr
 def continued(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, before: Pose, x: FloatArray
 ) -> Equilibrium:
-    """Shape to which a cable comes whose ends are moved from another pose's, slowly.
+    """Shape of a cable whose ends are moved quasi-statically from another pose.
 
-    Ends and frames move evenly from one pose's to the other's. Where the shape loses its stability
-    on the way, the cable snaps to the equilibrium that its last shape leads to.
+    Ends and frames move evenly from one pose to the other. Where the shape loses its stability on
+    the way, the cable snaps to the equilibrium reached from its last shape.
 
     Parameters
     ----------
@@ -361,7 +361,7 @@ def continued(
     """
     ends = np.array([before.ends, pose.ends])[:, : 2 * model.node.dimension]
     frames = np.array([before.frames, pose.frames])
-    # Of frames half a turn apart the increment is of any length.
+    # The increment between frames half a turn apart is unbounded.
     turned = min(float(np.abs(model.node.difference(*frames)).max()), 2 * np.pi)
     moved = float(np.abs(np.diff(ends, axis=0)).max()) / model.cable.length
     count = int(np.ceil(max(turned / MOST_TURNED, moved / MOST_MOVED, 1.0)))

@@ -1,4 +1,4 @@
-"""How far the next hanging of a pose may lie from its prediction, and on which side."""
+"""Uncertainty of a prediction: the spread of a new repeat of a pose, and its side."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import MODES, RestScatter, modes_of
 from dlo_casadi.thresholds import EITHER
 
-# Share of the next hangings inside the band, and the standard deviations to its edges.
+# Share of new repeats inside the band, and half its width in standard deviations.
 COVERED = 0.9
 EDGE = -float(ndtri((1 - COVERED) / 2))
-# Share of a standard deviation over which energies are differentiated.
+# Step of finite differences of energies, as a share of a standard deviation.
 _SHARE = 1e-3
 
 
@@ -35,11 +35,11 @@ class Uncertainty:
     covariance : (N, N)
         Of these, in SI units.
     scatter : mapping of str to float
-        Standard deviation of where each fixture is, pose by pose, by the deviation's name.
+        Standard deviation of the fixtures from pose to pose, by the deviation's name.
     rest_scatter : RestScatter
     hanging : float [m]
-        Standard deviation of a coordinate, root mean square along the cable, of what differs
-        between hangings of a pose that was taken again and again; 0 where none was.
+        Standard deviation of a coordinate between repeats of one pose, root mean square along the
+        cable; 0 where no pose was repeated.
     """
 
     names: tuple[str, ...]
@@ -56,7 +56,7 @@ class Uncertainty:
         return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
     def unknowns_in(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
-        """What each of `names` moves: parameters (n_parameters, N) and rests (n_rests, N)."""
+        """Derivatives of parameters (n_parameters, N) and rests (n_rests, N) by `names`."""
         size = len(self.names)
         by_p, by_rest = np.zeros((len(model.names), size)), np.zeros((model.chain.n_rests, size))
         for k, name in enumerate(self.names):
@@ -68,11 +68,11 @@ class Uncertainty:
         return by_p, by_rest
 
     def ways_in(self, model: CableModel) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Independent ways in which the next hanging of a pose may differ, a std of each.
+        """Independent directions in which a new repeat of a pose may differ, each of one std.
 
-        Of the parameters (n_parameters, q), the rest strains (n_rests, q) and the model's
-        deviations (n_deviations, q); but for pulls, of which nothing is known. The ways are the
-        fitted unknowns, the fixtures, and modes of each hanging's own rest curvature.
+        Changes of the parameters (n_parameters, q), the rest strains (n_rests, q) and the model's
+        deviations (n_deviations, q) without unknown forces: by the fitted unknowns, the fixtures,
+        and modes of the rest curvature that each repeat has of its own.
         """
         by_p, by_rest = (by @ self.root for by in self.unknowns_in(model))
         modes = modes_in(model)
@@ -88,7 +88,7 @@ class Uncertainty:
 
 
 def modes_in(model: CableModel) -> FloatArray:
-    """Modes of a hanging's own rest curvature in a model's cells: (n_rests, axes MODES)."""
+    """Modes (n_rests, axes MODES) of the rest curvature of a single repeat, in a model's cells."""
     axes = np.eye(len(model.node.strains))[:, -len(model.node.curvatures) :]
     return np.kron(axes, modes_of(model.chain.cells, model.cable.length))
 
@@ -102,11 +102,11 @@ def displacements(
     uncertainty: Uncertainty,
     s: FloatArray,
 ) -> tuple[NodeCurve, FloatArray]:
-    """Curve of a pose, and displacements (K, d, q) [m] of its places s [m] in the next hanging.
+    """Curve of a pose, and displacements (K, d, q) [m] of its places s [m] in a new repeat.
 
-    Independent ones, a standard deviation of each. First order: the fitted parameters' covariance,
-    the fixtures' scatter and the rest curvature of each hanging's own, carried to the shape by the
-    equilibrium; what repeats of one pose differ by, the same all along.
+    They are independent, of one standard deviation each. Derivatives of the equilibrium carry the
+    covariance of the fitted parameters, the fixtures' scatter and the rest curvature of a single
+    repeat to the shape; the measured difference of repeats is added, the same all along.
     """
     equilibria = BatchEquilibrium(model, [pose])
     by_p, by_rest, by_deviation = uncertainty.ways_in(model)
@@ -145,12 +145,12 @@ def _lever(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
 
 @dataclass(frozen=True)
 class Tipping:
-    """How near a clamp is to the angle at which a cable hangs as low on its other side.
+    """Distance of a clamp from the angle at which both sides of a cable are equally low.
 
     Parameters
     ----------
     angle, std : float [rad]
-        How far the clamp is from there, and how well that is known.
+        That distance, and its standard deviation.
     """
 
     angle: float
@@ -158,7 +158,7 @@ class Tipping:
 
     @property
     def either(self) -> bool:
-        """Whether nobody knows which side is the lower one."""
+        """Whether it is uncertain which side is the lower one."""
         return self.angle < EITHER * self.std
 
 
@@ -171,10 +171,10 @@ def tipping_of(
     other: Equilibrium,
     uncertainty: Uncertainty,
 ) -> Tipping:
-    """How near a pose is to the other of two equilibria on either side.
+    """Tipping of a pose, from the two equilibria on its sides.
 
-    First order, from all that makes a prediction uncertain: the slope of an equilibrium's energy
-    by anything is that of the Lagrangian at fixed nodes and multipliers.
+    First order in all that makes a prediction uncertain: the derivative of an equilibrium's energy
+    by any input is that of the Lagrangian at fixed nodes and multipliers.
     """
     each = uncertainty.ways_in(model)
     count = each[0].shape[1]
@@ -191,7 +191,7 @@ def tipping_of(
 
 
 def sides_of(model: CableModel, pose: Pose, *pair: Equilibrium) -> list[Pose]:
-    """A pose that tells the side of each of two equilibria on either side."""
+    """Copies of a pose that name the side of each of two equilibria."""
     ways = ways_of(model, pose)
     turned = [float(model.node.turning(eq.x)) for eq in pair]
     return ways if turned[0] > turned[1] else ways[::-1]

@@ -1,4 +1,4 @@
-"""A model's functions evaluated for many poses at once, and put together into band matrices.
+"""A model's functions, evaluated for many poses at once and assembled into band matrices.
 
 One CasADi function of a segment is mapped over the segments of a pose; its blocks are added up to
 the gradient of the Lagrangian, its Hessian (block-tridiagonal, with the multipliers as border), and
@@ -34,9 +34,9 @@ class Shapes:
     x : (m, n_nodes, coordinates)
         States of the nodes: of a planar cable, headings [rad].
     lam : (m, n_border)
-        Multipliers of the end conditions; places and pulls of springs.
+        Multipliers of the end conditions; places and multipliers of springs.
     deviation : (m, n_deviations)
-        What is different in every pose, see `deviation_names`.
+        Unknowns that each pose has of its own, see `deviation_names`.
     """
 
     x: FloatArray
@@ -45,7 +45,7 @@ class Shapes:
 
     @classmethod
     def declared(cls, x: FloatArray, lam: FloatArray) -> Shapes:
-        """Shapes whose ends are where they are declared to be."""
+        """Shapes without deviations from the declared ends."""
         return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]])))))
 
     def subset(self, index: Any) -> Shapes:
@@ -55,7 +55,7 @@ class Shapes:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the equilibria of m poses depend on.
+    """Inputs of the equilibria of m poses.
 
     `p` (m, n_parameters), `rest` (m, n_rests) [1/m], `poses` (m, n_pose) as declared.
     """
@@ -79,11 +79,11 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Tangents:
-    """Directions of all that shapes depend on, q of them, of m poses.
+    """Derivatives of the shapes and inputs of m poses along q directions.
 
     `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q),
-    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q). `tangent`: the tangent matrices by
-    which the shapes' directions were found, if they were.
+    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q). `tangent`: the tangent matrices from
+    which those of the shapes were solved, if they were.
     """
 
     x: FloatArray
@@ -105,8 +105,8 @@ class Tangents:
 class _Mapped:
     """A CasADi function of a segment (or node), mapped over a pose and called pose by pose.
 
-    It reads and writes NumPy's memory: converting to CasADi's matrices costs several times the
-    evaluation itself.
+    It reads and writes NumPy's memory: a conversion to CasADi's matrices takes several times as
+    long as the evaluation.
     """
 
     def __init__(self, function: ca.Function, count: int) -> None:
@@ -114,7 +114,7 @@ class _Mapped:
             (count, function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
         ]
         mapped = function.map(count) if count > 1 else function
-        # Any: CasADi's stubs do not know that a buffer takes NumPy's memory.
+        # Any: by CasADi's stubs a buffer does not take NumPy's memory.
         self._buffer: Any
         self._buffer, self._run = mapped.buffer()
 
@@ -158,7 +158,7 @@ class Assembly:
         self._functions: dict[str, _Mapped] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without compiled functions: another process makes its own."""
+        """Pickle without compiled functions: another process makes its own."""
         return {**self.__dict__, "_functions": {}}
 
     # ---- calls ---------------------------------------------------------------------------------
@@ -213,17 +213,17 @@ class Assembly:
 
     def balance(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, Vector, BandMatrix]:
         """Lagrangian (m,) [J], its gradient by increments and multipliers, and its Hessian."""
-        value, slope, bend = self._call_segments("segment", shapes, given)
-        end_value, end_slope, end_bend = self._call_ends("at_ends", shapes, given)
+        value, gradient, bend = self._call_segments("segment", shapes, given)
+        end_value, end_gradient, end_bend = self._call_ends("at_ends", shapes, given)
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
-        return total, self._added(slope, end_slope), self._held(self._band(bend, end_bend), given)
+        matrix = self._held(self._band(bend, end_bend), given)
+        return total, self._added(gradient, end_gradient), matrix
 
     def _held(self, matrix: BandMatrix, given: Inputs) -> BandMatrix:
-        """Hold the first node of cables that turn about their own axis at no cost.
+        """Add a stiffness against roll of the first node to cables free to roll about their axis.
 
-        Straight at rest, such a cable has the null vector (1, 0, 0) at every node. A stiffness
-        against one of these turns leaves Newton steps and the inertia beside that vector as they
-        are: the part of any direction along it may be taken off.
+        Such a cable, straight at rest, has the null vector (1, 0, 0) at every node. The stiffness
+        changes inertia and Newton steps along that vector alone, which may be taken off any step.
         """
         if not self.model.may_spin:
             return matrix
@@ -234,9 +234,9 @@ class Assembly:
 
     def imbalance(self, shapes: Shapes, given: Inputs) -> Vector:
         """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""
-        (slope,) = self._call_segments("segment_slope", shapes, given)
-        _, end_slope, _ = self._call_ends("at_ends", shapes, given)
-        return self._added(slope, end_slope)
+        (gradient,) = self._call_segments("segment_slope", shapes, given)
+        _, end_gradient, _ = self._call_ends("at_ends", shapes, given)
+        return self._added(gradient, end_gradient)
 
     def _band(self, bend: FloatArray, ends: FloatArray) -> BandMatrix:
         first, last, border = self._parts
@@ -248,12 +248,12 @@ class Assembly:
 
     def energy(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers."""
-        total, slope, _ = self.balance(shapes, given)
-        return total - self.work(shapes, slope)
+        total, gradient, _ = self.balance(shapes, given)
+        return total - self.work(shapes, gradient)
 
-    def work(self, shapes: Shapes, slope: Vector) -> FloatArray:
+    def work(self, shapes: Shapes, gradient: Vector) -> FloatArray:
         """Work (m,) [J] of the multipliers in the Lagrangian, whose gradient is given."""
-        own = shapes.lam * slope.y[:, :, 0] * self.model.are_multipliers
+        own = shapes.lam * gradient.y[:, :, 0] * self.model.are_multipliers
         return np.asarray(own.sum(axis=1))
 
     def imbalance_by(self, shapes: Shapes, given: Inputs, along: Tangents) -> Vector:
@@ -267,7 +267,7 @@ class Assembly:
     def add_by_numbers(
         self, total: FloatArray | float, blocks: FloatArray, along: Tangents
     ) -> FloatArray:
-        """Add to a total the change along p, rest and deviation, of derivatives of segments."""
+        """Add the change along p, rest and deviation to a total, given derivatives of segments."""
         n_p = along.p.shape[1]
         n_r = n_p + self.n_inside
         total = total + blocks[..., :n_p] @ along.p[:, None]
@@ -291,7 +291,7 @@ class Assembly:
         return self._stations(advance[..., 0], given.poses[:, : self.node.dimension])[0]
 
     def curve(self, shapes: Shapes, given: Inputs) -> FloatArray:
-        """Measured places, and slopes dr/ds of smooth elements, (m, n + 1, d or 2 d)."""
+        """Measured places, and dr/ds of smooth elements, (m, n + 1, d or 2 d)."""
         (advance,) = self._call_segments("segment_curve", shapes, given)
         (rows,) = self._call_stations("station", advance[..., 0], shapes, given)
         return rows[..., 0]
@@ -306,7 +306,7 @@ class Assembly:
         return self._mapped(name, count)(places, rates, x, p, ends)
 
     def curve_slopes(self, shapes: Shapes, given: Inputs) -> CurveSlopes:
-        """`curve` and what its derivatives are made of."""
+        """`curve` and the parts of its derivatives."""
         advance, by_moving, by_others = self._call_segments("segment_curve_slopes", shapes, given)
         rows, by_station, by_p = self._call_stations(
             "station_slopes", advance[..., 0], shapes, given
@@ -318,7 +318,7 @@ class Assembly:
         return self._call_ends("reactions", shapes, given)[0][..., 0]
 
     def readings(self, shapes: Shapes, given: Inputs) -> FloatArray:
-        """`reactions` as sensors show them."""
+        """`reactions` as measured by sensors."""
         return self._call_ends("readings", shapes, given)[0][..., 0]
 
     def readings_along(self, shapes: Shapes, given: Inputs, along: Tangents) -> FloatArray:
@@ -342,24 +342,24 @@ class Assembly:
         return by_strain.reshape((m, n_cells * strains, *columns))
 
     def state_after(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, ...]:
-        """Rest strains (m, n_rests) that poses leave; their slopes by both nodes, rest and p.
+        """Rest strains (m, n_rests) after poses, and their derivatives.
 
-        The slopes are (m, n_rests, 2b), (m, n_rests, strains) by the cell's own rest strains, and
-        (m, n_rests, n_parameters).
+        These are by both nodes (m, n_rests, 2b), by the cell's own rest strains (m, n_rests,
+        strains), and by p (m, n_rests, n_parameters).
         """
         found = self._call_segments("segment_state", shapes, given)
-        after, *slopes = (self._stacked(part[:, self.chain.layout.bends]) for part in found)
-        return (after[..., 0], *slopes)
+        after, *by = (self._stacked(part[:, self.chain.layout.bends]) for part in found)
+        return (after[..., 0], *by)
 
     def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
-        """Whether poses hand on the rest curvature that they find, to first order."""
+        """Whether poses leave the rest curvature unchanged, to first order."""
         same = np.repeat(np.eye(len(self.node.strains)), self.chain.n_cells, axis=0)
         return bool(np.all(slopes[2] == same))
 
     def state_along(
         self, slopes: tuple[FloatArray, ...], x: FloatArray, rest: FloatArray, p: FloatArray
     ) -> FloatArray:
-        """Change (m, n_rests, q) of what poses leave behind, along nodes, rest and p."""
+        """Change (m, n_rests, q) of the rest strains after poses, along nodes, rest and p."""
         _, by_x, by_rest, by_p = slopes
         strains = (1, len(self.node.strains), 1)
         both = np.tile(self._both(x)[:, self.chain.layout.bends], (*strains, 1))
@@ -370,7 +370,7 @@ class Assembly:
 
 @lru_cache(maxsize=MODELS)
 def assembly_of(model: CableModel) -> Assembly:
-    """A model's functions evaluated for many poses, made once."""
+    """The assembly of a model, made once."""
     return Assembly(model)
 
 

@@ -20,19 +20,19 @@ StartKind = Literal["pinned", "clamped"]
 EndKind = Literal["pinned", "clamped", "free"]
 
 BENDING_STIFFNESS = "bending_stiffness"
-# ln(1000): a prior of the stiffness may be off by three decades.
+# Prior std of log EI, ln(1000): a first guess may be off by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
-# ln(3): GJ over EI is 1 / (1 + nu) in a solid round rod; strands and jackets make it less or more.
+# Prior std of log(GJ / EI), ln(3): 1 / (1 + nu) in a solid round rod, other values with strands.
 STIFFNESS_RATIO_STD = float(np.log(3.0))
 # Prior std of the end roll [rad]: the twist at which the cable was gripped is unknown.
 ROLL_STD = 1.0
 TORSIONAL_STIFFNESS = "torsional_stiffness"
 STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
-# Elements of `CableModel.coarse`.
+# Number of elements of `CableModel.coarse`.
 COARSE_MESH = 10
-# Roll of the end clamp about the cable against what is declared [rad]: rest twist, see design.
+# Name of the parameter: roll of the end clamp against the declared one [rad], as by a rest twist.
 END_ROLL = "end_roll"
-# Numbers that tell where the camera of a pose stood, see `Pose.vector`.
+# Size of the camera's part of `Pose.vector`.
 VIEWPOINT_SIZE = 3
 
 
@@ -58,12 +58,12 @@ class CableModel:
     gravity : (dimension,) [m/s^2]
         In the board frame; three numbers for a cable in space.
     effects : tuple of Effect
-        In the order in which those of one segment are applied.
+        In the order in which those of one kind are applied.
     n_rest : int
         Number of spline coefficients of the rest curvature; 0 = straight at rest.
     priors : dict
-        Standard deviations of Gaussian priors on effect parameters by qualified name: what is
-        within a declared tolerance is a nuisance, not an effect.
+        Standard deviations of Gaussian priors on effect parameters by qualified name: these
+        effects are nuisances within a declared tolerance, not findings.
 
     Notes
     -----
@@ -108,17 +108,17 @@ class CableModel:
 
     @property
     def node(self) -> type[Node]:
-        """What the nodes carry."""
+        """The kind of its nodes."""
         return self.chain.kind.node
 
     @property
     def n_pose(self) -> int:
-        """Numbers that declare one pose, see `pose.Pose.vector`."""
+        """Size of `pose.Pose.vector`."""
         return EndConditions.size(self.node) + VIEWPOINT_SIZE
 
     @property
     def deviation_names(self) -> tuple[str, ...]:
-        """What may be different in every pose."""
+        """Names of the unknowns that each pose has of its own."""
         return deviation_names(self.node)
 
     @cached_property
@@ -130,7 +130,7 @@ class CableModel:
     def rest_basis(self) -> FloatArray:
         """Rest curvature per coefficient (n_rests, n_coefficients): kappa_0 = rest_basis @ c.
 
-        In space the coefficients about the axis z follow those about y; the rest twist is none.
+        In space the coefficients about the axis z follow those about y; the rest twist is zero.
         """
         means, strains = self.rest.cell_means(self.chain.cells), len(self.node.strains)
         return np.kron(np.eye(strains)[:, -len(self.node.curvatures) :], means)
@@ -151,7 +151,7 @@ class CableModel:
         listed = [_stiffness(BENDING_STIFFNESS, self.cable.bending_stiffness)]
         if self.cable.torsional_stiffness is not None:
             torsion = _stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness)
-            # Known by its ratio to the bending stiffness, see `Unknowns.prior_precision`.
+            # Its prior is on the ratio to the bending stiffness, see `Unknowns.prior_precision`.
             listed.append(replace(torsion, prior_std=np.inf))
             if self.start == self.end == "clamped":
                 std = self.priors.get(END_ROLL, ROLL_STD)
@@ -172,7 +172,7 @@ class CableModel:
 
     @property
     def stiffness_indices(self) -> list[int]:
-        """Where the stiffnesses stand in the vector `p`, bending first."""
+        """Indices of the stiffnesses in the vector `p`, bending first."""
         return [k for k, name in enumerate(self.names) if name in STIFFNESSES]
 
     @cached_property
@@ -208,7 +208,7 @@ class CableModel:
 
     @property
     def n_inner(self) -> int:
-        """Number of unknowns inside a segment beside its nodes: axial strain, and the element's."""
+        """Number of internal unknowns of a segment: those of the element, and the axial strain."""
         return int(self.extensible) + self.chain.kind.n_inner
 
     @property
@@ -218,9 +218,9 @@ class CableModel:
 
     @property
     def may_spin(self) -> bool:
-        """Whether nothing but a rest curvature tells how the cable is turned about its own axis.
+        """Whether only a rest curvature determines the roll of the cable about its own axis.
 
-        So it is in space between ball joints, with a section that bends alike about all axes.
+        That is so in space between ball joints, with one bending stiffness about all axes.
         """
         held = "clamped" in (self.start, self.end)
         laws = [effect for effect in self.effects if isinstance(effect, SectionLaw)]
@@ -245,7 +245,7 @@ class CableModel:
 
     @property
     def n_springs(self) -> int:
-        """Number of springs from places of the cable."""
+        """Number of springs at places of the cable."""
         return sum(effect.n_springs for effect in self.effects if isinstance(effect, Load))
 
     @property
@@ -257,8 +257,8 @@ class CableModel:
     def border_names(self) -> tuple[str, ...]:
         """Names of the unknowns beside the nodes: end conditions' multipliers, then springs'.
 
-        A spring's place y [m] is an unknown of its own, held on the cable by its pull [N]: so that
-        no node knows more than its neighbours, see `SpringAt`.
+        A spring's place y [m] is an unknown of its own, held on the cable by a multiplier [N]: the
+        Hessian then couples neighbouring nodes only, see `SpringAt`.
         """
         own = [f"{what}_{axis}" for what in ("place", "pull") for axis in self.node.axes]
         springs = [f"spring_{k}.{name}" for k in range(self.n_springs) for name in own]
@@ -266,7 +266,7 @@ class CableModel:
 
     @property
     def n_multipliers(self) -> int:
-        """How many of the border are multipliers: negative eigenvalues of a minimum's tangent."""
+        """Number of multipliers in the border: negative eigenvalues of a minimum's Hessian."""
         return self.n_conditions + self.node.dimension * self.n_springs
 
     @cached_property
@@ -280,7 +280,7 @@ class CableModel:
         return self._held("end_position")
 
     def _held(self, place: str) -> tuple[str, ...]:
-        """Components of what is held: of the end's place, as it is called, and of clamps."""
+        """Names of the held components: of the end's place, which is called so, and of clamps."""
         names = [] if self.end == "free" else [f"{place}_{axis}" for axis in self.node.axes]
         for side, kind in (("start", self.start), ("end", self.end)):
             names += [f"{side}_{turn}" for turn in self.node.turns if kind == "clamped"]
@@ -288,10 +288,10 @@ class CableModel:
 
     @cached_property
     def tipped_by(self) -> str | None:
-        """The end condition whose angle decides on which of two sides the cable hangs lower.
+        """The end condition whose angle decides which of two sides has the lower energy.
 
-        A free end falls to either side of a clamp that points up; between two clamps in space the
-        cable is twisted either way round where one is rolled by half a turn. Others have no sides.
+        A free end falls to either side of a clamp that points up; between two clamps in space, one
+        rolled by half a turn, the cable is twisted either way round. Others have no two sides.
         """
         turned = {("clamped", "free"): "start_heading", ("clamped", "clamped"): "end_rotation_x"}
         name = turned.get((self.start, self.end))
@@ -320,7 +320,7 @@ class Tolerances:
     moment_bias: float = 2e-3
 
     def deviation(self, node: type[Node]) -> FloatArray:
-        """Standard deviations of a pose's deviations, see `deviation_names`; pulls are free."""
+        """Standard deviations of `deviation_names`; infinite for unknown forces."""
         turn = self.heading if node.increment == 1 else self.rotation
         sizes = (self.end, turn, np.inf)
         counts = (node.dimension, 2 * node.increment, node.dimension)

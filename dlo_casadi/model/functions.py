@@ -1,4 +1,4 @@
-"""What a segment, an end or a node adds, as one CasADi function each.
+"""CasADi functions of one segment, of the ends, and of one element boundary.
 
 Every stage differentiates the same expressions, see `lagrangian`; the functions are mapped over the
 cable, see `assembly`.
@@ -32,8 +32,8 @@ class Functions:
         rest, place = self.terms.rest_strains, self.terms.place
         self._segment_arguments = [x, lam, p, rest, place, deviation]
         self._end_arguments = [x, lam, p, self.terms.pose, deviation]
-        # Lagrangians are differentiated by the nodes' increments and the multipliers, those of
-        # segments then by the numbers that they depend on.
+        # Variables of the first and second derivatives, and the numbers by which gradients of
+        # segments are differentiated, too.
         self._by, self._numbers = ca.vertcat(self.terms.delta, lam), ca.vertcat(p, rest, deviation)
 
     def _here(
@@ -41,8 +41,8 @@ class Functions:
     ) -> ca.Function:
         """A function at increments of zero, its outputs dense.
 
-        What is evaluated often is worth the search for common subexpressions: it takes away a
-        fifth of the operations, and of many effects' derivatives longer than the evaluation.
+        With `often`, common subexpressions are eliminated: a fifth of the operations is saved. For
+        derivatives of many effects the search takes longer than it saves.
         """
         still = ca.SX.zeros(self.terms.delta.shape)
         found = ca.substitute(outputs, [self.terms.delta], [still])
@@ -59,14 +59,14 @@ class Functions:
     def _gradient(self) -> ca.SX:
         """Gradient (2b + k,) of the Lagrangian of a segment."""
         if self.kind.framed:
-            return self._of_pulls @ self._about_nodes.gradient
+            return self._of_forces @ self._about_nodes.gradient
         return ca.gradient(self.terms.segment_terms.lagrangian, self._by)
 
     @cached_property
     def segment(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation) -> L_e, its gradient (2b + k,) and Hessian."""
         if self.kind.framed:
-            found, spread = self._about_nodes, self._of_pulls
+            found, spread = self._about_nodes, self._of_forces
             value, hessian = found.value, spread @ found.hessian @ spread.T
         else:
             value = self.terms.segment_terms.lagrangian
@@ -75,7 +75,7 @@ class Functions:
 
     @cached_property
     def segment_slope(self) -> ca.Function:
-        """As `segment` -> its gradient alone, for a small part of the operations."""
+        """As `segment` -> its gradient alone, which takes far fewer operations."""
         return self._of_segment("segment_slope", self._gradient)
 
     @cached_property
@@ -89,9 +89,9 @@ class Functions:
     def segment_potential(self) -> ca.Function:
         """(x, lam, p, rest, place, deviation, inner) -> energy [J] to minimise, and conditions.
 
-        The segment's share (n_border,) of the conditions on places is the slope by the multipliers.
-        The unknowns inside are, for an extensible cable, a_e with the axial strain sqrt(C) a_e and
-        the energy h a_e^2 / 2, and the element's own.
+        The segment's part (n_border,) of the conditions on places is the gradient by the
+        multipliers. The internal unknowns are those of the element and, of an extensible cable,
+        a_e with the axial strain sqrt(C) a_e and the energy h a_e^2 / 2.
         """
         kind, inner = self.kind, self.terms.inner
         unknowns = ca.SX.sym("unknowns", self.model.n_inner)
@@ -113,14 +113,14 @@ class Functions:
     def _framed(self) -> SegmentInFrame:
         """The segment in space, at this model's own symbols."""
         free, lam = self.model.end == "free", self.terms.lam
-        pulls = [ca.SX.zeros(3)] * free + [lam[k : k + 3] for k in self._pull_rows]
+        held = [ca.SX.zeros(3)] * free + [lam[k : k + 3] for k in self._force_rows]
         _, _, p, rest, place, deviation = self._segment_arguments
         numbers = SegmentNumbers(p, rest, place, deviation, ca.SX(self.terms.shares(p, place)))
-        return self.terms.in_frame(self.terms.x, ca.horzcat(*pulls), numbers)
+        return self.terms.in_frame(self.terms.x, ca.horzcat(*held), numbers)
 
     @property
-    def _pull_rows(self) -> list[int]:
-        """First rows in the multipliers of the force on the end's holder and of springs' pulls."""
+    def _force_rows(self) -> list[int]:
+        """First rows, in the border, of the force on the end's holder and of springs' forces."""
         springs = [self.model.n_conditions + 6 * k + 3 for k in range(self.model.n_springs)]
         return springs if self.model.end == "free" else [0, *springs]
 
@@ -131,12 +131,12 @@ class Functions:
         return framed.derivatives().about(*framed.node_turns)
 
     @property
-    def _of_pulls(self) -> ca.DM:
-        """Matrix from both nodes and the pulls to both nodes and all multipliers."""
+    def _of_forces(self) -> ca.DM:
+        """Matrix from both nodes and these forces to both nodes and the border."""
         every = np.eye(6 + self.model.n_border)
         none = [np.zeros((len(every), 3))] * (self.model.end == "free")
-        pulls = [every[:, 6 + k : 9 + k] for k in self._pull_rows]
-        return ca.sparsify(ca.DM(np.hstack([every[:, :6], *none, *pulls])))
+        forces = [every[:, 6 + k : 9 + k] for k in self._force_rows]
+        return ca.sparsify(ca.DM(np.hstack([every[:, :6], *none, *forces])))
 
     @cached_property
     def at_ends(self) -> ca.Function:
@@ -148,9 +148,9 @@ class Functions:
     def segment_sensitivity(self) -> ca.Function:
         """As `segment` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
         if self.kind.framed:
-            first, last, pulled = self._framed.by_numbers(self._numbers)
+            first, last, by_lam = self._framed.by_numbers(self._numbers)
             turns = self._framed.node_turns
-            mixed = self._of_pulls @ ca.vertcat(turns[0] @ first, turns[1] @ last, pulled)
+            mixed = self._of_forces @ ca.vertcat(turns[0] @ first, turns[1] @ last, by_lam)
         else:
             mixed = ca.jacobian(self._gradient, self._numbers)
         return self._of_segment("segment_sensitivity", mixed, often=False)
@@ -169,7 +169,7 @@ class Functions:
 
     @cached_property
     def _rates(self) -> ca.SX:
-        """Length ratio of a segment and, in a plane, its turning d phi / ds [1/m]."""
+        """Length ratio of a segment and, in a plane, its curvature d phi / ds [1/m]."""
         if self.node.increment > 1:  # no map of the measurement depends on a frame
             return self.terms.segment_terms.ratio
         turning = self.terms.stretch * self.kind.strain(self._plain)
@@ -177,7 +177,7 @@ class Functions:
 
     @cached_property
     def segment_curve(self) -> ca.Function:
-        """As `segment` -> advance [m], length ratio and, in a plane, turning [1/m]."""
+        """As `segment` -> advance [m], length ratio and, in a plane, curvature [1/m]."""
         return self._of_segment("segment_curve", self._advanced)
 
     @cached_property
@@ -186,7 +186,7 @@ class Functions:
         by = (self._by, self._numbers)
         if self.kind.framed:
             # The advance is the Lagrangian's derivative by the force on the end's holder.
-            by_nodes = (self._of_pulls @ self._about_nodes.hessian)[:, 6:9].T
+            by_nodes = (self._of_forces @ self._about_nodes.hessian)[:, 6:9].T
             advance = [by_nodes, self._framed.by_numbers(self._numbers)[2][:3, :]]
             ratio = [ca.jacobian(self._rates, one) for one in by]
             blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
@@ -196,28 +196,28 @@ class Functions:
 
     @cached_property
     def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
-        """Arguments, place (and slope) in the measurement of one station, and what moves it."""
+        """Arguments of one station, its measured place (and dr/ds), and the variables of both."""
         kind, node = self.kind, self.node
         point, rates = ca.SX.sym("point", node.dimension), ca.SX.sym("rates", self._rates.numel())
         frame = ca.SX.sym("frame", node.coordinates)
-        slope = rates[0] * node.tangent(frame)
+        tangent = rates[0] * node.tangent(frame)
         image = point
         maps = self.terms.effects_of(MeasurementEffect)
         for effect, local in maps:
             image = effect.observe(image, frame, self.terms.viewpoint, local)
         rows = image
         if kind.smooth:
-            slope = ca.jtimes(image, point, slope) if maps else slope
+            tangent = ca.jtimes(image, point, tangent) if maps else tangent
             for turning in ca.vertsplit(rates)[1:]:
-                slope += ca.jtimes(image, frame, turning)
-            rows = ca.vertcat(image, slope)
+                tangent += ca.jtimes(image, frame, turning)
+            rows = ca.vertcat(image, tangent)
         rows = ca.substitute(rows, frame, node.middle(*self.terms.moved))
         arguments = [point, rates, self.terms.x, self.terms.p, self.terms.pose]
         return arguments, rows, ca.vertcat(point, rates, self.terms.delta)
 
     @cached_property
     def station(self) -> ca.Function:
-        """(point, rates, x, p, ends) of an element boundary -> its image: place, slope dr/ds."""
+        """(point, rates, x, p, ends) of an element boundary -> measured place, and dr/ds there."""
         arguments, rows, _ = self._seen
         return self._here("station", arguments, [rows])
 
@@ -241,7 +241,7 @@ class Functions:
 
     @cached_property
     def segment_state(self) -> ca.Function:
-        """As `segment` -> rest strains of the cell after it; by increments, rest and p."""
+        """As `segment` -> rest strains of the cell after the pose; by increments, rest and p."""
         own = self.terms.rest_strains[::3]
         strain, mean = self.kind.strain(self._plain), own
         for effect, local in self.terms.effects_of(StateEffect):
@@ -256,9 +256,9 @@ class Functions:
     def _reactions(self) -> ca.SX:
         """Forces [N] and moments [N m] of the cable on its fixtures, see `ends.REACTIONS`.
 
-        Forces are minus the slope of the Lagrangian by the ends' places, nodes and multipliers
-        kept. Moments, about the world's axes, are the slope by turns of the first and last node of
-        what the holders add to it: multipliers of clamps, springs of pins.
+        Forces are minus the gradient of the Lagrangian by the ends' places at fixed nodes and
+        multipliers. Moments, about the world's axes, are the gradient of the holders' part of it
+        (multipliers of clamps, springs of pins) by rotations of the first and last node.
         """
         node, x, delta = self.node, self.terms.x, self.terms.delta
         places = -ca.gradient(self.terms.ends_lagrangian, self.terms.pose)[: 2 * node.dimension]
@@ -280,7 +280,7 @@ class Functions:
 
     @cached_property
     def _readings(self) -> ca.SX:
-        """The same as sensors show them."""
+        """The same as measured by sensors."""
         rows, of = self._reactions, reaction_rows(self.node)
         for effect, local in self.terms.effects_of(MeasurementEffect):
             parts = effect.feel({name: rows[at] for name, at in of.items()}, local)
@@ -289,7 +289,7 @@ class Functions:
 
     @cached_property
     def readings(self) -> ca.Function:
-        """As `reactions`, as sensors show them."""
+        """As `reactions` -> the same as measured by sensors."""
         return self._of_ends("readings", self._readings)
 
     @cached_property
@@ -300,7 +300,7 @@ class Functions:
 
     @cached_property
     def dead_load(self) -> ca.Function:
-        """P -> sum of the dead loads (dimension,) [N], without those of single poses."""
+        """(p) -> sum of the dead loads (dimension,) [N], without those of single poses."""
         still = ca.SX.zeros(len(self.model.deviation_names))
         load = ca.substitute(self.terms.total_load, self.terms.deviation, still)
         return ca.Function("dead_load", [self.terms.p], [ca.densify(load)])

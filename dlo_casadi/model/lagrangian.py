@@ -34,13 +34,13 @@ from dlo_casadi.rod.element import Cell, Section, Segment
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentInFrame
 
-# Models whose expressions and functions are kept: a diagnosis compares some thirty at a time.
+# Number of models whose expressions and functions are cached: a diagnosis compares some thirty.
 MODELS = 64
 
 
 @dataclass(frozen=True)
 class _SegmentTerms:
-    """Expressions of one segment: its Lagrangian and its share of the stretched, bowed curve."""
+    """Expressions of one segment: its Lagrangian, its advance and its length ratio."""
 
     lagrangian: ca.SX
     advance: ca.SX
@@ -48,7 +48,7 @@ class _SegmentTerms:
 
 
 class SegmentNumbers(NamedTuple):
-    """What a segment depends on beside its nodes and multipliers."""
+    """Arguments of a segment beside its nodes and multipliers."""
 
     p: ca.SX
     rest: ca.SX
@@ -69,11 +69,11 @@ class Lagrangian:
     p : (n_parameters,)
         In the order of `model.names`.
     pose : (n_pose,)
-        What is declared of one pose, see `pose.Pose.vector`.
+        A declared pose, see `pose.Pose.vector`.
     deviation : (n_deviations,)
-        Of one pose from its declared ends, see `deviation_names`.
+        Unknowns of one pose of its own, see `deviation_names`.
     lam : (n_border,)
-        Border: multipliers of the end conditions, then place and pull of each spring.
+        Border: multipliers of the end conditions, then place and multiplier of each spring.
     x, delta : (2 coordinates,), (2 increment,)
         Coordinates of the two nodes of a segment, or of the first and last; their increments.
     rest_strains : (3 strains,) [1/m]
@@ -81,7 +81,7 @@ class Lagrangian:
     place : (5,)
         A row of `Layout.segments`.
     inner : (n_inner,)
-        Unknowns inside an element that are eliminated from it.
+        Internal unknowns of an element, which are eliminated.
     """
 
     def __init__(self, model: CableModel) -> None:
@@ -97,7 +97,7 @@ class Lagrangian:
         self.inner = ca.SX.sym("inner", self.kind.n_inner)
 
     def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
-        """Effects of one segment of the model with their own parameters."""
+        """Effects of one kind in the model, with their own parameters."""
         names, cable = self.model.names, self.model.cable
         picked = []
         for effect in self.model.effects:
@@ -118,7 +118,7 @@ class Lagrangian:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """From where the points of a pose are measured."""
+        """Where the camera of a pose stands."""
         start = EndConditions.of(self.declared_ends, self.node).start
         return Viewpoint(start, self.pose[-3:-1], self.pose[-1])
 
@@ -134,14 +134,14 @@ class Lagrangian:
         return self.kind.local(*self.moved)
 
     def spring_unknowns(self, k: int) -> tuple[ca.SX, ca.SX]:
-        """Place and pull of a spring."""
+        """Place and multiplier of a spring."""
         d = self.node.dimension
         own = self.lam[self.model.n_conditions + 2 * d * k :][: 2 * d]
         return own[:d], own[d:]
 
     @cached_property
     def true_ends(self) -> EndConditions:
-        """Where the ends really are: declared, deviation of the pose, boundary effects."""
+        """True ends: as declared, plus the pose's deviation and the boundary effects."""
         d, b = self.node.dimension, self.node.increment
         place, first, last, _ = ca.vertsplit(self.deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
         declared = EndConditions.of(self.declared_ends, self.node)
@@ -155,7 +155,7 @@ class Lagrangian:
 
     @cached_property
     def held(self) -> ca.Function:
-        """(p, ends, deviation) -> where the ends really are, length without load [m].
+        """(p, ends, deviation) -> true ends, length without load [m].
 
         The ends as `EndConditions.vector`, declared and true.
         """
@@ -179,14 +179,14 @@ class Lagrangian:
 
     @cached_property
     def felt_gravity(self) -> ca.SX:
-        """Gravity [m/s^2] as every weight feels it."""
+        """Gravity [m/s^2] with the effects that change it."""
         gravity = ca.SX(ca.DM(self.model.gravity))
         for effect, local in self.effects_of(Load):
             gravity = effect.gravity(gravity, local)
         return gravity
 
     def resultant(self, s: ca.SX | float) -> ca.SX:
-        """Force [N] of all that is spread along the cable on its part beyond s."""
+        """Force [N] of all distributed loads on the part of the cable beyond s."""
         weight = self.model.cable.mass / self.model.cable.length * self.felt_gravity
         total = weight * (self.model.cable.length - s)
         for effect, local in self.effects_of(Load):
@@ -195,13 +195,13 @@ class Lagrangian:
 
     @cached_property
     def dead_forces(self) -> list[PointForceAt]:
-        """Dead forces on single places of the cable."""
+        """Dead point forces on the cable."""
         loads = self.effects_of(Load)
         return [f for effect, local in loads for f in effect.forces(self.felt_gravity, local)]
 
     @cached_property
     def springs(self) -> list[SpringAt]:
-        """Springs from places of the cable."""
+        """Springs at places of the cable."""
         return [k for effect, local in self.effects_of(Load) for k in effect.springs(local)]
 
     @cached_property
@@ -212,7 +212,7 @@ class Lagrangian:
     def segment(
         self, ratio: ca.SX, inner: ca.SX, square: ca.SX, local: ca.SX | None = None
     ) -> Segment:
-        """The segment's symbols; numbers that all segments share are written in."""
+        """The segment's symbols; numbers that all segments share are constants."""
         table = self.model.chain.layout.segments
         alike = np.all(table == table[0], axis=0)
         place = [ca.SX(table[0, i]) if alike[i] else self.place[i] for i in range(len(alike))]
@@ -260,7 +260,7 @@ class Lagrangian:
         return ca.Function("section_moment", [bend, self.p], [ca.gradient(energy, bend)])
 
     def segment_energy(self, segment: Segment) -> ca.SX:
-        """Energy of bending and loads of one segment [J]: of loads, minus their work along it."""
+        """Elastic energy of one segment minus the work of the loads along it [J]."""
         return self.elastic_energy(segment) - self.work_along(segment, self.forces_on(segment))
 
     def work_along(self, segment: Segment, forces: list[ca.SX]) -> ca.SX:
@@ -275,13 +275,13 @@ class Lagrangian:
         return work
 
     def forces_on(self, segment: Segment) -> list[ca.SX]:
-        """Dead forces [N] on a segment: at the points of its rule, then those on single places."""
+        """Dead forces [N] on a segment: at its quadrature points, then the point forces."""
         spread = [self.resultant(segment.start + u * segment.length) for u in self.kind.rule[0]]
         return [*spread, *(force.force for force in self.dead_forces)]
 
     @cached_property
     def share_symbols(self) -> ca.SX:
-        """Shares of a segment up to the places of the forces, then of the springs, 0 to 1."""
+        """Shares (0 to 1) of a segment that lie before each point force, then each spring."""
         return ca.SX.sym("share", len(self.dead_forces) + self.model.n_springs)
 
     @cached_property
@@ -298,7 +298,7 @@ class Lagrangian:
         return ca.substitute(expressions, [self.share_symbols], [self.shares(self.p, self.place)])
 
     def work_of_multipliers(self, segment: Segment) -> ca.SX:
-        """Work of the multipliers of places, the end's and the springs', along a segment [J]."""
+        """Work of the multipliers of places, of the end and of springs, along a segment [J]."""
         work = ca.SX(0)
         if self.model.end != "free":
             work = ca.dot(self.lam[: self.node.dimension], self.kind.advance(segment))
@@ -315,11 +315,11 @@ class Lagrangian:
 
     @cached_property
     def segment_terms_by_share(self) -> _SegmentTerms:
-        """A segment's Lagrangian, and its curve, stretched by the tension and bowed.
+        """A segment's Lagrangian, and its curve with axial strain and bubble.
 
             L_e = V_e + lam^T advance_e - h C N_e^2 / 2,   N_e = -(1/h) dL_e/d(ratio)
 
-        which is exact for dead loads; the inner unknowns are eliminated.
+        which is exact for dead loads; the internal unknowns are eliminated.
         """
         kind, h = self.kind, self.model.chain.h
         ratio, inner = ca.SX.sym("ratio"), self.inner
@@ -340,22 +340,22 @@ class Lagrangian:
             lagrangian -= self.axial_compliance * h * tension**2 / 2
             stretched = self.stretch + self.axial_compliance * tension
         true = self.segment(stretched, condensed.inner, condensed.square)
-        # The curve whose end the Lagrangian's derivative by the multipliers holds.
+        # The derivative of the Lagrangian by the multipliers holds the end of this curve.
         return _SegmentTerms(lagrangian, kind.advance(true), stretched)
 
-    def in_frame(self, x: ca.SX, pulls: ca.SX, numbers: SegmentNumbers) -> SegmentInFrame:
+    def in_frame(self, x: ca.SX, held: ca.SX, numbers: SegmentNumbers) -> SegmentInFrame:
         """A segment in space, written in the frame in its middle.
 
         Parameters
         ----------
         x : (8,)
             Frames of both nodes.
-        pulls : (3, 1 + n_springs) [N]
-            Force on the end's holder, then the springs' pulls.
+        held : (3, 1 + n_springs) [N]
+            Force on the end's holder, then the multipliers of the springs.
         numbers : SegmentNumbers
         """
         spread, dead = len(self.kind.rule[0]), len(self.dead_forces)
-        weights = np.zeros((spread + dead + self.model.n_springs, pulls.shape[1]))
+        weights = np.zeros((spread + dead + self.model.n_springs, held.shape[1]))
         weights[:spread, 0] = -1.0
         weights[spread + dead :, 1:] = -np.eye(self.model.n_springs)
         loads = self.segment_forces(numbers.p, numbers.place, numbers.deviation)
@@ -364,7 +364,7 @@ class Lagrangian:
             local = ca.vertcat(ca.DM(self.node.identity), phi)
             return ca.SX(self.segment_in_frame(local, inner, forces, *numbers))
 
-        total = ca.SX(loads) + pulls @ ca.DM(weights.T)
+        total = ca.SX(loads) + held @ ca.DM(weights.T)
         return SegmentInFrame(self.kind, energy, x, total, weights)
 
     @cached_property
@@ -379,9 +379,9 @@ class Lagrangian:
     def segment_in_frame(self) -> ca.Function:
         """(local, inner, forces, p, rest, place, deviation, shares) -> energy [J] of a segment.
 
-        Its minimum over the inner unknowns is that of `segment_by_share`. Forces are arguments, so
-        that a segment and the forces on it may be turned together: the energy stays. Multipliers of
-        the end's place and of the springs' are such forces, too, see `in_frame`.
+        Its minimum over the internal unknowns is that of `segment_by_share`. Forces are arguments:
+        the energy does not change when a segment and the forces on it are rotated together.
+        Multipliers of the end's place and of springs are such forces, too, see `in_frame`.
         """
         kind, h, inner = self.kind, self.model.chain.h, self.inner
         ratio, local = ca.SX.sym("ratio"), ca.SX.sym("local", self.local.numel())
@@ -398,7 +398,7 @@ class Lagrangian:
 
     @cached_property
     def compliance_of(self) -> dict[int, ca.SX]:
-        """What the conditions of clamps that give way give per multiplier, by their places."""
+        """Index of the condition of a compliant clamp -> its turn per moment [rad/(N m)]."""
         total = [ca.SX(0), ca.SX(0)]
         for effect, local in self.effects_of(BoundaryEffect):
             total = [c + own for c, own in zip(total, effect.compliance(local), strict=True)]
@@ -415,12 +415,12 @@ class Lagrangian:
 
     @property
     def compliant(self) -> list[int]:
-        """End conditions that give way."""
+        """Indices of the end conditions of compliant clamps."""
         return list(self.compliance_of)
 
     @cached_property
     def ends_lagrangian(self) -> ca.SX:
-        """Lagrangian of the ends: holders, end conditions, and the loads' work at the start."""
+        """Lagrangian of the ends: holders, end conditions, and the work of loads at the start."""
         first, last = self.moved
         held, gap = self.true_ends, self.node.difference
         gaps = [] if self.model.end == "free" else [held.start - held.end]
@@ -432,8 +432,8 @@ class Lagrangian:
         for k, compliance in self.compliance_of.items():
             total -= compliance * self.lam[k] ** 2 / 2
         for k, spring in enumerate(self.springs):
-            place, pull = self.spring_unknowns(k)
-            total += spring.energy(place) + ca.dot(pull, held.start - place)
+            place, multiplier = self.spring_unknowns(k)
+            total += spring.energy(place) + ca.dot(multiplier, held.start - place)
         return total - ca.dot(self.total_load, held.start)
 
 

@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline
 from dlo_casadi.arrays import FloatArray
 
 _DEGREE = 3
-# Cosines of a rest curvature, and its correlation lengths that are tried, shares of L.
+# Number of cosines of a random rest curvature, and its trial correlation lengths as shares of L.
 MODES = 8
 SMOOTHNESS = (0.5, 0.25, 0.12)
 
@@ -61,7 +61,7 @@ class RestCurvature:
 
 @dataclass(frozen=True)
 class RestScatter:
-    """Random rest curvature of every hanging.
+    """Random rest curvature, a different one in each repeat of a pose.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class RestScatter:
     smoothness : float
         Correlation length as a share of the cable's.
     dof : float
-        Degrees of freedom of chi-square with which its variance is known.
+        Degrees of freedom of the chi-square distribution of its estimated variance.
     """
 
     std: float = 0.0

@@ -1,4 +1,4 @@
-"""One pose as a whole, as CasADi expressions for IPOPT: the functions of segments, added up."""
+"""CasADi expressions of a whole pose, for IPOPT: sums of the functions of segments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dlo_casadi.model.lagrangian import lagrangian_of
 
 @dataclass(frozen=True)
 class PoseSymbols:
-    """What a pose's expressions depend on.
+    """Arguments of the expressions of a pose.
 
     `x` (n_nodes coordinates,), `lam` (n_border,), `p` (n_parameters,), `rest` (n_rests,) [1/m],
     `pose` (n_pose,), `deviation` (n_deviations,).
@@ -93,7 +93,7 @@ def balance(model: CableModel, s: PoseSymbols) -> ca.SX:
 
 
 def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
-    """Measured curve ((n + 1) d or 2 d,): place, and slope of smooth elements, node by node."""
+    """Measured curve ((n + 1) d or 2 d,), by node: place, and dr/ds of smooth elements."""
     layout, d, functions = model.chain.layout, model.node.dimension, functions_of(model)
     steps = functions.segment_curve(*_segment_arguments(model, s))[:, layout.advancing.tolist()]
     points = ca.cumsum(ca.horzcat(s.pose[:d], steps[:d, :]), 1)
@@ -106,7 +106,7 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
 
 
 def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
-    """What sensors on the fixtures show (n_reactions,) [N, N m], see `ends.REACTIONS`."""
+    """Wrench measurements (n_reactions,) [N, N m] of sensors, see `ends.REACTIONS`."""
     return functions_of(model).readings(*_end_arguments(model, s))
 
 
@@ -122,8 +122,8 @@ def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
     return [both, s.lam, s.p, s.pose, s.deviation]
 
 
-def _segment_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
-    """A column for each segment, one column of what is alike in all."""
+def _segment_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX | ca.DM]:
+    """A column for each segment, or a single column of what all segments share."""
     chain = model.chain
     x = ca.reshape(s.x, model.node.coordinates, chain.n_nodes)
     after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)

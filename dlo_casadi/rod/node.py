@@ -248,7 +248,7 @@ def conjugate(q: Any) -> tuple[Any, Any, Any, Any]:
     return (-x, -y, -z, w)
 
 
-def rotated(q: ca.SX, vector: Any) -> ca.SX:
+def rotated(q: Any, vector: Any) -> ca.SX:
     """Vector (3,) turned by the unit quaternion q: v + 2 w (u x v) + 2 u x (u x v)."""
     u, w = q[:3], q[3]
     once = 2 * ca.cross(u, vector)

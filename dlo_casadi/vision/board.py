@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dlo_casadi.errors import VisionError
+from dlo_casadi.errors import VisionError, counted
 from dlo_casadi.vision.camera import Array, Camera, Picture, View, Viewpoint
 from dlo_casadi.vision.image import spoilt
 
@@ -129,7 +129,7 @@ def _located(
     ]
     if len(seen) < least:
         raise VisionError(
-            f"the camera's place needs {least} markers of the board, and "
+            f"the camera's place needs {counted(least, 'marker')} of the board, and "
             f"{'only ' if seen else ''}{sorted(seen)} of {sorted(board.marker_centers)} are seen. "
             "Try: a photograph with the whole board in it, sharp and not covered."
             + spoilt(image)
@@ -154,8 +154,8 @@ def _located(
         )
     if len(fit.found) < least:
         raise VisionError(
-            f"the camera's place needs {least} markers of the board where they are declared, and "
-            f"only {sorted(fit.found)} of {sorted(seen)} are. Try: marker_centers?"
+            f"the camera's place needs {counted(least, 'marker')} of the board where they are "
+            f"declared, and only {sorted(fit.found)} of {sorted(seen)} are. Try: marker_centers?"
         )
     used = f"{len(fit.found)} of {len(board.marker_centers)} are used"
     lost = sorted(set(board.marker_centers) - set(fit.found) - repeated)
