@@ -1,7 +1,5 @@
 """What differs between the solver of a cable in a plane and of one in space."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,7 +24,7 @@ def template(name: str) -> str:
     return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
 
 
-def case_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> Case:
+def case_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> "Case":
     """What the templates of this cable are filled with."""
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
     return kind(model, p, rest, inline)

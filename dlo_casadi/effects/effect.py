@@ -6,8 +6,6 @@ values a diagnosis tries, and which other effects may stand for it. All of that 
 effects declare only `name`, `parameters` and their law.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
@@ -163,11 +161,11 @@ class Effect:
         """Arc length [m] at which it acts; None if it acts at more than one place."""
         return None
 
-    def may_be(self, found: Fitted) -> bool:
+    def may_be(self, found: "Fitted") -> bool:
         """Whether another effect that was found may have the same cause, judged by the shapes."""
         return False
 
-    def linear(self) -> Effect:
+    def linear(self) -> "Effect":
         """Return the same effect, of the same label, in the parameters of its score test.
 
         They differ where the derivative by a parameter is zero when the effect vanishes, although

@@ -1,7 +1,5 @@
 """The equilibrium of a cable in one pose: its shape, forces, energy and stability."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 
@@ -83,7 +81,7 @@ class Equilibrium:
     residual: float
     status: Status
     iterations: int
-    other_side: Equilibrium | None = None
+    other_side: "Equilibrium | None" = None
 
     @property
     def shapes(self) -> Shapes:

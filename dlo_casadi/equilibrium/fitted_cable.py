@@ -1,10 +1,8 @@
 """A fitted cable, how well its parameters are known, and its shape in one pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -170,7 +168,7 @@ class CableShape:
     equilibrium: Equilibrium
     curve: CableCurve
     seen: CableCurve
-    other_side: CableShape | None = None
+    other_side: Self | None = None
     tipping: Tipping | None = None
 
     def band(self, count: int = 101) -> FloatArray:

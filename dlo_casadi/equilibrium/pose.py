@@ -1,11 +1,9 @@
 """End conditions of one pose as declared."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -94,7 +92,7 @@ class Pose:
         least = 1e-300
         return first / max(np.linalg.norm(first), least), last / max(np.linalg.norm(last), least)
 
-    def moved(self, start: FloatArray, end: FloatArray, frames: Sequence[FloatArray]) -> Pose:
+    def moved(self, start: FloatArray, end: FloatArray, frames: Sequence[FloatArray]) -> Self:
         """The same pose with other ends; what is free stays free."""
         values = (float(x[0]) if self.node is Heading else tuple(x) for x in frames)
         held: dict[str, Any] = dict(zip(self._direction_names, values, strict=True))
@@ -106,7 +104,7 @@ class Pose:
         end = [] if self.end is None else [np.array(self.end)[None]]
         return np.concatenate([np.array(self.start)[None], points, *end])
 
-    def rolled(self, angle: float) -> Pose:
+    def rolled(self, angle: float) -> Self:
         """The pose with its end clamp, in space, turned about its x axis [rad]."""
         if self.end_orientation is None:
             return self

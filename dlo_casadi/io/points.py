@@ -1,7 +1,5 @@
 """Lines and markers as CSV files: points along a cable in metres, from its start to its end."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Sequence
@@ -49,7 +47,7 @@ class MeasuredPoints:
     s: FloatArray | None = None
     count: FloatArray | float = 1.0
 
-    def means(self, most: int) -> MeasuredPoints:
+    def means(self, most: int) -> "MeasuredPoints":
         """Means of the points on each of at most so many equally long stretches.
 
         White errors average out; a stretch that was not measured has no mean. The mean of a bow of

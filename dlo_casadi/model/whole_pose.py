@@ -1,7 +1,5 @@
 """CasADi expressions of a whole pose, for IPOPT: sums of the functions of segments."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca
@@ -28,7 +26,7 @@ class PoseSymbols:
     deviation: ca.SX
 
     @classmethod
-    def of(cls, model: CableModel) -> PoseSymbols:
+    def of(cls, model: CableModel) -> "PoseSymbols":
         """Fresh symbols."""
         sizes = {
             "x": model.chain.n_nodes * model.node.coordinates,

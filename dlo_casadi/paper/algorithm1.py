@@ -14,13 +14,11 @@ References
 Quartaro, Moser, Cooper, Komendera, Front. Robot. AI 12:1565837 (2025).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -127,7 +125,7 @@ class Target:
     end: FloatArray
 
     @classmethod
-    def of(cls, measured: MeasuredPose, gap: float) -> Target:
+    def of(cls, measured: MeasuredPose, gap: float) -> Self:
         """Take the points of a pose; what is missing over more than `gap` [m] is a gap."""
         line = measured.pose.joined(measured.points) - np.array(measured.pose.start)
         wide = np.hypot(*np.diff(line, axis=0).T) > gap

@@ -4,8 +4,6 @@ A chain of N nodes has S segments, N - 1 or N; segment j joins the nodes j and j
 energy and its shape are sums over segments, so that derivatives couple neighbouring nodes only.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,7 +39,7 @@ class Cell:
         return self.low + self.width
 
     @property
-    def halves(self) -> tuple[Cell, Cell]:
+    def halves(self) -> "tuple[Cell, Cell]":
         """The two halves."""
         half = self.width / 2
         return Cell(self.low, half, self.mesh / 2), Cell(self.middle, half, self.mesh / 2)

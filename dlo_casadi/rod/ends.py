@@ -1,7 +1,5 @@
 """How the ends of a cable are held: their positions and frames, as symbols of one pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 
@@ -49,7 +47,7 @@ class EndConditions:
         return 2 * (node.dimension + node.coordinates)
 
     @classmethod
-    def of(cls, values: ca.SX, node: type[Node]) -> EndConditions:
+    def of(cls, values: ca.SX, node: type[Node]) -> "EndConditions":
         """Split a vector of start, end, start frame, end frame."""
         d, c = node.dimension, node.coordinates
         start, end, first, last = ca.vertsplit(values, [0, d, 2 * d, 2 * d + c, 2 * (d + c)])
@@ -60,13 +58,13 @@ class EndConditions:
         """Start, end, start frame, end frame in one vector."""
         return ca.vertcat(self.start, self.end, self.start_frame, self.end_frame)
 
-    def rolled(self, angle: ca.SX) -> EndConditions:
+    def rolled(self, angle: ca.SX) -> "EndConditions":
         """Return a copy whose end clamp in space is turned about its x axis [rad]."""
         roll = (ca.sin(angle / 2), ca.SX(0), ca.SX(0), ca.cos(angle / 2))
         rolled = quaternion_product(ca.vertsplit(self.end_frame), roll)
         return replace(self, end_frame=ca.vertcat(*rolled))
 
-    def turned(self, start: ca.SX | None = None, end: ca.SX | None = None) -> EndConditions:
+    def turned(self, start: ca.SX | None = None, end: ca.SX | None = None) -> "EndConditions":
         """Return a copy whose clamps are turned by increments about their own axes."""
         first, last = (
             frame if turn is None else self.node.moved(frame, turn)

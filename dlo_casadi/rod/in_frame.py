@@ -19,8 +19,6 @@ Second-order terms: composition of unit quaternions to second order, e.g. Murray
 Mathematical Introduction to Robotic Manipulation, 1994.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -70,7 +68,7 @@ class SegmentDerivatives:
     mixed: tuple[ca.SX, ca.SX]
     lam_lam: ca.SX
 
-    def about(self, first: ca.SX, last: ca.SX) -> SegmentDerivatives:
+    def about(self, first: ca.SX, last: ca.SX) -> "SegmentDerivatives":
         """The same by rotations about other axes, given by matrices (3, 3) from these to those."""
         (g, h), (aa, ab, bb), (al, bl) = self.slopes, self.bends, self.mixed
         return replace(

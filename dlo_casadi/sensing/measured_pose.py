@@ -1,7 +1,5 @@
 """A measured pose: its end conditions, and what its sensors say of it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -79,7 +77,7 @@ class MeasuredPose:
         return self.readable and (self.line is None or len(self.line.points) > 0)
 
     @cached_property
-    def traced(self) -> MeasuredPose:
+    def traced(self) -> "MeasuredPose":
         """The same pose with its line alone; about where its points lie if they show none."""
         if self.line is None:
             return self

@@ -8,11 +8,9 @@ of c measured neighbours, whose white errors average out. Whether the correlated
 likelihood.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,10 +96,10 @@ class NoiseModel:
     source: Source = "estimated"
     slow_dof: float = np.inf
     readings: ReadingNoise = ReadingNoise(1.0, 1.0)
-    before: NoiseModel | None = None
+    before: Self | None = None
 
     @property
-    def of_points(self) -> NoiseModel:
+    def of_points(self) -> Self:
         """What is known of the noise of the points themselves."""
         return self.before if self.before is not None and self.before.known else self
 
@@ -154,7 +152,7 @@ class NoiseModel:
         own = {"point": self.std, "force": self.readings.force, "moment": self.readings.moment}
         return self.std / np.array([own[kind] for kind in kinds])
 
-    def doubted(self, std: float) -> NoiseModel:
+    def doubted(self, std: float) -> "NoiseModel":
         """White noise of that size [m] where it is larger, that of readings grown with it."""
         factor, own = std / self.std, self.readings
         if factor <= 1:
@@ -209,7 +207,7 @@ class NoiseSample:
     correlation_length: float = 0.0
     count: Count = 1.0
 
-    def thinned(self, most: int) -> NoiseSample:
+    def thinned(self, most: int) -> "NoiseSample":
         """Keep at most so many points, evenly picked, and of the own directions what they tell.
 
         A pose's directions may leave the points of one of its photographs where they are.

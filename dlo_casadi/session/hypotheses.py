@@ -1,7 +1,5 @@
 """What a session may have been meant as: hypotheses, and what they are compared by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -67,7 +65,7 @@ class Session:
         return {pose.name: pose for pose in self.config.experiment.poses}
 
     @cached_property
-    def lines(self) -> Lines:
+    def lines(self) -> "Lines":
         """Measured lines beside their declared ends."""
         return lines_of(self.config, self.read)
 

@@ -1,7 +1,5 @@
 """Cameras: pixels to the cable's plane and back, and what is seen of a round cable in space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 
 import cv2
@@ -208,7 +206,7 @@ class Viewpoint(Photograph):
         """Undistorted rays (K, 2), q_xy / q_z, of pixels (K, 2) [px]."""
         return self.camera.undistort(np.asarray(pixels, float).reshape(-1, 2))
 
-    def moved(self, motion: Array) -> Viewpoint:
+    def moved(self, motion: Array) -> "Viewpoint":
         """Turn the board by the rotation vector w and shift it by d in the camera's frame."""
         turn = Rotation.from_rotvec(motion[:3]).as_matrix()
         shift = turn @ self.translation + motion[3:]

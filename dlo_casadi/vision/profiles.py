@@ -1,7 +1,5 @@
 """Smooth curves in a picture, and the sub-pixel position across them from its profiles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2
@@ -88,7 +86,7 @@ class Profiles:
         core = self.values[:, np.abs(self.offset) < 0.3 * diameter].mean(axis=1)
         return core, self.values[:, np.abs(self.offset) > 0.8 * diameter]
 
-    def average(self, trusted: Flags, along: float) -> Profiles:
+    def average(self, trusted: Flags, along: float) -> "Profiles":
         """Average trusted profiles along the curve, with a Gaussian of deviation `along` [m].
 
         That lowers the noise of the pixels and of their compression, and bends nothing, since the

@@ -1,7 +1,5 @@
 """Smooth curves in space through what several photographs show of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -72,7 +70,7 @@ class SpaceCurve:
         ends = self.position(np.array([0.0, 1.0]))[: len(fixtures)]
         return np.asarray(np.linalg.norm(ends - fixtures, axis=1))
 
-    def evenly(self) -> SpaceCurve:
+    def evenly(self) -> "SpaceCurve":
         """Give the same curve with t proportional to its arc length."""
         s = chord_length(self.position(_FINE))
         at = np.interp(_FINE * s[-1], s, _FINE)
