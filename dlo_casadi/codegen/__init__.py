@@ -3,16 +3,3 @@
 from dlo_casadi.codegen.compiled import CompiledSolver
 from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.shapes import STATUSES, Capsule, Gap, HalfSpace, Shape, ShapePath, Slope
-
-__all__ = [
-    "STATUSES",
-    "Capsule",
-    "CompiledSolver",
-    "Gap",
-    "HalfSpace",
-    "Shape",
-    "ShapePath",
-    "Slope",
-    "Solver",
-    "generate",
-]

@@ -14,19 +14,3 @@ from dlo_casadi.config.sections import (
     Pose,
     SkippedPose,
 )
-
-__all__ = [
-    "Camera",
-    "Centerlines",
-    "Config",
-    "DeclaredEffect",
-    "EstimationOptions",
-    "Images",
-    "Pose",
-    "SkippedPose",
-    "declared_setup",
-    "dump_yaml",
-    "load_config",
-    "read_yaml",
-    "wrong_effects",
-]

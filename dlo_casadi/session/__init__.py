@@ -2,5 +2,3 @@
 
 from dlo_casadi.session.outcome import Outcome
 from dlo_casadi.session.run import Progress, Silent, run_session
-
-__all__ = ["Outcome", "Progress", "Silent", "run_session"]

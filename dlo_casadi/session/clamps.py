@@ -16,6 +16,7 @@ from dlo_casadi.session.hypotheses import (
     Suspicion,
     axes_of,
     likeliest,
+    listed,
 )
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import (
@@ -105,7 +106,7 @@ class _Shown:
 
     def __str__(self) -> str:
         way = self.ways[(self.ways @ axes_of(self.value)[:, 0]).argmax()]
-        values, along = _listed(self.value, ".3g"), f"({_listed(way, '.2g')})"
+        values, along = listed(self.value, ".3g"), f"({listed(way, '.2g')})"
         if np.ndim(self.value) == 0:
             values += " rad"
             angle = np.arctan2(way[1], way[0]) if self.turned is None else self.turned
@@ -156,11 +157,7 @@ def _try(shown: Sequence[_Shown]) -> str:
     best = _meant(shown) or _meant([item])
     if not best:
         return f". Try: {_RULE[item.kind]}."
-    return f". Try: {best} then {_listed(_MEANT[item.kind][best](item.value), '.4g')}."
-
-
-def _listed(values: Any, form: str) -> str:
-    return ", ".join(format(x, form) for x in np.atleast_1d(values))
+    return f". Try: {best} then {listed(_MEANT[item.kind][best](item.value), '.4g')}."
 
 
 def _shown(session: Session, side: str) -> Iterator[_Shown]:
@@ -336,7 +333,7 @@ def _about_elsewhere(one: Compared, forces: FloatArray) -> Iterator[Hypothesis[F
     scale, *arm = np.linalg.lstsq(columns, one.measured.ravel(), rcond=None)[0]
     if scale <= 0:
         return
-    told = _listed(-1e3 * np.array(arm) / scale, ".3g")
+    told = listed(-1e3 * np.array(arm) / scale, ".3g")
     axes = "of the clamp" if one.frames is not None else "of gravity's frame"
     yield Hypothesis(
         f"once taken about a point ({told}) mm from the fixture along the axes {axes}, where the "

@@ -22,6 +22,7 @@ from dlo_casadi.session.hypotheses import (
     T,
     exchanges,
     likeliest,
+    listed,
     named,
     overall,
 )
@@ -140,7 +141,7 @@ def _exchanged_axes(lines: Lines, several: bool) -> Iterator[Hypothesis[FloatArr
     """Ends of points from another origin, with other axes, and both."""
     shift = _shift(lines, lines.measured)
     yield Hypothesis(
-        f"all lines lie {_at(shift, '.4g')} m away from their start and end. Try: measure "
+        f"all lines lie ({listed(shift, '.4g')}) m away from their start and end. Try: measure "
         "fixtures and lines from the same origin; subtract this from the points, or add it to "
         "start and end.",
         lines.measured - shift,
@@ -149,7 +150,7 @@ def _exchanged_axes(lines: Lines, several: bool) -> Iterator[Hypothesis[FloatArr
         turned, what = lines.measured @ axes.T, named(axes)
         if moved:
             shift = _shift(lines, turned)
-            turned, what = turned - shift, f"{what} and moved by {_at(-shift, '.4g')} m"
+            turned, what = turned - shift, f"{what} and moved by ({listed(-shift, '.4g')}) m"
         yield _in_frame(what, turned)
 
 
@@ -198,7 +199,7 @@ def _fitted(lines: Lines, turn: FloatArray) -> Hypothesis[FloatArray]:
 
 def _told(turn: FloatArray, shift: FloatArray) -> str:
     """A frame in words: exchanged axes by their names, else how far it is turned and moved."""
-    d, moved = len(turn), f"moved by {_at(shift, '.3g')} m"
+    d, moved = len(turn), f"moved by ({listed(shift, '.3g')}) m"
     near = min(exchanges(d), key=lambda axes: float(np.linalg.norm(turn - axes)))
     if np.linalg.norm(turn - near) < _NAMED * np.sqrt(2) and not np.allclose(near, np.eye(d)):
         return f"{named(near)} and {moved}"
@@ -210,7 +211,7 @@ def _told(turn: FloatArray, shift: FloatArray) -> str:
     angle = float(np.linalg.norm(vector))
     return (
         f"the points {'mirrored, ' if hand < 0 else ''}turned by {np.degrees(angle):.3g} degrees "
-        f"about {_at(vector / max(angle, 1e-12), '.2g')} and {moved}"
+        f"about ({listed(vector / max(angle, 1e-12), '.2g')}) and {moved}"
     )
 
 
@@ -260,16 +261,17 @@ def single_poses(session: Session) -> tuple[Suspicion, ...]:
         (
             turned,
             lambda i: (
-                f"its end {_at(ends[i, 1], 'g')} m is where the other poses have their start. "
+                f"its end ({listed(ends[i, 1], 'g')}) m is where the other poses have their start. "
                 "Try: are start and end exchanged?"
             ),
         ),
         (
             own > CONTRADICTS,
             lambda i: (
-                f"its line runs from {_at(lines.measured[i, 0])} to {_at(lines.measured[i, 1])} "
-                f"m, {own[i] * lines.length:.3g} m RMS away from the declared ends. Try: start "
-                "and end of this pose, and whether it is the right file."
+                f"its line runs from ({listed(lines.measured[i, 0])}) to "
+                f"({listed(lines.measured[i, 1])}) m, {own[i] * lines.length:.3g} m RMS away from "
+                "the declared ends. Try: start and end of this pose, and whether it is the right "
+                "file."
             ),
         ),
     ]
@@ -320,10 +322,6 @@ def stretched(session: Session) -> tuple[Suspicion, ...]:
         said = f"s_m contradicts the points of {told}. {name}: "
         return (Suspicion(said + texts[name] + advice, True),)
     return tuple(Suspicion.of_pose(name, text + advice) for name, text in texts.items())
-
-
-def _at(point: FloatArray, form: str = ".3f") -> str:
-    return f"({', '.join(format(value, form) for value in point)})"
 
 
 # Of these only the first one that finds anything is told; and those that are told beside others.

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations, product
-from typing import Generic, NamedTuple, Self, TypeVar
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -119,6 +119,11 @@ def exchanges(d: int) -> list[FloatArray]:
         for order in permutations(range(d))
         for signs in product((1.0, -1.0), repeat=d)
     ]
+
+
+def listed(values: Any, form: str = ".3f") -> str:
+    """Numbers (n,), or one, in words."""
+    return ", ".join(format(x, form) for x in np.atleast_1d(values))
 
 
 def named(axes: FloatArray) -> str:

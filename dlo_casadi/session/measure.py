@@ -339,10 +339,8 @@ def calibrated(config: Config, step: Callable[[str, int, int], None]) -> Config:
             f"measurement.camera is missing, photographs of a cable {why} need it, and they "
             f"do not show it themselves: {error.message}"
         ) from None
-    matrix = tuple(tuple(row) for row in found.camera.matrix.tolist())
-    camera = DeclaredCamera.model_validate(
-        {"matrix": matrix, "distortion": tuple(found.camera.distortion.tolist())}
-    )
+    own = {key: getattr(found.camera, key).tolist() for key in DeclaredCamera.model_fields}
+    camera = DeclaredCamera.model_validate(own)
     measurement = config.experiment.measurement.model_copy(update={"camera": camera})
     return replace(
         config,

@@ -120,14 +120,12 @@ class Stage:
     @property
     def other_branch(self) -> dict[str, BranchShape]:
         """By name the poses that were measured in another equilibrium than the predicted one."""
-        found = {name: shape.measured_branch for name, shape in self.shapes.items()}
-        return {name: branch for name, branch in found.items() if branch is not None}
+        return {name: found for name, x in self.shapes.items() if (found := x.measured_branch)}
 
     @property
     def measured_side(self) -> dict[str, BranchShape]:
         """By name the fit poses that are compared on another side than a prediction takes."""
-        found = {name: shape.measured_side for name, shape in self.shapes.items()}
-        return {name: side for name, side in found.items() if side is not None}
+        return {name: found for name, x in self.shapes.items() if (found := x.measured_side)}
 
 
 @dataclass(frozen=True)
@@ -431,8 +429,8 @@ class Outcome:
     @property
     def either_side(self) -> dict[str, EitherSide]:
         """Held-out poses by name of which the side is to be told, as the last stage sees them."""
-        found = {name: shape.either_side for name, shape in self.stages[-1].shapes.items()}
-        return {name: either for name, either in found.items() if either and either.told}
+        shapes = self.stages[-1].shapes.items()
+        return {name: found for name, x in shapes if (found := x.either_side) and found.told}
 
     def held_out(self, stage: Stage) -> HeldOut:
         """How many of the declared held-out poses a stage has predicted."""

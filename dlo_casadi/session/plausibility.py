@@ -29,6 +29,7 @@ from dlo_casadi.session.hypotheses import (
     Suspicion,
     clamp_axes,
     exchanges,
+    listed,
     named,
     shown_pull,
     spread,
@@ -339,7 +340,7 @@ def hangs_elsewhere(session: Session) -> tuple[Suspicion, ...]:
         )
     up = f"{[*np.zeros(len(gravity) - 1).tolist(), -9.81]} with {'xyz'[len(gravity) - 1]} up"
     text = (
-        f"the cable does not hang along gravity {_vector(gravity)} m/s^2: {weightless}"
+        f"the cable does not hang along gravity ({listed(gravity + 0.0, 'g')}) m/s^2: {weightless}"
         f"{found.told}. Try: points, start, end and gravity in one frame, such as gravity: {up}."
         + ("" if found.certain else " A strap that lifts the cable would look the same.")
     )
@@ -361,7 +362,7 @@ def _hung_otherwise(session: Session, pull: FloatArray | None) -> Iterator[Hypot
         if not any(np.allclose(way, other) for other in tried):
             tried.append(way)
             meant = session.with_experiment(gravity=tuple(way.tolist()))
-            yield Hypothesis(f"gravity {_vector(way)} m/s^2", meant)
+            yield Hypothesis(f"gravity ({listed(way + 0.0, 'g')}) m/s^2", meant)
     if experiment.boundary.start == experiment.boundary.end == "pinned":
         return  # between pins it is the same to turn the points, and gravity
     kept = [_held(session.declared[item.name], length) for item in session.read]
@@ -385,10 +386,6 @@ def _held(pose: Pose, length: float) -> FloatArray:
     axes = [clamp_axes(pose, side) for side in ("start", "end")]
     kept += [own[:, 0] for own in axes if own is not None]
     return np.array(kept)
-
-
-def _vector(values: FloatArray) -> str:
-    return f"({', '.join(f'{value + 0.0:g}' for value in values)})"
 
 
 def _angle(pull: FloatArray | None, way: FloatArray) -> float:
