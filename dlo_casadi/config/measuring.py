@@ -58,11 +58,7 @@ class Camera(Section):
     """Camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel]."""
     distortion: Annotated[tuple[Number, ...], within(DISTORTION), checked(_unknown_count)] = (
         0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )
+    ) * 5
     """OpenCV's 4, 5, 8, 12 or 14 coefficients k1, k2, p1, p2, k3, k4, ...; [] for none."""
 
 

@@ -168,12 +168,8 @@ def explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any) -
             near = difflib.get_close_matches(str(key), known, 1, cutoff=0.6)
             suggested.update((*above, name) for name in near)
     for error in errors:
-        place, kind, context, found = (
-            error["loc"],
-            error["type"],
-            error.get("ctx", {}),
-            error["input"],
-        )
+        place, kind, found = error["loc"], error["type"], error["input"]
+        context = error.get("ctx", {})
         section, label, key = _section_at(place[:-1], sections), _label(place, data), place[-1]
         if found == PLACEHOLDER:
             text = f"{label} is still to be filled in{_help(section, key)}"
@@ -196,13 +192,12 @@ def explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any) -
         elif kind in ("union_tag_invalid", "union_tag_not_found"):
             place = (*place, "kind")
             text = f"{label}: kind must be images or centerlines, found {show(context.get('tag'))}"
-        elif kind == "value_error" and isinstance(context["error"], Contradiction):
-            for inner in context["error"].problems:
+        elif kind == "value_error":
+            wrong = context["error"]
+            for inner in getattr(wrong, "problems", (Problem((), str(wrong)),)):
                 at = (*place, *inner.place)
                 yield Problem(at, f"{_label(at, data)}: {inner.message}")
             continue
-        elif kind == "value_error":
-            text = f"{label}: {context['error']}"
         elif kind in _MESSAGES:
             words = {
                 "input": show(found),
