@@ -24,9 +24,9 @@ from dlo_casadi.equilibrium.fitted_cable import CableShape, FittedCable, shape_i
 from dlo_casadi.equilibrium.pose import Branch, Pose
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.io.parameters import load_parameters
+from dlo_casadi.report.documents import parameters_of
 from dlo_casadi.report.figures_poses import outcome_figure, prediction_figure
-from dlo_casadi.report.notebook import outcome_html, outcome_text, shape_html, shape_text
-from dlo_casadi.report.parameters_text import parameters_of
+from dlo_casadi.report.tables import outcome_html, outcome_text, shape_html, shape_text
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
 

@@ -23,7 +23,7 @@ from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.report.parameters_text import parameters_of
+from dlo_casadi.report.documents import parameters_of
 
 NOISE = 3e-4
 LIFT, PLACE = 0.4, 0.35  # N, m

@@ -17,7 +17,7 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.io.parameters import load_parameters, parameters_hash
-from dlo_casadi.report.parameters_text import fit_dict, shared_fixtures
+from dlo_casadi.report.documents import fit_dict, shared_fixtures
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import measured_poses, read_inputs
 

@@ -12,7 +12,7 @@ from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
-from dlo_casadi.report.json_report import check_dict
+from dlo_casadi.report.documents import check_dict
 from dlo_casadi.report.terminal import check_table
 from dlo_casadi.session import measure
 from dlo_casadi.session.plausibility import find_suspicions

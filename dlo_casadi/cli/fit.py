@@ -89,7 +89,7 @@ def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:
         begin(executor, os.getpid)
         # These imports take as long as those of the other process, beside which they are made.
         from dlo_casadi.cli.watch import Watch
-        from dlo_casadi.report.json_report import report_dict
+        from dlo_casadi.report.documents import report_dict
         from dlo_casadi.report.terminal import candidate_table, print_summary
         from dlo_casadi.report.writer import ResultsFolder
         from dlo_casadi.session import run_session

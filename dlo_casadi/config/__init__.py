@@ -6,7 +6,6 @@ reported at once, each with its line.
 
 from dlo_casadi.config.document import dump_yaml, read_yaml
 from dlo_casadi.config.load import declared_setup, load_config, wrong_effects
-from dlo_casadi.config.measuring import Camera, Centerlines, Images
 from dlo_casadi.config.sections import (
     Config,
     DeclaredEffect,
@@ -14,3 +13,4 @@ from dlo_casadi.config.sections import (
     Pose,
     SkippedPose,
 )
+from dlo_casadi.config.values import Camera, Centerlines, Images

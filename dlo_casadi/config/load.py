@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.measuring import Tolerances
 from dlo_casadi.config.problems import Place, Problem, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import (
     Cable,
@@ -19,7 +18,7 @@ from dlo_casadi.config.sections import (
     Pose,
     SkippedPose,
 )
-from dlo_casadi.config.values import Range
+from dlo_casadi.config.values import Range, Tolerances
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, Setup
 from dlo_casadi.effects import Cable as EffectsCable
 from dlo_casadi.errors import ConfigError, counted

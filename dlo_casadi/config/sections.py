@@ -12,13 +12,14 @@ from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from dlo_casadi.config.measuring import Centerlines, Images, Tolerances
 from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, show
 from dlo_casadi.config.values import (
     STIFFNESS,
+    Centerlines,
     Elements,
     Force,
     Gravity,
+    Images,
     Moment,
     Name,
     Number,
@@ -28,6 +29,7 @@ from dlo_casadi.config.values import (
     RestCoefficients,
     Section,
     Switch,
+    Tolerances,
     implausible_sizes,
     optional,
     within,

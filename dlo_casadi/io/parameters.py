@@ -1,7 +1,7 @@
 """parameters.yaml: a fitted cable, complete enough to compute with (schema "dlo-parameters/1").
 
 Prediction, code generation and comparisons of cables read nothing else. Its text is made in
-`report.parameters_text`.
+`report.documents`.
 """
 
 import difflib
@@ -127,7 +127,7 @@ class _Scatter(OpenSection):
 
 
 class ParametersFile(OpenSection):
-    """What is read of a parameters.yaml; each key as `report.parameters_text` writes it."""
+    """What is read of a parameters.yaml; each key as `report.documents` writes it."""
 
     cable: Annotated[
         _Cable, checked(lambda cable: implausible_sizes(cable.length, cable.mass, cable.diameter))

@@ -21,7 +21,7 @@ import yaml
 
 from dlo_casadi.config import load_config
 from dlo_casadi.fleet import parquet_library
-from dlo_casadi.report.parameters_text import parameters_text
+from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.session import run_session
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
-from dlo_casadi.report.parameters_text import parameters_text
+from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.session import run_session
 
 BENCH = Path(__file__).resolve().parents[2] / "tests" / "data" / "bench"

@@ -17,7 +17,7 @@ from dlo_casadi.estimation.repeats import (
     with_repeats,
 )
 from dlo_casadi.estimation.result import uncertainty_of
-from dlo_casadi.report.parameters_text import fit_dict
+from dlo_casadi.report.documents import fit_dict
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.fitting import declared_model, fit_declared

@@ -10,7 +10,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import uncertainty_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.report.json_report import finite
+from dlo_casadi.report.documents import finite
 from dlo_casadi.report.tables import describe
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.stages import fitted_parameters

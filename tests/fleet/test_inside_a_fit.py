@@ -10,7 +10,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import EFFECTS, RestCurvatureDrift
 from dlo_casadi.estimation.descent import refit
-from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.report.documents import report_dict
 from dlo_casadi.runtime.parallel import open_executor
 from dlo_casadi.session import run_session
 

@@ -24,7 +24,7 @@ from dlo_casadi.fleet import shape_table as shape_table_module
 from dlo_casadi.fleet.shape_poses import Grid, PoseList
 from dlo_casadi.fleet.shape_table import Plan, shape_table
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.report.parameters_text import parameters_text
+from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import open_executor
 from dlo_casadi.session import run_session

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.equilibrium.spread import Tipping
-from dlo_casadi.report.json_report import finite, report_dict, report_text
+from dlo_casadi.report.documents import finite, report_dict, report_text
 from dlo_casadi.report.page import page_data
 from dlo_casadi.report.words import all_warnings, verdict_lines
 from dlo_casadi.session.outcome import ParameterEstimate, RestCurvatureEstimate, Stage

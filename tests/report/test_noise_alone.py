@@ -10,9 +10,9 @@ from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.report import figures
 from dlo_casadi.report.canvas import BLACK
-from dlo_casadi.report.json_report import report_dict
-from dlo_casadi.report.notebook import outcome_html, outcome_text
+from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page import report_page
+from dlo_casadi.report.tables import outcome_html, outcome_text
 from dlo_casadi.report.words import millimetres
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 

@@ -18,7 +18,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.parameters import load_parameters, parameters_hash
 from dlo_casadi.model.assembly import Inputs, assembly_of
-from dlo_casadi.report.parameters_text import final_rest, fit_dict, parameters_text
+from dlo_casadi.report.documents import final_rest, fit_dict, parameters_text
 from dlo_casadi.session.fitting import declared_model, minimum_by_ipopt
 from dlo_casadi.session.measure import measured_poses, read_inputs
 

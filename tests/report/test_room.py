@@ -11,9 +11,9 @@ from small_sessions import BARE
 from test_figures import pull
 from test_page import PROPOSAL, diagnosed
 
+from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.figures import figures_of, write_figures
 from dlo_casadi.report.figures_poses import draw_poses, outcome_figure
-from dlo_casadi.report.json_report import report_dict
 from dlo_casadi.report.page import report_page
 from dlo_casadi.report.scene import VIEWS, arrow, scenes_of, seen, upright
 from dlo_casadi.report.terminal import print_summary

@@ -9,7 +9,7 @@ from test_figures import EFFECT, LOAD
 from test_page import PROPOSAL
 
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE, Structure
-from dlo_casadi.report.json_report import report_dict
+from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page import page_data
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.tables import describe, stage_rows, unidentified
