@@ -1,7 +1,7 @@
-"""Files and folders that are there as a whole or not at all, even after a power cut.
+"""Atomic writing of files and folders: complete or unchanged, even after a power cut.
 
-All that the package writes goes through here, so that it fails in one way: the earlier file is
-as it was, no draft is left, and the error names the place, the system's reason and a remedy.
+The whole package writes through here, and so fails in one way: the earlier file is unchanged, no
+draft is left, and the error names the place, the system's reason and a remedy.
 """
 
 import os
@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 
 from dlo_casadi.errors import OutputError, well_formed
 
-# Begins the names of all drafts.
+# Prefix of the names of all drafts.
 _DRAFT = ".dlo-draft-"
 
 
@@ -30,12 +30,12 @@ def write_file(
     Parameters
     ----------
     path : Path
-        The file; of a link, the file that it leads to.
+        The file; for a link, the file that it leads to.
     content : str, bytes or callable
         Text is written as UTF-8, `well_formed`; a callable fills the open draft.
     draft : Path, optional
-        Where the draft lies instead, on the same file system: one that a killed process leaves
-        behind is then written over by the next.
+        Another place of the draft, on the same file system: the next process then overwrites one
+        that a killed process has left.
 
     Raises
     ------
@@ -63,15 +63,15 @@ def write_file(
 
 
 class FolderDraft:
-    """A hidden folder, to be filled and then put in place of a folder, entry by entry.
+    """A hidden folder to fill, whose entries then replace those of a folder.
 
         with FolderDraft(path) as draft:  # raises if the folder cannot be written
             write_file(draft.folder / "a.txt", "...")
             draft.put_in_place()
 
     The folder and its parents are made if they do not exist; `folder` is the one to be filled.
-    Until then the folder stays as it is, and if putting in place fails it becomes so again.
-    Entries of other names stay: what lies there and is not ours is never touched.
+    Until `put_in_place` nothing changes, and if that fails, earlier entries are restored. Entries
+    of other names are never touched.
 
     Raises
     ------
@@ -81,7 +81,7 @@ class FolderDraft:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(os.path.realpath(path))
-        # On the file system of the folder: moving is then a renaming.
+        # On the file system of the folder, so that moving is renaming.
         beside = self.path if os.path.isdir(self.path) else self.path.parent
         self._hidden = _draft_in(beside)
         self.folder, self._previous = self._hidden / "complete", self._hidden / "previous"
@@ -115,9 +115,9 @@ class FolderDraft:
             error.add_note(f"What was in {self.path} before is in part in {self._previous}.")
 
     def put_in_place(self, obsolete: Iterable[str] = ()) -> None:
-        """Move all that the draft holds into the folder; on any failure put back what was there.
+        """Move the draft's entries into the folder; on any failure restore the earlier ones.
 
-        Entries of the names in `obsolete` go even if the draft holds nothing of that name.
+        Entries named in `obsolete` are removed even if the draft has none of that name.
         """
         for folder, _, files in os.walk(self.folder):
             for name in files:
@@ -153,9 +153,9 @@ class FolderDraft:
         shutil.rmtree(self._previous, ignore_errors=True)
 
     def _remove(self) -> None:
-        """Remove the draft, and parents that were made for nothing.
+        """Remove the draft, and parents that were made for it alone.
 
-        What was there before stays in the draft if it could not be put back.
+        Earlier entries that could not be restored stay in the draft.
         """
         shutil.rmtree(self.folder, ignore_errors=True)
         for folder in (self._previous, self._hidden, *self._made):
@@ -164,7 +164,7 @@ class FolderDraft:
 
 
 def is_marked(path: Path, mark: str) -> bool:
-    """Whether a file is known as ours by a text in it; true where there is none."""
+    """Whether a file contains the text that marks it as ours; true if there is no file."""
     try:
         return not os.path.lexists(path) or mark.encode() in path.read_bytes()
     except OSError:
@@ -172,7 +172,7 @@ def is_marked(path: Path, mark: str) -> bool:
 
 
 def refuse_foreign(folder: Path, taken: Sequence[str]) -> None:
-    """Raise OutputError if there are names, of entries of a folder that are not ours to replace."""
+    """Raise OutputError if `taken` names entries of a folder: they are not ours to replace."""
     if taken:
         raise OutputError(
             f"{folder} holds {', '.join(taken)} from elsewhere, which would be replaced.\n"
@@ -182,14 +182,14 @@ def refuse_foreign(folder: Path, taken: Sequence[str]) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and its parents, unless they are there, or raise OutputError."""
+    """Make a folder and its parents if they do not exist, or raise OutputError."""
     with _explained(path):
         path.mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager
 def only_run(folder: Path) -> Iterator[None]:
-    """Hold a folder for one run; the system lets go of it when the process ends, however.
+    """Lock a folder for one run; the system releases it when the process ends in any way.
 
     Raises OutputError if another run holds it, or it cannot be written.
     """
@@ -206,7 +206,7 @@ def only_run(folder: Path) -> Iterator[None]:
 
 
 def _draft_in(folder: Path) -> Path:
-    """Place of a draft; not named after the file, whose name may be as long as can be."""
+    """Place of a draft; not named after the file, whose name may have the greatest length."""
     return folder / f"{_DRAFT}{secrets.token_hex(8)}"
 
 
@@ -224,7 +224,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make renamings durable, where the file system can: some refuse to, and all is written."""
+    """Make renamings durable where the file system can; the files themselves are written."""
     with suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:

@@ -44,18 +44,18 @@ from dlo_casadi.rod.node import Frame
 
 FILE = "parameters.yaml"
 SCHEMA = "dlo-parameters/1"
-# What a prediction depends on beside the values of the parameters.
+# Keys on which a prediction depends, beside the values of the parameters.
 _MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
-# A value at a bound may miss it by so much of the bound, or of the parameter's scale: rounding of
-# value = nominal + scale x, or exp(x), some 1e-14; and what solvers leave of a bound.
+# Tolerance of a value at its bound, relative to the bound or the parameter's scale: rounding of
+# value = nominal + scale x, or exp(x), some 1e-14, and the tolerance of solvers.
 _ROUNDING = 1e-9
-# Folders of results that a message lists.
+# Maximum number of folders that a message lists.
 _LISTED = 5
 _DAMAGED, _REMEDY = "damaged parameters", ".\n  Try: the file as a fit has written it."
 
 
 def _wrong_effect(row: Mapping[str, Any]) -> list[Problem]:
-    """Find what is wrong with an effect and its options, by their keys."""
+    """Problems of an effect and its options, by their keys."""
     name = row.get("name")
     kind = known_effect(name) if isinstance(name, str) else None
     if kind is None:
@@ -73,7 +73,7 @@ def _wrong_effect(row: Mapping[str, Any]) -> list[Problem]:
 
 
 def _form(value: Any) -> Any:
-    """What kind of a value it is, item by item: a finite number, text, true or false."""
+    """Type of a value, item by item: a finite number, text, true or false."""
     if isinstance(value, list | tuple):
         return [_form(item) for item in value]
     number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -127,7 +127,7 @@ class _Scatter(OpenSection):
 
 
 class ParametersFile(OpenSection):
-    """What is read of a parameters.yaml; each key as `report.documents` writes it."""
+    """The keys of a parameters.yaml that are read, as `report.documents` writes them."""
 
     cable: Annotated[
         _Cable, checked(lambda cable: implausible_sizes(cable.length, cable.mass, cable.diameter))
@@ -196,7 +196,7 @@ def load_parameters(path: str | Path) -> FittedCable:
 
 
 def _results_near(path: Path) -> str:
-    """What to try instead of a path: folders of results beside it, the nearest name first."""
+    """Advice for a wrong path: folders of results beside it, the most similar name first."""
     wanted = path.parent if path.suffix else path
     known = {
         folder.name: folder
@@ -234,7 +234,7 @@ def _effect(row: Mapping[str, Any]) -> Effect:
 
 
 def _unlike(file: ParametersFile, model: CableModel) -> Iterator[Problem]:
-    """Find what does not suit the model: other parameters, other numbers of them, their bounds."""
+    """Contradictions to the model: names and numbers of parameters, and their bounds."""
     if strange := set(file.parameters) ^ set(model.names):
         wrong = ", ".join(sorted(strange))
         yield Problem(("parameters",), f"parameters and effects do not belong together: {wrong}")
@@ -256,7 +256,7 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[Problem]:
 
 
 def _beyond(q: Parameter, row: _Value) -> str:
-    """Whether a value lies outside of its bounds, of the file and of the model; empty if not."""
+    """Message on a value outside its bounds, of the file and of the model; empty if inside."""
     lower = max(q.lower, -math.inf if row.lower is None else row.lower)
     upper = min(q.upper, math.inf if row.upper is None else row.upper)
     bound = lower if lower > row.value else upper
@@ -268,7 +268,7 @@ def _beyond(q: Parameter, row: _Value) -> str:
 
 
 def metadata_of(document: dict[str, Any], source: Path) -> Metadata:
-    """What a document tells beside the model."""
+    """Contents of a document beside the model."""
     file = ParametersFile.model_validate(document)
     names, stiffness = file.covariance.names, file.parameters["bending_stiffness"]
     covariance = np.array(file.covariance.values, dtype=float).reshape(len(names), len(names))
@@ -294,7 +294,7 @@ def metadata_of(document: dict[str, Any], source: Path) -> Metadata:
 
 
 def parameters_hash(document: Mapping[str, Any]) -> str:
-    """SHA-256 of what determines predictions; bounds and standard deviations do not.
+    """SHA-256 of all that determines predictions, without bounds and standard deviations.
 
     It stands in the file as `model_hash`. A generated solver has its own: `codegen.solver_hash`.
     """

@@ -40,7 +40,7 @@ class MeasuredPoints:
     s : (K,) [m], optional
         Arc lengths of markers.
     count : (K,) or one for all
-        Measured points of which each is the mean.
+        Number of measured points of which each point is the mean.
     """
 
     points: FloatArray
@@ -48,14 +48,14 @@ class MeasuredPoints:
     count: FloatArray | float = 1.0
 
     def means(self, most: int) -> "MeasuredPoints":
-        """Means of the points on each of at most so many equally long stretches.
+        """Means of the points in at most `most` intervals of equal length.
 
-        White errors average out; a stretch that was not measured has no mean. The mean of a bow of
-        length h and curvature k lies k h^2 / 24 beside it: 5 um of a full circle of 1 m in 240.
+        White errors average out; an interval without points has no mean. The mean over an arc of
+        length h and curvature k lies k h^2 / 24 beside it: 5 um for a circle of 1 m in 240 parts.
         """
         along, every = self.s, np.arange(len(self.points))
         if along is None:
-            # By chords that are longer than the noise: stretches must not depend on it.
+            # Lengths of chords that are longer than the noise, on which they must not depend.
             ends = np.linspace(0, every[-1], min(most, len(every))).astype(int)
             chords = np.linalg.norm(np.diff(self.points[ends], axis=0), axis=1)
             along = np.interp(every, ends, np.concatenate([[0.0], np.cumsum(chords)]))

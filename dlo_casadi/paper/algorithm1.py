@@ -5,9 +5,9 @@
 
 with alpha = [k_theta, theta_0] and the chain of straight links. Corrected against the printed
 text: the loop runs while alpha changes by more than the tolerance; theta_1 is a heading and has
-no bound; every pose starts from the arc through its ends. Kept: each node is drawn to its nearest
-measured point (Eq. 9), and the balance of Eq. 14 leaves out the reaction of the held end. The
-latter makes k_theta grow without end on many data; the result then says so.
+no bound; every pose starts from the arc through its ends. Kept: Eq. 9 measures each node from its
+nearest point, and the balance of Eq. 14 neglects the reaction of the held end. The latter makes
+k_theta diverge on many data; the result then says so.
 
 References
 ----------
@@ -37,22 +37,22 @@ from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
-# Iterations in a row in which alpha must not change, the paper asks for several; and the largest
-# change of ln(k_theta) and of theta_0 [rad] that counts as none.
-CALM, TOLERANCE = 3, 1e-4
-# k_theta beyond this factor of its prior, either way, has run away.
+# Successive iterations without a change of alpha at convergence, the paper asks for several; and
+# the largest change of ln(k_theta) and of theta_0 [rad] that counts as none.
+UNCHANGED, TOLERANCE = 3, 1e-4
+# Factor from its prior, up or down, beyond which k_theta has diverged.
 RUNAWAY = 1e3
-# So is one that has changed the same way so many times in a row, by more than the factor GROWTH
-# in all, and still does so by more than LAST_STEP.
+# It has also diverged after this number of successive changes in one direction, by more than the
+# factor GROWTH in all, the last one of ln(k_theta) larger than LAST_STEP.
 STEADY, GROWTH, LAST_STEP = 12, 3.0, 0.01
-# On rendered sessions the loop converges after 5 iterations or runs away after 1; one that creeps
-# is told after STEADY. Four times that: what still changes then does so without an end.
+# Maximum number of iterations, four times STEADY. On rendered sessions the loop converges after 5
+# iterations or diverges after 1; slow divergence is detected after STEADY.
 ITERATIONS = 50
 # Weight of the distances: beta = WEIGHT n [J/m^2]. The paper's c, chosen there by hand.
 WEIGHT = 1e4
-# Nearest points are frozen while IPOPT runs, then chosen again until they stay, at most so often.
+# Maximum number of times that the nearest points are chosen; they are fixed while IPOPT runs.
 ASSIGNMENTS = 20
-# IPOPT takes up to 18 iterations for Eq. 13 on the same sessions; ten times that has gone astray.
+# Maximum number of IPOPT iterations, ten times the 18 that Eq. 13 takes on the same sessions.
 IPOPT_ITERATIONS = 200
 # COBYLA: first change of a joint angle [rad], last one, and number of evaluations.
 COBYLA_STEP, COBYLA_TOLERANCE, COBYLA_EVALUATIONS = 0.1, 1e-6, 4000
@@ -68,7 +68,7 @@ class Algorithm1Status(Enum):
 
 @dataclass(frozen=True)
 class Algorithm1Result:
-    """What the paper's loop has found.
+    """Result of the paper's loop.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Algorithm1Result:
     message : str
         One or more sentences with numbers.
     history : (iterations + 1,) [N m/rad]
-        k_theta from the prior on.
+        k_theta of the prior and after each iteration.
     seconds : float
     """
 
@@ -115,7 +115,7 @@ class Algorithm1Result:
 
 @dataclass(frozen=True)
 class Target:
-    """Measured points of one pose, about its start.
+    """Measured points of one pose, relative to its start.
 
     `points` (K, 2) [m]; `edges` (K,) marks points with a gap beside them; `end` (2,) [m].
     """
@@ -126,7 +126,7 @@ class Target:
 
     @classmethod
     def of(cls, measured: MeasuredPose, gap: float) -> Self:
-        """Take the points of a pose; what is missing over more than `gap` [m] is a gap."""
+        """Take the points of a pose; neighbours farther apart than `gap` [m] enclose a gap."""
         line = measured.pose.joined(measured.points) - np.array(measured.pose.start)
         wide = np.hypot(*np.diff(line, axis=0).T) > gap
         return cls(line[1:-1], wide[:-1] | wide[1:], line[-1])
@@ -174,12 +174,12 @@ class InnerProblem:
         joints = phi[1:] - phi[:-1]
         bending = k_theta / 2 * ca.sumsqr(joints - theta_0)
         middles = (nodes[1:, :] + nodes[:-1, :]) / 2
-        hanging = -ca.dot(ca.DM(self.weight), ca.sum1(middles).T)
+        weight = -ca.dot(ca.DM(self.weight), ca.sum1(middles).T)
         gaps = ca.dot(seen, ca.sum2((nodes[1:n, :] - points) ** 2))
         problem = {
             "x": phi,
             "p": ca.vertcat(k_theta, theta_0, end, seen, ca.vec(points)),
-            "f": bending + hanging + self.beta * gaps,
+            "f": bending + weight + self.beta * gaps,
             "g": ca.vertcat(nodes[n, :].T - end, joints),
         }
         self._solver = ipopt("algorithm1", problem, 1e-9, IPOPT_ITERATIONS)
@@ -192,15 +192,15 @@ class InnerProblem:
     def objective(
         self, phi: FloatArray, target: Target, k_theta: float, theta_0: FloatArray
     ) -> float:
-        """V + beta r_p with the nearest points of this very shape [J]."""
+        """V + beta r_p with the nearest points of this shape [J]."""
         nodes = self.nodes(phi)
         middles = (nodes[1:] + nodes[:-1]) / 2
         bending = k_theta / 2 * ((np.diff(phi) - theta_0) ** 2).sum()
-        hanging = -(middles @ self.weight).sum()
-        return float(bending + hanging + self.beta * target.residual(nodes[1:-1]))
+        weight = -(middles @ self.weight).sum()
+        return float(bending + weight + self.beta * target.residual(nodes[1:-1]))
 
     def first_guess(self, pose: Pose, target: Target) -> FloatArray:
-        """Arc through both ends on the pose's branch, or nearer to the measured points."""
+        """Arc through both ends on the pose's branch; without one the arc nearer to the points."""
         sides = {"ccw": (1,), "cw": (-1,)}.get(pose.branch or "", (1, -1))
         places, length = self.chain.places, self.chain.length
         arcs = [arc_headings(places, length, target.end, side) for side in sides]
@@ -209,9 +209,9 @@ class InnerProblem:
     def solve_ipopt(
         self, phi: FloatArray, target: Target, k_theta: float, theta_0: FloatArray
     ) -> tuple[FloatArray, bool]:
-        """Minimise by IPOPT in absolute headings, the nearest points chosen again in between.
+        """Minimise by IPOPT in absolute headings; nearest points are chosen again after each run.
 
-        Headings (n,) [rad], and whether IPOPT converged.
+        Returns headings (n,) [rad], and whether IPOPT converged.
         """
         bound = np.concatenate([np.zeros(2), np.full(self.chain.n - 1, JOINT_BOUND)])
         chosen: tuple[IntArray, BoolArray] | None = None
@@ -233,7 +233,7 @@ class InnerProblem:
     ) -> tuple[FloatArray, bool]:
         """Minimise by COBYLA in relative joint angles, as in the paper.
 
-        Headings (n,) [rad], and whether COBYLA converged.
+        Returns headings (n,) [rad], and whether COBYLA converged.
         """
 
         def objective(theta: FloatArray) -> float:
@@ -260,7 +260,7 @@ class InnerProblem:
 
 
 def applies(model: CableModel) -> bool:
-    """Whether the paper's method knows such a cable: in a plane, pinned at both ends."""
+    """Whether the paper's method applies to the cable: in a plane, pinned at both ends."""
     return model.node is Heading and model.start == model.end == "pinned"
 
 
@@ -357,7 +357,7 @@ def run_algorithm1(
     Returns
     -------
     Algorithm1Result
-        Of the last iteration. A k_theta that runs away is a result, too: see its `status`.
+        Of the last iteration, also where k_theta has diverged: see its `status`.
 
     Raises
     ------
@@ -373,7 +373,7 @@ def run_algorithm1(
     k_theta = cable.bending_stiffness / problem.chain.h
     theta_0: FloatArray = np.zeros(n - 1)
     history = [k_theta]
-    calm, failed = 0, 0
+    unchanged, failed = 0, 0
     status = Algorithm1Status.ITERATION_LIMIT
     while status is Algorithm1Status.ITERATION_LIMIT and len(history) <= max_iterations:
         solved = [solve(*one, k_theta, theta_0) for one in zip(shapes, targets, strict=True)]
@@ -385,10 +385,10 @@ def run_algorithm1(
         k_theta, theta_0 = best_parameters(angles, slopes[:, 1:], k_theta, theta_0)
         history.append(k_theta)
         change = max(abs(np.log(k_theta / last)), float(np.abs(theta_0 - last_0).max()))
-        calm = calm + 1 if change <= TOLERANCE else 0
+        unchanged = unchanged + 1 if change <= TOLERANCE else 0
         if _runs_away(history):
             status = Algorithm1Status.RUNAWAY
-        elif calm >= CALM:
+        elif unchanged >= UNCHANGED:
             status = Algorithm1Status.CONVERGED
     seconds = perf_counter() - began
     message = _message(status, history, seconds, failed, len(shapes))
@@ -421,7 +421,7 @@ def _usable(
 
 
 def _runs_away(history: list[float]) -> bool:
-    """Whether k_theta has left its prior far behind, or moves away from it steadily."""
+    """Whether k_theta is far from its prior, or moves away from it steadily."""
     if abs(np.log(history[-1] / history[0])) > np.log(RUNAWAY):
         return True
     steps = np.diff(np.log(history[-STEADY - 1 :]))

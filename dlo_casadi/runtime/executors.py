@@ -1,8 +1,8 @@
 """Where tasks run: in this process, in a pool of processes, or on a Dask cluster.
 
-Each is a `concurrent.futures.Executor` that tells `parallel.py` how many `workers` do its tasks,
-whether this process is one of them (`here`), the errors by which a killed worker shows (`losses`),
-and where workers keep their `logs`.
+Each is a `concurrent.futures.Executor` with attributes for `parallel.py`: the number of `workers`,
+whether this process is one of them (`here`), the errors raised when a worker was killed (`losses`),
+and the folder of the workers' `logs`.
 """
 
 import faulthandler
@@ -30,11 +30,11 @@ from threadpoolctl import threadpool_limits
 
 from dlo_casadi.errors import DloError
 
-# How long a scheduler may take to answer, and to have a worker [s].
+# Longest time until a scheduler answers, and until it has a worker [s].
 PATIENCE = 30.0
-# How long a process that is told to end is waited for [s]: one that is just starting takes one.
+# Longest time until a process that is told to end has ended [s]: one that is just starting takes 1.
 LAST_WORDS = 2.0
-# Read by BLAS, OpenMP and OpenCV when they are loaded.
+# Environment variables that BLAS, OpenMP and OpenCV read when they are loaded.
 THREADS = dict.fromkeys(
     (
         *("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
@@ -44,12 +44,12 @@ THREADS = dict.fromkeys(
 )
 # Signals by which a command is interrupted.
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
-# Whether signals can be blocked, in processes that are started meanwhile, too: a matter of POSIX.
+# Whether signals can be blocked, also in processes that are started meanwhile: POSIX only.
 BLOCKABLE = hasattr(signal, "pthread_sigmask")
 
 
 class InProcess(Executor):
-    """Runs each task at once, in the process that submits it."""
+    """Runs each task immediately, in the process that submits it."""
 
     here = True
 
@@ -64,7 +64,7 @@ class InProcess(Executor):
 
 
 class Pool(Executor):
-    """Spawned processes, see `open_executor`; started anew when one of them was killed."""
+    """Spawned processes, see `open_executor`; a new pool is started when one of them was killed."""
 
     def __init__(
         self, workers: int, logs: Path | None, here: bool, libraries: Sequence[str]
@@ -86,7 +86,7 @@ class Pool(Executor):
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit to the pool, to a new one if a worker of the last was killed."""
         try:
-            # The pool would pickle in a thread of its own, what is being worked on meanwhile.
+            # The pool would pickle later in its own thread, when the arguments may have changed.
             task = pickle.dumps((fn, args, kwargs))
         except Exception as error:
             unsent: Future[Any] = Future()
@@ -101,7 +101,7 @@ class Pool(Executor):
 
     def _begun(self, task: bytes) -> Future[Any]:
         before = set(multiprocessing.active_children())
-        # Tasks start the processes, which inherit the environment and load libraries after that.
+        # Submitting starts the processes, which inherit the environment and then load libraries.
         with environment(THREADS), starting_processes():
             future = self._inner.submit(_unpickled, task)
         self._processes |= set(multiprocessing.active_children()) - before
@@ -109,8 +109,8 @@ class Pool(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the workers; with `wait=False` those in the middle of a task, too."""
-        # One without a task is not waited for: it takes half a second to end by itself.
+        """End the workers; with `wait=False` also those in the middle of a task."""
+        # Idle workers are not waited for: they take half a second to end.
         wait = wait and not all(task.done() for task in self._tasks)
         self._inner.shutdown(wait, cancel_futures=cancel_futures)
         if not wait:
@@ -148,7 +148,7 @@ class Cluster(Executor):
             on_failure.callback(self._client.close)
             self._check_workers(address)
             on_failure.pop_all()
-        # Equal calls are different tasks: each is one row, one sample.
+        # Not pure: equal calls are different tasks, each for its own row or sample.
         self._inner = self._client.get_executor(pure=False)
 
     def _check_workers(self, address: str) -> None:
@@ -172,7 +172,7 @@ class Cluster(Executor):
 
     @property
     def workers(self) -> int:
-        """Processes that take tasks now; they may come and go."""
+        """Number of processes that take tasks now; it may change."""
         return max(1, len(self._client.nthreads()))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -180,7 +180,7 @@ class Cluster(Executor):
         return self._inner.submit(fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let go of the cluster; what was not awaited is cancelled."""
+        """Disconnect from the cluster; unfinished tasks are cancelled."""
         self._client.close()
 
 
@@ -204,23 +204,23 @@ def open_executor(
     Parameters
     ----------
     jobs : int
-        1 runs in this process, more in a pool of so many processes.
+        Number of processes; 1 runs in this process, more run in a pool.
     scheduler : str, optional
-        Address of a Dask scheduler, instead, such as tcp://192.168.1.5:8786.
+        Address of a Dask scheduler to use instead, such as tcp://192.168.1.5:8786.
     logs : Path, optional
         Folder in which each worker keeps a log; a crash leaves its stack there. It must exist, on a
         file system that the workers see.
     here : bool
-        Whether this process is one of the `jobs`, and does what a lost worker has left: for tasks
-        none of which can crash. Else it waits for the others, and outlives them.
+        Whether this process is one of the `jobs`, and repeats tasks of a lost worker: only for
+        tasks that cannot crash. Otherwise it only waits, and survives crashes of the others.
     libraries : sequence of str
-        Modules that other processes import before they are asked for anything.
+        Modules that other processes import before their first task.
 
     Raises
     ------
     DloError
-        If jobs is not positive, both are asked for, `distributed` is missing, no scheduler or
-        worker answers, or a worker has other versions of what decides the digits of results.
+        If jobs is not positive, both are given, `distributed` is missing, no scheduler or worker
+        answers, or a worker has other versions of libraries that change digits of results.
     """
     if jobs < 1:
         raise DloError(f"--jobs {jobs}: at least one process must do the work")
@@ -242,7 +242,7 @@ def open_executor(
 
 @contextmanager
 def ended_first(executor: Executor) -> Iterator[None]:
-    """End an executor on an exception, an interrupt too, before what its tasks work with is left.
+    """On an exception or an interrupt, end an executor before the resources of its tasks are freed.
 
     Waiting tasks are cancelled, running ones ended.
     """
@@ -255,7 +255,7 @@ def ended_first(executor: Executor) -> Iterator[None]:
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set variables of the environment; what was set before is put back."""
+    """Set variables of the environment for a block, then restore them."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -271,7 +271,7 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 def one_thread() -> Iterator[None]:
     """Hold BLAS, OpenMP and OpenCV to one thread each: the matrices are small.
 
-    Libraries that are loaded already are told so, others find it in the environment.
+    Loaded libraries are told directly, others read it from the environment.
     """
     with ExitStack() as stack:
         stack.enter_context(environment(THREADS))
@@ -285,9 +285,9 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Hold interrupts back until the end of the block; they are raised there."""
+    """Delay interrupts to the end of the block."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # interrupts are the main thread's
+        yield  # only the main thread receives interrupts
         return
     received: list[int] = []
     before = {
@@ -305,21 +305,21 @@ def interrupts_held() -> Iterator[None]:
 
 @contextmanager
 def starting_processes() -> Iterator[None]:
-    """Hold interrupts back while processes are started, and in them until `begin_worker`.
+    """Block interrupts while processes are started, and in them until `begin_worker`.
 
-    A process that is interrupted half way in its start, or whose parent is, prints its stack.
+    Otherwise a process that is interrupted during its start, or its parent, prints its stack.
     """
     with interrupts_held(), ExitStack() as stack:
         if BLOCKABLE:
-            resource_tracker.ensure_running()  # which lets go of the signals when it starts
-            # What is started inherits the mask.
+            resource_tracker.ensure_running()  # it unblocks the signals when it starts
+            # Processes inherit the mask.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
             stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
         yield
 
 
 def begin_worker(logs: Path | None, libraries: Sequence[str] = ()) -> None:
-    """Leave interrupts to the parent, end with it, keep the stack of a crash; import libraries."""
+    """Set up a worker: ignore interrupts, end with the parent, log crashes, import libraries."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if BLOCKABLE:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)
@@ -329,7 +329,7 @@ def begin_worker(logs: Path | None, libraries: Sequence[str] = ()) -> None:
     for handler in worker_log(logs).handlers:
         stream = getattr(handler, "stream", sys.stderr)
         faulthandler.enable(stream)
-        # What libraries print would tear the progress of the parent.
+        # Output of libraries would disturb the progress display of the parent.
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
     for name in libraries:
@@ -337,7 +337,7 @@ def begin_worker(logs: Path | None, libraries: Sequence[str] = ()) -> None:
 
 
 def _end_with(sentinel: int) -> None:
-    """A worker whose parent was killed would wait for work for ever."""
+    """End this worker when its parent is killed, instead of waiting for work for ever."""
     multiprocessing.connection.wait([sentinel])
     os._exit(1)
 
@@ -362,7 +362,7 @@ def worker_log(folder: Path | None) -> logging.Logger:
     for old in list(logger.handlers):
         logger.removeHandler(old)
         old.close()
-    # A machine of the cluster may not see the folder: Dask keeps its own log there.
+    # A machine of the cluster may not see the folder: Dask keeps its own log then.
     with suppress(OSError):
         handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
         handler.name = str(path)

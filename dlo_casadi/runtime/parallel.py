@@ -1,4 +1,4 @@
-"""Everything that repeats: one function over many items, wherever the tasks run."""
+"""One function applied to many items, on any executor."""
 
 import logging
 import multiprocessing
@@ -34,14 +34,14 @@ __all__ = [
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Times that a task that was lost with a worker is given to another, the last time alone.
+# Number of repetitions of a task lost with its worker; the last one runs without other tasks.
 RETRIES = 2
-# 90 % of a normal distribution lie within so many standard deviations.
+# Half width of the 90 % interval of a standard normal distribution.
 NINETY = 1.645
 
 
 class LostTaskError(DloError):
-    """A task whose worker was killed each time that it ran."""
+    """A task whose worker was killed every time."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Finished(Generic[Item, Result]):
     Parameters
     ----------
     index : int
-        Place of the item among the items.
+        Index of the item.
     item : object
     result : object or None
     error : BaseException or None
-        What the function raised instead, or a `LostTaskError`.
+        Exception of the function, or a `LostTaskError`.
     seconds : float
-        That it took, on its worker.
+        Duration on the worker.
     worker : str
         Machine and process; empty if it was lost.
     """
@@ -71,7 +71,7 @@ class Finished(Generic[Item, Result]):
 
     @property
     def value(self) -> Result:
-        """The result; what the function raised is raised here."""
+        """The result; an exception of the function is raised here."""
         if self.error is not None:
             raise self.error
         return cast(Result, self.result)
@@ -79,12 +79,12 @@ class Finished(Generic[Item, Result]):
 
 @dataclass(frozen=True)
 class Tally:
-    """How far the tasks have come.
+    """Progress of the tasks.
 
     Parameters
     ----------
     done, failed : int
-        Failed ones are among the done.
+        Numbers of tasks; `done` includes failed ones.
     total : int or None
     elapsed : float [s]
     remaining : (float, float) or None [s]
@@ -110,27 +110,27 @@ def map_as_completed(
 ) -> Generator[Finished[Item, Result]]:
     """Apply a function to all items; yield each as soon as it has ended.
 
-    What the function raises ends its own item alone. A task that is lost with a killed worker
-    is given to another, in its last repetition with no task beside it; one that is lost every
-    time ends with a `LostTaskError`. Where this process is one of the executor's workers it does
-    tasks between those that it hands out, and those that are lost. Each task has one thread of
-    BLAS, OpenMP and OpenCV, so that its numbers do not depend on where it runs.
+    An exception of the function ends its own item alone. A task lost with a killed worker is
+    repeated on another one, the last time without other tasks; one that is lost every time ends
+    with a `LostTaskError`. If this process is one of the executor's workers, it runs tasks between
+    submitting others, and the lost ones. Each task has one thread of BLAS, OpenMP and OpenCV, so
+    that its numbers do not depend on where it runs.
 
     Parameters
     ----------
     executor : Executor
-        Any; `open_executor` makes those that are logged and survive a killed worker.
+        Any; those of `open_executor` keep logs and survive a killed worker.
     function : callable
-        Of one item. Both, and what it returns, must be picklable unless all run in this process.
+        Of one item. Both, and its result, must be picklable unless all run in this process.
     items : iterable
-        Taken only as tasks are submitted.
+        Consumed as tasks are submitted.
     total : int, optional
-        Number of items, if it cannot be asked.
+        Number of items, if they have no length.
     in_flight : int, optional
-        Most tasks under way; by default two for each worker.
+        Maximum number of submitted tasks; by default two for each worker.
     retries : int
-        Times that a lost task is repeated, the last of them alone; with 0 its first loss, to which
-        any task beside it may have led, ends it.
+        Number of repetitions of a lost task, the last of them without other tasks; with 0 its first
+        loss ends it, although another task may have been the cause.
     progress : callable, optional
         Called after each task.
     """
@@ -148,7 +148,7 @@ def map_as_completed(
         workers = getattr(executor, "workers", 1)  # asked anew: those of a cluster come and go
         most = in_flight or 2 * (workers - here)
         if here and (workers == 1 or total is not None):
-            # The fewer are left, the fewer wait for a worker that this process could do.
+            # Towards the end, leave waiting tasks to this process.
             left = (total or 0) - taken
             most = min(most, (workers - 1) * max(1, left // (2 * workers))) if left > 1 else 0
         return max(0, most - len(under_way))
@@ -184,7 +184,7 @@ def map_as_completed(
                 if not suspects:
                     return
                 submit(*suspects.pop())
-            # Who has just done a task goes on with the next, and does not wait for the others.
+            # After a task of its own this process goes on without waiting for the others.
             for future in wait(under_way, 0.0 if own else None, FIRST_COMPLETED).done:
                 index, item, lost = under_way.pop(future)
                 if future.cancelled():
@@ -197,7 +197,7 @@ def map_as_completed(
                 else:
                     if isinstance(error, losses):
                         if lost < retries:
-                            # With none beside it, no other can be to blame for the last loss.
+                            # Run alone: no other task can then be the cause of the last loss.
                             put_off = again if lost + 1 < retries else suspects
                             put_off.append((index, item, lost + 1))
                             continue
@@ -216,22 +216,22 @@ def map_as_completed(
 def map_in_order(
     executor: Executor, function: Callable[[Item], Result], items: Sequence[Item], **options: Any
 ) -> list[Result]:
-    """Results of all items in their order; the first item's error, if any, is raised.
+    """Results of all items in their order; the first exception is raised.
 
     Parameters
     ----------
     options
-        As of `map_as_completed`.
+        Those of `map_as_completed`.
     """
     ended = list(map_as_completed(executor, function, items, **options))
     return [item.value for item in sorted(ended, key=lambda item: item.index)]
 
 
 def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Callable[[], Result]:
-    """Begin one call beside others; what is returned waits for it, and raises what it raised.
+    """Begin one call in the background; the returned function waits for its result.
 
-    Where the executor has no worker but this process, it is made when the result is asked for, and
-    where the worker is killed, again. As each task of `map_as_completed` it has one thread.
+    It raises what the call raised. The call is made here, on demand, if the executor has no other
+    worker or its worker was killed. As each task of `map_as_completed` it has one thread.
     """
     task = partial(_run, call, 0, partial(function, *args))
     begun: Future[Finished[Any, Result]] | None = None
@@ -248,19 +248,19 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
 
 
 def generator_of(seed: int, index: int) -> np.random.Generator:
-    """Random numbers of one task: they depend on its index, not on where or when it runs."""
+    """Random number generator of one task: it depends on the seed and the index alone."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
 
 
-# CasADi's expressions are not made for threads: a worker does one task at a time.
+# CasADi's expressions are not thread-safe: a worker does one task at a time.
 _one_at_a_time = threading.RLock()
 
 
 def _run(
     function: Callable[[Item], Result], index: int, item: Item, logs: Path | None
 ) -> Finished[Any, Result]:
-    """Run one task, timed and logged; what is returned holds an exception, but not the item."""
-    # Tasks within a task have no log of their own.
+    """Run one task, timed and logged; the result holds an exception, but not the item."""
+    # Tasks within a task are not logged.
     log = worker_log(logs) if logs is not None else logging.getLogger("dlo_casadi.unlogged")
     result, failure = None, None
     with _one_at_a_time, one_thread():
@@ -271,7 +271,7 @@ def _run(
         except Exception as error:
             log.info("task %d failed", index, exc_info=True)
             if multiprocessing.parent_process() is not None and not isinstance(error, DloError):
-                error.add_note(traceback.format_exc())  # the stack does not come along
+                error.add_note(traceback.format_exc())  # the stack is not pickled
             failure = error
         seconds = time.perf_counter() - begin
         if failure is None:
@@ -282,7 +282,7 @@ def _run(
 def _remaining(
     durations: Sequence[float], total: int | None, elapsed: float, executor: Executor
 ) -> tuple[float, float] | None:
-    """Time of the tasks left: a sum of so many, whose mean itself is known from those done.
+    """90 % interval of the time left, from the mean and the deviation of the durations so far.
 
     (k mean +- 1.645 s sqrt(k + k^2 / m)) / workers  with k left and m done.
     """

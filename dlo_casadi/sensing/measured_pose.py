@@ -1,4 +1,4 @@
-"""A measured pose: its end conditions, and what its sensors say of it."""
+"""A measured pose: its end conditions and the measurements of its sensors."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench, line
 
 @dataclass(frozen=True)
 class MeasuredPose:
-    """One pose with what was measured of it: the residuals of its sensors, one after the other.
+    """One measured pose. Its residual stacks those of its sensors.
 
     Parameters
     ----------
@@ -29,9 +29,9 @@ class MeasuredPose:
     held_out : bool
         Whether the pose is kept for the final test.
     line : Centerline or Markers, optional
-        Measured points of the cable from which distances are taken, where those of the sensors are
-        others: the line that photographs show together, without points where they show none; or
-        the points themselves where the sensors have their means.
+        Measured points of the cable from which distances are reported, if they differ from those
+        of the sensors: the common line of photographs, without points if there is none; or all
+        points where the sensors have means of them.
     """
 
     pose: Pose
@@ -48,18 +48,18 @@ class MeasuredPose:
         held_out: bool = False,
         s: FloatArray | None = None,
     ) -> Self:
-        """A pose with one line of points (K, d) [m], or markers where arc lengths s are known.
+        """A pose with one line of points (K, d) [m], or with markers at known arc lengths s.
 
-        Without points the pose could not be read. `weight` (K,) is one by default.
+        A pose without points is unreadable. `weight` (K,) is one by default.
         """
         if not len(points):
             return cls(pose, (), held_out)
         return cls(pose, (line_or_markers(points, weight, s),), held_out)
 
     def with_readings(self, readings: Mapping[str, Sequence[float]]) -> Self:
-        """The same pose with forces and moments on its fixtures, by names of `ends.REACTIONS`.
+        """The same pose with wrench measurements at its fixtures, by names of `ends.REACTIONS`.
 
-        A pose that could not be read stays so.
+        An unreadable pose stays so.
         """
         if not readings or not self.readable:
             return self
@@ -73,12 +73,12 @@ class MeasuredPose:
 
     @property
     def has_line(self) -> bool:
-        """Whether it is known where in space points of the cable lie."""
+        """Whether there are measured points in the frame of the poses, not only pixels."""
         return self.readable and (self.line is None or len(self.line.points) > 0)
 
     @cached_property
     def traced(self) -> "MeasuredPose":
-        """The same pose with its line alone; about where its points lie if they show none."""
+        """The same pose with its line alone, or approximate places of its points without one."""
         if self.line is None:
             return self
         line = self.line if self.has_line else line_or_markers(self.points)
@@ -97,7 +97,7 @@ class MeasuredPose:
 
     @property
     def relative_white(self) -> FloatArray:
-        """The same where errors are white, so that means of points have smaller ones."""
+        """The same of white errors, which are smaller for means of points."""
         return np.concatenate([sensor.weight / np.sqrt(sensor.count) for sensor in self.sensors])
 
     @property
@@ -107,18 +107,18 @@ class MeasuredPose:
 
     @cached_property
     def point_of(self) -> IntArray:
-        """Index of the point to which each residual of points belongs: they come first."""
+        """Index of the point of each residual; residuals of points come first."""
         per_point = [np.full(len(x.points), x.per_point) for x in self.sensors]
         return np.repeat(np.arange(len(self.points)), np.concatenate(per_point))
 
     @cached_property
     def kinds(self) -> NDArray[np.str_]:
-        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
+        """Kind of each residual (R,): point [m], force [N] or moment [N m]."""
         return np.concatenate([sensor.kinds for sensor in self.sensors])
 
     @property
     def on_points(self) -> BoolArray:
-        """Which residuals (R,) are of points; the others are of readings."""
+        """Which residuals (R,) are of points; the others are of wrenches."""
         return np.asarray(self.kinds == "point")
 
     @property
@@ -127,13 +127,13 @@ class MeasuredPose:
         return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.measured)
 
     def readings_beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """These, measured and as a model says, by their names."""
+        """Measured and predicted wrenches by name."""
         found = (x.beside(seen) for x in self.sensors if isinstance(x, Wrench))
         return {name: pair for parts in found for name, pair in parts.items()}
 
     @property
     def slices(self) -> list[tuple[Sensor, slice, slice]]:
-        """Each sensor of points, which of the points and which of the residuals are its."""
+        """Each sensor of points with the slices of its points and of its residuals."""
         out, point, row = [], 0, 0
         for sensor in self.sensors:
             count, rows = len(sensor.points), len(sensor.kinds)
@@ -151,10 +151,10 @@ class MeasuredPose:
         ]
 
     def slow_rows(self, modes: FloatArray) -> FloatArray:
-        """Displacements (K, count) along the cable, in each of the residuals' directions.
+        """Residuals (R, c) of displacement modes (K, count), in each direction of the residuals.
 
-        Beside them what the residuals of a sensor share. Of what is measured at no point each
-        residual is a mode of its own.
+        Added to them are the errors that the residuals of a sensor share, and one mode for each
+        residual that belongs to no point.
         """
         blocks = []
         for x, points, _ in self.slices:
@@ -165,7 +165,7 @@ class MeasuredPose:
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
 
     def _each(self, *per_point: FloatArray) -> Iterator[tuple[Any, ...]]:
-        """Each sensor with its part of values of the points (K, ...)."""
+        """Each sensor with its part of arrays over the points (K, ...)."""
         ends = np.cumsum([len(x.points) for x in self.sensors])[:-1]
         return zip(self.sensors, *(np.split(values, ends) for values in per_point), strict=True)
 
@@ -178,7 +178,7 @@ class MeasuredPose:
         return np.concatenate([x.located(seen, s) for x, s in self._each(places)])
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
-        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
+        """Change (R, q) of the residual by displacements (K, d, q) [m] of the measured points."""
         parts = self._each(places, moved)
         return np.concatenate([x.components(curve, s, way) for x, s, way in parts])
 
@@ -200,13 +200,13 @@ class MeasuredPose:
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
 
     def nearest(self, curve: NodeCurve) -> FloatArray:
-        """Arc lengths (K,) [m] at which the points belong on a curve that may be far off."""
+        """Arc lengths (K,) [m] of the points on a curve that may be far off, by global search."""
         return np.concatenate([sensor.nearest(curve) for sensor in self.sensors])
 
     def distances(self, curve: NodeCurve) -> FloatArray:
-        """Distance [m] of each point of the line from where a curve has it.
+        """Distance [m] of each point of the line from its place on a curve.
 
-        Of photographs that show none together: of each pixel, across its line of sight.
+        For photographs without a common line: of each pixel, across its line of sight.
         """
         if not self.has_line:
             return self.misses(curve)
@@ -215,18 +215,18 @@ class MeasuredPose:
 
     @property
     def noise_distances(self) -> FloatArray:
-        """RMS `distances` (K,) from the true curve, over the noise of one coordinate."""
+        """Expected RMS of `distances` (K,) to the true curve, over the noise of a coordinate."""
         item = self.traced if self.has_line else self
         return np.sqrt(np.bincount(item.point_of, item.relative_std[item.point_of] ** 2))
 
     def misses(self, curve: NodeCurve) -> FloatArray:
-        """Size (K,) [m] of the residuals of each point of a sensor."""
+        """Norm (K,) [m] of the residuals of each point."""
         seen, places = Observed(curve, np.zeros(0)), self.nearest(curve)
         rows = [sensor.residual(seen, places[points]) for sensor, points, _ in self.slices]
         return np.sqrt(np.bincount(self.point_of, np.concatenate(rows) ** 2))
 
     def misread(self, seen: Observed, noise: NoiseModel) -> FloatArray:
-        """Errors of the readings [m] as `NoiseModel.units` have them; empty without any."""
+        """Errors of the wrenches, in metres by `NoiseModel.units`; empty without any."""
         rows = [x.residual(seen, np.zeros(0)) for x in self.sensors if not len(x.points)]
         kinds = self.kinds[~self.on_points]
         return np.concatenate([np.zeros(0), *rows]) * noise.units(kinds)

@@ -24,20 +24,20 @@ Kernel = Literal["exponential", "matern", "gaussian"]
 Count = FloatArray | float
 Source = Literal["declared", "repeats", "estimated", "misfit"]
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
-# Slow sines per pose in which a missing effect would show.
+# Number of slow sines per pose: displacements that a missing effect may cause.
 SLOW_MODES = 6
-# Directions below this share of the largest tell nothing of their own: the square root of rounding
-# in their products, 1e-8, and two digits.
+# Singular value, relative to the largest, below which directions are dependent: the square root of
+# the rounding error of their products, 1e-8, and two digits.
 _DEPENDENT = 1e-6
-# Share of the variance from which on noise is smooth along the cable. Points nearer to one another
-# than its correlation length tell of the kernel's shape then, not of slow errors: of rendered
-# photographs those came out at 0.9 of their variance from 80 points a pose, at 0.37 from 160,
-# against 54.
+# Correlated share of the variance above which noise counts as smooth, and points are thinned.
+# Points closer than the correlation length determine the kernel's shape, not the slow errors: on
+# rendered photographs the variance of slow errors was 0.9 with 80 points a pose, and 0.37 with 160,
+# of that with 54.
 SMOOTH = 0.9
-# Points beyond its own directions that a pose needs to tell of the noise, and degrees of freedom
-# that all poses need together for a size and a correlation.
+# Fewest points, beyond its own directions, of a pose used for the noise; and fewest degrees of
+# freedom of all poses together for a size and a correlation.
 _SPARE_POINTS, _LEAST_DEGREES = 5, 6
-# Most poses from which the correlation is estimated, evenly picked; its size is that of all.
+# Maximum number of poses used for the correlation, evenly spaced; the size of the noise uses all.
 _MOST_POSES = 60
 
 
@@ -53,9 +53,9 @@ def correlation(kernel: Kernel, ratio: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class ReadingNoise:
-    """Standard deviations of one component of a force [N] and of a moment [N m] that were read.
+    """Standard deviations of one component of a measured force [N] and of a moment [N m].
 
-    `force_known`, `moment_known`: whether they were declared; else they are estimated.
+    `force_known`, `moment_known`: whether they were declared; otherwise they are estimated.
     """
 
     force: float
@@ -78,15 +78,15 @@ class NoiseModel:
         Correlation length.
     kernel : "exponential", "matern" or "gaussian"
     source : "declared", "repeats", "estimated" or "misfit"
-        Whether it was declared, is how poses repeat that were taken more than once, or was
-        estimated from the residual; or is no noise at all, but what a model misses that lacks
-        something, by which a fit of it weighs the points.
+        Origin: declared, the difference of repeated poses, or estimated from the residual. With
+        "misfit" it is no noise but the error of a model that lacks an effect, and weighs the
+        points in a fit of it.
     slow_dof : float
-        Degrees of freedom of chi-square with which the variance of slow modes is known.
+        Degrees of freedom of the chi-square distribution of the slow modes' estimated variance.
     readings : ReadingNoise, optional
         Of forces and moments on the fixtures, where there are any.
     before : NoiseModel, optional
-        Of a misfit: what was known of the noise.
+        Of a misfit: the noise itself.
     """
 
     std: float
@@ -100,12 +100,12 @@ class NoiseModel:
 
     @property
     def of_points(self) -> Self:
-        """What is known of the noise of the points themselves."""
+        """The known noise where this is a misfit, otherwise this noise itself."""
         return self.before if self.before is not None and self.before.known else self
 
     @property
     def beside_hangings(self) -> float:
-        """Standard deviation of points [m] beside how hangings differ; 0 where that told it all."""
+        """Standard deviation of points [m] beside the scatter of repeats; 0 if that includes it."""
         return 0.0 if self.source == "repeats" else self.std
 
     @property
@@ -115,7 +115,7 @@ class NoiseModel:
 
     @property
     def known(self) -> bool:
-        """Whether it does not depend on the model that is fitted."""
+        """Whether it is independent of the model that is fitted."""
         return self.source != "estimated"
 
     def covariance(
@@ -145,7 +145,7 @@ class NoiseModel:
         return unit
 
     def units(self, kinds: NDArray[np.str_]) -> FloatArray:
-        """What a unit of each residual counts as [m] (R,): one of its stds as one of a point's.
+        """Metres (R,) per unit of each residual, such that its std becomes that of a point.
 
         One of points, m/N of forces, 1/N of moments.
         """
@@ -153,7 +153,7 @@ class NoiseModel:
         return self.std / np.array([own[kind] for kind in kinds])
 
     def doubted(self, std: float) -> "NoiseModel":
-        """White noise of that size [m] where it is larger, that of readings grown with it."""
+        """White noise of this size [m] if it is larger, with that of wrenches scaled alike."""
         factor, own = std / self.std, self.readings
         if factor <= 1:
             return self
@@ -171,14 +171,14 @@ class NoiseModel:
 
 
 def smooth_modes(s: FloatArray, length: float, count: int, free_end: bool) -> FloatArray:
-    """Displacements (K, count) that a missing effect may cause: slow sines along the cable."""
+    """Slow sines (K, count) along the cable, displacements that a missing effect may cause."""
     k = np.arange(1, count + 1) - (0.5 if free_end else 0.0)
     return np.sin(np.pi * np.outer(s / length, k))
 
 
 @dataclass(frozen=True)
 class NoiseSample:
-    """What one pose tells about the noise: residuals of points, and what they hold beside it.
+    """Residuals of one pose's points, and the directions of them that are not noise.
 
     Parameters
     ----------
@@ -189,12 +189,12 @@ class NoiseSample:
     weight : (K,)
         Relative standard deviations.
     own : (R, a)
-        Directions that the curve of this pose alone may take; projected out.
+        Directions in which the curve of this pose alone may change; projected out.
     shared : (R, b)
-        Directions along which all poses move together; projected out. Stacked over the poses
+        Directions in which all poses change together; projected out. Stacked over the poses
         they are independent of one another and of the poses' own directions.
     correlation_length : scalar [m]
-        Over which the points share the errors that are white otherwise.
+        Length over which the otherwise white errors are correlated.
     count : (K,) or one for all
         Measured points of which each is the mean.
     """
@@ -208,9 +208,9 @@ class NoiseSample:
     count: Count = 1.0
 
     def thinned(self, most: int) -> "NoiseSample":
-        """Keep at most so many points, evenly picked, and of the own directions what they tell.
+        """Keep at most `most` points, evenly spaced, and the own directions that change them.
 
-        A pose's directions may leave the points of one of its photographs where they are.
+        Some of a pose's directions may not change the points of one of its photographs.
         """
         step = max(1, -(-len(self.places) // most))
         kept = np.arange(0, len(self.places), step)
@@ -247,8 +247,8 @@ class NoiseSample:
 def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[float, float]:
     """Restricted -2 log likelihood with the scale profiled out, and that scale [m].
 
-    REML: the directions that the fitted curves may take are projected out and their loss of
-    degrees of freedom is counted, so that a good fit does not make the noise look smaller.
+    REML: the directions of the fitted curves are projected out and the degrees of freedom reduced
+    accordingly, so that a good fit does not make the noise look smaller.
 
     References
     ----------
@@ -261,7 +261,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> tuple[f
             unit.correlation(sample.distance, sample.correlation_length, sample.count)
         )
         points, each, columns = sample.scaled.shape
-        # LAPACK itself: of matrices this small SciPy's checks take longer than the solution.
+        # LAPACK itself: for matrices this small SciPy's checks take longer than the solution.
         y = dtrtrs(factor.T, sample.scaled.reshape((points, -1)), lower=0, trans=1)[0]
         y = y.reshape((points * each, columns))
         products, k = y.T @ y, len(gram)
@@ -294,16 +294,16 @@ def estimate_noise(
     samples : list of NoiseSample
     cable_length : float [m]
     max_points : int
-        Points used per pose; evenly thinned beyond that, and where smooth noise makes them alike.
+        Maximum number of points used per pose, evenly spaced; fewer where the noise is smooth.
 
     See Also
     --------
-    tell_of_noise : whether there is enough to estimate it from.
+    tell_of_noise : whether there are enough points for it.
     """
     samples = [sample.thinned(max_points) for sample in _telling(samples)]
     everything, samples = samples, samples[:: max(1, -(-len(samples) // _MOST_POSES))]
-    # A correlation that is there but weak must not be dropped: it makes smooth residuals
-    # look significant. So the likelihood alone decides, without a price on the parameters.
+    # A weak correlation must not be dropped: smooth residuals would then look significant. The
+    # likelihood alone decides, without a penalty on the number of parameters.
     found = [_white(samples, cable_length)]
     found += [_correlated(samples, cable_length, kernel) for kernel in KERNELS]
     best = min(found, key=lambda item: item.deviance)
@@ -319,12 +319,12 @@ def estimate_noise(
 
 
 def tell_of_noise(samples: list[NoiseSample], least: float = _LEAST_DEGREES) -> bool:
-    """Whether enough of the points is left to `estimate_noise` by what is projected out.
+    """Whether enough degrees of freedom are left for `estimate_noise` after the projection.
 
     Parameters
     ----------
     least : float
-        Degrees of freedom that are enough.
+        Fewest degrees of freedom.
     """
     kept = _telling(samples)
     return bool(kept) and _degrees(kept) >= least
@@ -337,7 +337,7 @@ def _telling(samples: list[NoiseSample]) -> list[NoiseSample]:
 
 @dataclass(frozen=True)
 class _Estimate:
-    """Most likely noise of one kernel, with what is known of the variance of slow modes."""
+    """Most likely noise of one kernel, and the estimated variance of slow modes."""
 
     noise: NoiseModel
     deviance: float
@@ -365,8 +365,8 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
         return replace(unit(q), std=restricted_deviance(unit(q), samples)[1])
 
     def deviance(q: FloatArray) -> float:
-        # All shares are as likely before: slow modes are projected out, and of photographs the
-        # likelihood alone made 0.11 mm of slow errors of 0.015 mm, by a smooth kernel.
+        # Uniform prior of the share: slow modes are projected out, and on photographs the
+        # likelihood alone gave slow errors of 0.11 mm instead of 0.015 mm, with a smooth kernel.
         share = _logistic(q[0])
         prior = -2 * np.log(4 * share * (1 - share))
         outside = 10 * float((q[1] - np.clip(q[1], low, high)) ** 2)
@@ -391,7 +391,7 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
     ]
     mixed = deviance(found.x + step) + deviance(found.x - step) - 2 * found.fun - sum(diagonal)
     hessian = np.array([[diagonal[0], mixed / 2], [mixed / 2, diagonal[1]]]) / step**2
-    # -2 log likelihood: the covariance is twice the inverse; the penalty's curvature is the least.
+    # The covariance is twice the inverse Hessian of -2 log likelihood, at least the prior's part.
     values, vectors = np.linalg.eigh(hessian)
     along = vectors.T @ (np.array(slope) / (2 * step))
     spread = 2 / _degrees(samples) + 2 * float((along**2 / np.maximum(values, 0.04)).sum())
@@ -400,20 +400,20 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
 
 
 def _logistic(q: float) -> float:
-    """Share of a logit, within 3e-4 of its limits."""
+    """Share whose logit is q, cut at 3e-4 from its limits."""
     return float(1 / (1 + np.exp(-np.clip(q, -8, 8))))
 
 
 def _degrees(samples: list[NoiseSample]) -> float:
-    """Points less the directions that are projected out."""
+    """Number of residuals minus that of the directions that are projected out."""
     own = sum(len(sample.residuals) - sample.own.shape[1] for sample in samples)
     return float(max(own - samples[0].shared.shape[1], 1))
 
 
 def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float) -> float:
-    """Logarithm of the geometric mean of the variance of slow modes, in the middle pose for all."""
+    """Logarithm of the geometric mean of the variances of slow modes, taken of the middle pose."""
     sample = samples[len(samples) // 2]
-    # Sines vanish at the fixtures, where points may lie: they determine no mode.
+    # Points at the fixtures, where sines vanish, determine no mode.
     count = min(SLOW_MODES, max(1, len(sample.places) - 3))
     modes = smooth_modes(sample.places, cable_length, count, free_end=False)
     seen = noise.whitening(sample.places, sample.weight, sample.correlation_length) @ modes
@@ -421,7 +421,7 @@ def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float
 
 
 def _slow_dof(found: list[_Estimate]) -> float:
-    """Degrees of freedom of a chi-square whose logarithm varies as that of the slow variance.
+    """Degrees of freedom of the chi-square whose logarithm has the variance of `log_slow`.
 
     var(log slow) = E var(log slow | kernel) + var E(log slow | kernel), kernels weighted by their
     likelihood; var(log chi-square_k) = 2 / k.

@@ -13,16 +13,16 @@ from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Sensor
 from dlo_casadi.vision import ImageCurve, Viewpoint, compare_pixels, nearest_in_order
 
-_SETTLED = 1e-5  # of the length: a residual feels half the bend times the square of that
-# Standard deviations of the average along the cable. On rendered photographs pixels are 0.014 px
-# RMS off the true curve, but 0.1 px within two of an end, and 0.03 px within three.
+_TOLERANCE = 1e-5  # of the length: the residual's error is half the curvature times its square
+# Distance from an end of the line within which pixels are left out, in std of the average along the
+# cable. Rendered pixels are 0.014 px RMS off the true curve, 0.1 px within two, 0.03 within three.
 _REACH = 3.0
-# Times the median: stretches that share an outline are known to 0.2 to 0.4 px, and off by as much.
+# Largest std of a pixel over the median one: where stretches share an outline it is 0.2 to 0.4 px.
 _UNSURE = 2.0
-# Sine of the angle between cable and line of sight. In ten rendered poses pixels are off the fitted
-# line's neighbourhood by 0.04 mm RMS below it, by 0.02 mm up to twice it and 0.014 mm above.
+# Smallest sine of the angle between cable and line of sight. In ten rendered poses pixels are off
+# their neighbours' fitted line by 0.04 mm RMS below it, 0.02 mm up to twice it, 0.014 mm above.
 _STEEP = 0.4
-_SURE_PX = 2.0  # how far off a curve may be seen that is nearly right
+_SURE_PX = 2.0  # largest distance of a pixel from a curve that is nearly right
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class ViewInput:
         File stem.
     image : Path
     seen : ImageCurve
-        What is seen in it.
+        The line found in it.
     places : (K, 3) [m]
-        About where its pixels lie in space; nan for those that are not of the cable.
+        Approximate places of its pixels in space; nan for those that are not of the cable.
     """
 
     name: str
@@ -56,8 +56,8 @@ class Pixels(Sensor):
     at the cable's distance: the distance across the line of sight, in the units of other sensors.
     The places s_k are nearest in the picture; there d does not change to first order with s.
 
-    Where the camera stands is known from the board's markers only so well: its error, a rotation
-    and a shift, moves all pixels of a photograph together and is part of their covariance.
+    The pose of the camera is known from the board's markers; its error, a rotation and a shift,
+    moves all pixels of a photograph together and is part of their covariance.
 
     Parameters
     ----------
@@ -68,18 +68,18 @@ class Pixels(Sensor):
     diameter : scalar [m]
         Of the cable.
     points : (K, 3) [m]
-        About where they lie.
+        Their approximate places.
     weight : (K,)
         Relative standard deviations.
     size : scalar [m/px]
         Of a pixel at the cable.
     by_camera : (K, 6) [m]
-        What a standard deviation of each error of the camera's place does to the residuals.
+        Change of the residuals by one standard deviation of each error of the camera's pose.
     correlation_length : scalar [m]
-        Length over which the average along the cable correlates the pixels' errors: what else is
-        correlated, such as by light that changes along the cable, is left to the noise model.
+        Length over which the average along the cable correlates the pixels' errors. The noise model
+        has other correlations, such as by light that changes along the cable.
     on_line : bool
-        Whether the points are of a line in space, and no guess.
+        Whether the points are of a measured line in space, not guessed.
     """
 
     viewpoint: Viewpoint
@@ -96,17 +96,17 @@ class Pixels(Sensor):
 
     @property
     def together(self) -> FloatArray:
-        """What the errors of the camera's place do to the residuals (K, 6) [m], a std of each."""
+        """Change (K, 6) [m] of the residuals by one std of each error of the camera's pose."""
         return self.by_camera
 
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
-        """Arc lengths (K,) [m] that are seen nearest to the pixels, near those given."""
+        """Arc lengths (K,) [m] whose images are nearest to the pixels, near those given."""
         return self._nearest(seen.curve, places)
 
     def nearest(self, curve: NodeCurve) -> FloatArray:
-        """Arc lengths (K,) [m] at which the pixels belong on a curve that may be far off.
+        """Arc lengths (K,) [m] of the pixels on a curve that may be far off, by global search.
 
-        Those nearest in space; of one photograph alone those nearest in it, in order.
+        The nearest in space; for a single photograph the nearest in the picture, in order.
         """
         if self.on_line:
             return self._nearest(curve, curve.nearest(self.points))
@@ -127,17 +127,17 @@ class Pixels(Sensor):
             ahead = np.sum((self.pixels - seen) * along, axis=1)
             return np.asarray(ahead / np.maximum(np.sum(along**2, axis=1), 1e-12))
 
-        return curve.followed(guess, step, _SETTLED)
+        return curve.followed(guess, step, _TOLERANCE)
 
     def _compared(self, curve: NodeCurve, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals (K,) [m] and their slopes (K, 3) by the curve's points."""
+        """Residuals (K,) [m] and their derivatives (K, 3) by the curve's points."""
         position, tangent = curve.frame(places, 1)
         tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
-        away, slopes = compare_pixels(self.viewpoint, self.pixels, position, tangent, self.diameter)
-        return self.size * away, self.size * slopes
+        away, by = compare_pixels(self.viewpoint, self.pixels, position, tangent, self.diameter)
+        return self.size * away, self.size * by
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
-        """What the residual has of displacements (K, 3, q) [m] of what is measured: (K, q)."""
+        """Change (K, q) of the residual by displacements (K, 3, q) [m] of the measured points."""
         return np.asarray(-np.einsum("kd,kdq->kq", self._compared(curve, places)[1], moved))
 
     def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
@@ -148,12 +148,12 @@ class Pixels(Sensor):
         self, seen: Observed, places: FloatArray, along: ObservedChange
     ) -> tuple[FloatArray, FloatArray]:
         """Residual (K,) [m] and its change (K, q) along directions."""
-        away, slopes = self._compared(seen.curve, places)
+        away, by = self._compared(seen.curve, places)
         moved = seen.curve.moved(places, along.curve)
-        return away, np.einsum("kd,kdq->kq", slopes, moved)
+        return away, np.einsum("kd,kdq->kq", by, moved)
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
-        """Matrix W (K, K) [1/m] with W cov W^T = 1, errors of the camera's place among them."""
+        """Matrix W (K, K) [1/m] with W cov W^T = 1, including errors of the camera's pose."""
         white = noise.whitening(places, self.weight, self.correlation_length)
         seen = white @ self.by_camera
         factor = np.linalg.cholesky(np.eye(len(seen)) + seen @ seen.T)
@@ -168,15 +168,15 @@ def pixel_std(views: Sequence[ViewInput]) -> float:
 def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | None:
     """The sensor of a photograph; None if none of its pixels is of the cable.
 
-    Pixels share their errors with their neighbours over the length of the average along the
-    cable: of those nearer to each other than its integral one is taken. None is taken where the
-    average reaches over an end of the line, into what holds the cable, to where another stretch
-    hides an edge, or to where the cable runs along the line of sight.
+    Errors of neighbouring pixels are correlated over the length of the average along the cable:
+    pixels are taken at its integral's distance. None is taken where the average reaches beyond an
+    end of the line, into the holder, where another part of the cable hides an edge, or where the
+    cable runs along the line of sight.
 
     Parameters
     ----------
     view : ViewInput
-        With what is seen in it.
+        With the line found in it.
     std : scalar [m]
         Standard deviation of a pixel of weight one.
     """
@@ -204,7 +204,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     error = np.linalg.cholesky(viewpoint.covariance)
     together = size * np.column_stack([by_turn, by_shift]) @ error
     weight = curve.std[kept] * size / std
-    # Of an average with a Gaussian, whose errors are correlated over sqrt(2) of its own length.
+    # Errors of an average with a Gaussian are correlated over sqrt(2) times its own length.
     correlation_length = np.sqrt(2.0 / np.pi) * curve.correlation * size
     return Pixels(
         viewpoint,
@@ -229,7 +229,7 @@ def _across(view: ViewInput) -> FloatArray:
 
 
 def _size(view: ViewInput) -> float:
-    """Size [m] of a pixel of a photograph at the cable, the median."""
+    """Median size [m] of a pixel at the cable."""
     viewpoint = view.seen.viewpoint
     depth = viewpoint.in_camera(view.places)[:, 2]
     return float(np.nanmedian(depth)) / viewpoint.camera.focal

@@ -1,8 +1,7 @@
-"""Sensors: what is measured of a pose, and how it is compared with what a model says.
+"""Sensors: measurements of a pose, their residuals, derivatives and covariance.
 
-A sensor's residual is what was measured minus what the model says of it. Its own unknowns, such
-as the places of points along the cable, follow the curve (`located`); derivatives are those at
-fixed own unknowns.
+A sensor's residual is measured minus predicted. Its own unknowns, such as the arc lengths of
+points, follow from the curve (`located`); derivatives are taken at fixed own unknowns.
 """
 
 from abc import ABC, abstractmethod
@@ -23,7 +22,7 @@ from dlo_casadi.sensing.noise import Count, NoiseModel
 class Sensor(ABC):
     """One measurement of one pose: `per_point` residuals of each of its K points, point by point.
 
-    Or of no point at all (K = 0), but of R residuals beside the curve.
+    A measurement without points (K = 0) has R residuals.
 
     Attributes
     ----------
@@ -46,22 +45,22 @@ class Sensor(ABC):
 
     @property
     def correlation_length(self) -> float:
-        """Length [m] over which points share the errors that are white otherwise."""
+        """Length [m] over which the otherwise white errors of points are correlated."""
         return 0.0
 
     @property
     def count(self) -> Count:
-        """Measured points of which each (K,) of its points is the mean; or one for all."""
+        """Number (K,) of measured points of which each point is the mean, or one for all."""
         return 1.0
 
     @property
     def kinds(self) -> NDArray[np.str_]:
-        """What each residual (R,) is of: point [m], force [N] or moment [N m]."""
+        """Kind of each residual (R,): point [m], force [N] or moment [N m]."""
         return np.full(len(self.points) * self.per_point, "point")
 
     @property
     def together(self) -> FloatArray:
-        """Errors (R, c) that its residuals share, a standard deviation of each; none by default."""
+        """Common errors (R, c) of its residuals, of one std each; none by default."""
         return np.zeros((len(self.kinds), 0))
 
     def places(self, pose: Pose, length: float) -> FloatArray:
@@ -74,11 +73,11 @@ class Sensor(ABC):
 
     @abstractmethod
     def nearest(self, curve: NodeCurve) -> FloatArray:
-        """Arc lengths (K,) [m] at which the points belong on a curve that may be far off."""
+        """Arc lengths (K,) [m] of the points on a curve that may be far off, by global search."""
 
     @abstractmethod
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
-        """What the residual has of displacements (K, d, q) [m] of the points: (R, q)."""
+        """Change (R, q) of the residual by displacements (K, d, q) [m] of the measured points."""
 
     @abstractmethod
     def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
@@ -100,7 +99,7 @@ class Sensor(ABC):
 
 
 class _Known(Sensor):
-    """A sensor that knows the arc lengths s (K,) [m] of its points."""
+    """A sensor with known arc lengths s (K,) [m] of its points."""
 
     s: FloatArray
     marked = True
@@ -150,8 +149,8 @@ class _Points(Sensor):
 class Centerline(_Points):
     """Points somewhere along the cable, compared across its tangent: d - 1 residuals each.
 
-    The arc lengths of their closest points on the curve are the sensor's own unknowns. There the
-    normal distance does not change to first order with s, so that derivatives at fixed s are exact.
+    The arc lengths s of the points' projections onto the curve are the sensor's own unknowns. The
+    distance is stationary in s there, so that derivatives at fixed s are exact.
 
     Parameters
     ----------
@@ -167,7 +166,7 @@ class Centerline(_Points):
         return self.points.shape[1] - 1
 
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
-        """Arc lengths (K,) [m] of the closest points, near those given."""
+        """Arc lengths (K,) [m] of the points' projections, near those given."""
         return seen.curve.projections(self.points, places)
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
@@ -184,7 +183,7 @@ class Centerline(_Points):
 class Markers(_Known, _Points):
     """Points at known arc lengths, compared in all directions: d residuals each.
 
-    Where the cable's length is an unknown, the known arc lengths are shares of the declared one.
+    Where the cable's length is estimated, arc lengths scale with it.
 
     Parameters
     ----------
@@ -230,8 +229,8 @@ class Wrench(_Known):
     Parameters
     ----------
     measured : dict
-        Of the cable on whatever holds it, in world axes, moments about the fixture, by their names,
-        of `ends.REACTIONS`: (dimension,) [N], (increment,) [N m].
+        Forces (dimension,) [N] and moments (increment,) [N m] of the cable on its fixtures, in
+        world axes, moments about the fixture; by names of `ends.REACTIONS`.
     node : type of Node
     """
 
@@ -242,22 +241,22 @@ class Wrench(_Known):
 
     @property
     def _rows(self) -> dict[str, slice]:
-        """Where those that were measured stand among the model's readings."""
+        """Slices of the measured components in the model's `readings`."""
         return {name: at for name, at in reaction_rows(self.node).items() if name in self.measured}
 
     def beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Measured and the model's, by their names."""
+        """Measured and predicted values by name."""
         return {name: (self.measured[name], seen.readings[at]) for name, at in self._rows.items()}
 
     @property
     def kinds(self) -> NDArray[np.str_]:
-        """What each residual (R,) is of: a force or a moment."""
+        """Kind of each residual (R,): a force or a moment."""
         return np.concatenate(
             [np.full(at.stop - at.start, name.split("_")[1]) for name, at in self._rows.items()]
         )
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
-        """Zeros (R, q): no point of theirs moves."""
+        """Zeros (R, q): it measures no points."""
         return np.zeros((len(self.kinds), moved.shape[2]))
 
     def residual(self, seen: Observed, places: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The board's ArUco markers: where the camera stands."""
+"""The board's ArUco markers, and the pose of the camera from them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,11 +11,11 @@ from dlo_casadi.errors import VisionError, counted
 from dlo_casadi.vision.camera import Array, Camera, Picture, View, Viewpoint
 from dlo_casadi.vision.image import spoilt
 
-MAX_ERROR_PX = 2.0  # a marker worse than this is not where the configuration says
-LEAST_MARKERS = 3  # for the pose of a camera: fewer span no more than a line of the board
-CORNERS_THAT_SHARE = 4  # corners that share light, blur and print: those of a marker count as one
-_BEST_CORNER_PX = 0.05  # least error of a corner, from sampling and rounding to grey levels
-_RESIZED = 20.0  # largest factor by which a picture is taken to have been made smaller or larger
+MAX_ERROR_PX = 2.0  # largest error of a marker that is where the configuration says
+LEAST_MARKERS = 3  # fewest markers for the pose of a camera: two span no more than a line
+CORNERS_THAT_SHARE = 4  # corners of a marker with a common error (light, blur, print): count as one
+_BEST_CORNER_PX = 0.05  # smallest error of a corner, from sampling and rounding to grey levels
+_RESIZED = 20.0  # largest factor by which a picture may have been scaled
 
 # Mistakes in marker_centers: what was written -> the board's axes, x right and y up.
 _AXES = {
@@ -76,10 +76,10 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
 
 
 def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
-    """Find the board and return where the camera stands before it.
+    """Find the board and return the pose of the camera.
 
     The pose (R, t) minimises the reprojection error of all corners of all visible markers. The
-    board's standoff does not count; the rest is as in `locate_board`.
+    board's standoff is not used; the rest is as in `locate_board`.
 
     Raises
     ------
@@ -90,9 +90,9 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
     one, other, shift = fit.plane.T
     rotation = np.column_stack([one, other, np.cross(one, other)])
     at = np.vstack([board.corners(n) for n in fit.found]) @ rotation[:, :2].T + shift
-    # Corners of a marker err together: 4 (J^T J)^-1 s^2 with the corners' own scatter s^2 = sum /
-    # (2 K - 6). On rendered boards poses are off by up to five times what sixteen independent
-    # corners would leave.
+    # Corners of a marker have a common error: 4 (J^T J)^-1 s^2 with the corners' scatter s^2 = sum
+    # / (2 K - 6). On rendered boards the error of poses is up to five times that of sixteen
+    # independent corners.
     by_shift = camera.project(at)[1]
     J = np.concatenate([np.cross(at[:, None, :], by_shift), by_shift], axis=2).reshape(-1, 6)
     scatter = max(fit.rms**2 * len(at) / (2 * len(at) - 6), _BEST_CORNER_PX**2)
@@ -107,7 +107,7 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The board's plane as markers show it."""
+    """The board's plane, fitted to markers."""
 
     found: dict[int, Array]  # corners (4, 2) [px] of each marker
     plane: Array  # (3, 3), homography to pixels; with a camera [r_1, r_2, t]
@@ -193,9 +193,9 @@ def _fit(found: dict[int, Array], board: Board, camera: Camera | None) -> _Fit:
 
 
 def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, int]) -> str:
-    """Sentence on a matrix of a picture of another size, or turned; empty if it fits as it is.
+    """Sentence on a camera matrix of another picture size, or of a rotated one; empty if it fits.
 
-    A principal point is near the middle of the picture that it was found in.
+    A principal point is near the middle of the picture from which it was estimated.
     """
     width, height = shape
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
@@ -223,7 +223,7 @@ def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, in
 
 
 def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) -> str:
-    """Sentence on the axes with which the declared places would fit, if some do."""
+    """Sentence on other axes with which the declared places would fit, if there are any."""
     for what, axes in _AXES.items():
         centers = {n: np.array(axes) @ np.array(board.marker_centers[n], float) for n in found}
         fit = _fit(found, replace(board, marker_centers=centers), camera)
@@ -233,7 +233,7 @@ def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) ->
 
 
 def detect_markers(image: Picture, board: Board) -> tuple[dict[int, Array], set[int]]:
-    """Corners (4, 2) [px] of the board's markers, and the numbers that are seen more than once."""
+    """Corners (4, 2) [px] of the board's markers, and numbers of markers seen more than once."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:
         known = ", ".join(sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_"))[:6])
@@ -242,7 +242,7 @@ def detect_markers(image: Picture, board: Board) -> tuple[dict[int, Array], set[
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
 
     def markers(picture: Picture) -> dict[int, list[Array]]:
-        """Corners of all markers by their numbers, once for each time one is seen."""
+        """Corners of all markers by number, a list for each."""
         quads, numbers, _ = detector.detectMarkers(picture)
         found: dict[int, list[Array]] = {}
         for n, quad in zip([] if numbers is None else numbers.ravel(), quads, strict=True):
@@ -268,7 +268,7 @@ def detect_markers(image: Picture, board: Board) -> tuple[dict[int, Array], set[
 def _refine(grey: Picture, quad: Array) -> Array:
     """Corners of a black square on white as the intersections of its four straight sides.
 
-    Corner detectors look for saddles; on the L of a blurred square they are pulled inwards by
+    Corner detectors look for saddles; on the L of a blurred square they are biased inwards by
     about 0.2 px. A side is the median place at which the brightness steps from black to white.
     """
     corners = np.array(quad, float)

@@ -18,16 +18,16 @@ from dlo_casadi.vision.board import (
 from dlo_casadi.vision.camera import Array, Camera, Picture
 
 _LEAST_PHOTOGRAPHS = 3  # each gives two equations for the five numbers of the matrix
-_GOOD_FOCAL = 0.005  # relative std of the focal length: 0.5 % of every length along the view
-# Degrees between the most different directions, below which focal length and distance mix.
+_GOOD_FOCAL = 0.005  # largest relative std of a good focal length: 0.5 % of lengths along the view
+# Smallest angle [deg] between the most different directions; below, focal length and distance mix.
 _TILTED = 20.0
-# How well marker_centers are known [m], one coordinate, with a ruler. All photographs see the same
-# error, so that what they leave does not show it: of drawn corners whose markers were off by this,
-# three photographs from within 12 degrees were up to 5.7 % off where scatter alone told 2 %.
+# Std of a coordinate of marker_centers [m], measured with a ruler. The error is the same in all
+# photographs and does not show in the residuals: on drawn corners with markers off by this, three
+# photographs within 12 degrees gave errors up to 5.7 %, where the scatter alone predicted 2 %.
 _PLACED = 1e-3
-_APART = "30 to 90 degrees apart"  # directions that tell focal length from distance
-_FILLED = 0.5  # share of the picture in which corners lie: beyond them the lens is extrapolated
-# Numbers of a lens that are fitted: none, k1, k1 k2, k1 k2 p1 p2 k3.
+_APART = "30 to 90 degrees apart"  # directions that separate focal length from distance
+_FILLED = 0.5  # smallest share of the picture with corners: beyond them the lens is extrapolated
+# Lenses, by the coefficients that are fitted: none, k1, k1 k2, k1 k2 p1 p2 k3.
 _STRAIGHT = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 _LENSES = {
     0: _STRAIGHT | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2,
@@ -39,7 +39,7 @@ _LENSES = {
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera and how well it is known."""
+    """A camera and its uncertainty."""
 
     camera: Camera
     """Matrix [px] and distortion k1, k2, p1, p2, k3."""
@@ -58,7 +58,7 @@ class Calibration:
 
     @property
     def focal_uncertainty(self) -> float:
-        """Standard deviation of the focal lengths over themselves, the larger of both."""
+        """Relative standard deviation of the focal lengths, the larger of both."""
         return float(max(self.matrix_std[:2] / np.diag(self.camera.matrix)[:2]))
 
 
@@ -130,7 +130,7 @@ def calibrate_camera(photographs: Mapping[str, Picture], board: Board) -> Calibr
 def _solve(
     seen: dict[str, dict[int, Array]], board: Board, size: tuple[int, int], problems: dict[str, str]
 ) -> tuple[Calibration, dict[str, dict[int, float]]]:
-    """Calibrate with the lens that is worth its numbers; errors [px] of each marker by picture."""
+    """Calibrate with the lens of the least BIC; errors [px] of each marker by picture."""
     if len(seen) < _LEAST_PHOTOGRAPHS:
         raise VisionError(
             f"a calibration needs {_LEAST_PHOTOGRAPHS} photographs with {LEAST_MARKERS} markers "
@@ -157,7 +157,7 @@ def _solve(
     ):
         projected, slope = cv2.projectPoints(corners, turn, shift, matrix, lens)
         slopes.append(slope[:, : 10 + fitted])
-        # A marker that is elsewhere on the board moves its corners as the board itself would.
+        # A shift of a marker on the board moves its corners as a shift of the board would.
         moved = slope[:, 3:6] @ cv2.Rodrigues(turn)[0][:, :2]
         own = [
             np.kron(np.array(list(markers)) == n, np.ones(8))[:, None] * moved
@@ -183,11 +183,10 @@ def _solve(
 
 
 def _matrix_std(slopes: list[Array], displaced: list[Array], rms: float) -> Array:
-    """Standard deviations (4,) [px] of the matrix, whatever place and lens.
+    """Marginal standard deviations (4,) [px] of the matrix, over poses and lens.
 
-    Of scattered corners, those of a marker counting as one, and of markers that are not quite where
-    they are declared. OpenCV's drop what photographs from one direction do not tell, and call it
-    known.
+    They include the scatter of corners, those of a marker counting as one, and errors of the
+    declared markers. OpenCV's omit directions that photographs from one place do not determine.
 
     `slopes` (2 K, 10 + k) are derivatives of the corners of each photograph by its place (6), the
     matrix (4) and the lens, `displaced` (2 K, 2 m) by the places of the m markers on the board
@@ -205,7 +204,7 @@ def _matrix_std(slopes: list[Array], displaced: list[Array], rms: float) -> Arra
 
 
 def _advice(found: Calibration, filled: float) -> Iterator[str]:
-    """Sentences on how to do better; corners are seen in the share `filled` of the picture."""
+    """Advice on better photographs; corners are seen in the share `filled` of the picture."""
     if found.focal_uncertainty > _GOOD_FOCAL or found.spread < _TILTED:
         yield (
             f"the focal length is known to {100 * found.focal_uncertainty:.1f} % only, from "

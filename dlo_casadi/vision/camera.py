@@ -1,4 +1,4 @@
-"""Cameras: pixels to the cable's plane and back, and what is seen of a round cable in space."""
+"""Cameras: pixels to the cable's plane and back, and the image of a round cable in space."""
 
 from dataclasses import dataclass, field, fields, replace
 
@@ -15,8 +15,8 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 Picture = NDArray[np.uint8]
 
-# OpenCV inverts a lens by a fixed point. Its five default steps leave 0.6 px where a lens bends the
-# corners by 60 px; for 1e-10 px that one needs thirty steps, one of 10 px ten.
+# Stopping rule of OpenCV's fixed-point inversion of a lens. Its five default steps leave 0.6 px
+# where a lens moves the corners by 60 px; 1e-10 px takes thirty steps there, ten for 10 px.
 _UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
 
 
@@ -61,7 +61,7 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class Photograph:
-    """A picture's camera, and what it shows of the board."""
+    """A picture's camera, and the board as seen in it."""
 
     shape: tuple[int, int]
     """Height and width [px]."""
@@ -105,7 +105,7 @@ class View(Photograph):
 
     @property
     def camera_center(self) -> Array | None:
-        """Where the camera stands (3,) [m]; None if it is not known.
+        """Centre of the camera (3,) [m]; None if it is not known.
 
         x, y in the board frame, z in front of the cable's plane: C = -R^T t with
         H = [r_1, r_2, t] of a calibrated camera.
@@ -131,7 +131,7 @@ def _apply(homography: FloatArray, points: Array) -> Array:
 
 
 def from_reference(pixels: ArrayLike, points: ArrayLike, shape: tuple[int, ...]) -> View:
-    """View of a camera that looks squarely at the cable, from two points known in the picture.
+    """View of a camera square to the cable's plane, from two known points in the picture.
 
     With z = x + i y on the board and q = u - i v in the picture (rows run down, y runs up),
 
@@ -166,7 +166,7 @@ def from_reference(pixels: ArrayLike, points: ArrayLike, shape: tuple[int, ...])
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint(Photograph):
-    """Where the camera of one photograph stands.
+    """Pose of the camera of one photograph.
 
     A point p of the board frame (x right, y up, z out of the board) is at
 
@@ -186,7 +186,7 @@ class Viewpoint(Photograph):
 
     @property
     def center(self) -> Array:
-        """Where the camera stands (3,) [m] in the board frame, C = -R^T t."""
+        """Centre of the camera (3,) [m] in the board frame, C = -R^T t."""
         return -self.rotation.T @ self.translation
 
     def in_camera(self, points: ArrayLike) -> Array:
@@ -247,12 +247,12 @@ def project_outline(
         s = +-r / p_z / (B cos a -+ g sin a),  B = |b_xy|,  g = e_xy . b_xy / B
 
     across the axis. The middle between both is off the projected axis by r g sin a / p_z /
-    (B^2 cos^2 a - g^2 sin^2 a): nothing in the middle of the picture, some r^2 f / (2 d^2) in its
+    (B^2 cos^2 a - g^2 sin^2 a): zero in the middle of the picture, about r^2 f / (2 d^2) in its
     corners; with f = 1080 px 0.002 px for a cable of 7 mm at 1.7 m, 0.08 px for 12 mm at 0.5 m.
 
-    A bent cable is the envelope of spheres along its axis. Its outline has the projected axis in
-    the middle while that bends less than the outline is wide: where a bend is seen from its side as
-    a cusp, and where another stretch shares the outline, the middle is somewhere else.
+    A bent cable is the envelope of spheres along its axis. The projected axis is in the middle of
+    the outline if its radius exceeds the outline's width; not so where a bend seen from its side
+    is a cusp, and where another part of the cable shares the outline.
     """
     p = viewpoint.in_camera(points)
     t = np.asarray(tangents, float).reshape(-1, 3) @ viewpoint.rotation.T
@@ -264,11 +264,11 @@ def project_outline(
     B = np.maximum(np.linalg.norm(b[:, :2], axis=1), 1e-9)
     g = np.sum(e[:, :2] * b[:, :2], axis=1) / B
     radius, sin = 0.5 * diameter, 0.5 * diameter / d
-    # A cable seen on end shows its section, whose middle is the axis to a radius.
+    # A cable seen end-on shows its section; its middle is the axis to within a radius.
     squares = np.maximum(B**2 * (1.0 - sin**2) - (g * sin) ** 2, sin**2)
     off = np.clip(radius * g * sin / squares, -radius, radius) / p[:, 2]
     across = b[:, :2] / B[:, None]
-    # d(pixel)/d(ray) = p_z d(pixel)/d(p_xy), and a step along the ray's plane moves no depth
+    # d(pixel)/d(ray) = p_z d(pixel)/d(p_xy), and a step in the ray's plane changes no depth
     by_ray = p[:, 2, None, None] * (slopes @ viewpoint.rotation.T)[:, :, :2]
     step = np.einsum("kij,kj->ki", by_ray, across)
     along = np.einsum("kij,kj->ki", slopes, np.asarray(tangents, float).reshape(-1, 3))
@@ -287,12 +287,12 @@ def compare_pixels(
     pixels : (K, 2) [px]
         Measured middles of the outline, as photographed.
     points, tangents : (K, 3) [m], [-]
-        Of the curve, at the nearest place to each pixel in the picture: there the distance does
-        not change to first order with the place.
+        Of the curve, at the nearest place to each pixel in the picture, where the distance is
+        stationary.
 
     Returns
     -------
-    Distances (K,) [px], and their slopes d(distance)/d(point) (K, 3) [px/m].
+    Distances (K,) [px], and d(distance)/d(point) (K, 3) [px/m].
     """
     middle, normals, slopes = project_outline(viewpoint, points, tangents, diameter)
     distance = np.sum((np.asarray(pixels, float) - middle) * normals, axis=1)

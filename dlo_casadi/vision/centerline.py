@@ -25,13 +25,14 @@ from dlo_casadi.vision.profiles import (
 )
 from dlo_casadi.vision.workplane import ALONG_BOARD, ExpectedLine, KnownCable, rectify
 
-_STEP = 1 / 8  # of the diameter: between profiles
-_RAW, FINE = 0.15, 0.7  # diameters averaged along the cable, to judge and to measure
-# Height and width vary by 1.5 % along a cable of seven pixels, by 6 % half a width from its end.
+_STEP = 1 / 8  # of the diameter: distance between profiles
+_RAW, FINE = 0.15, 0.7  # diameters over which profiles are averaged: to judge them, to measure
+# Relative difference in height or width from which a profile is unlike others. Both vary by 1.5 %
+# along a cable of seven pixels, and by 6 % half a width from its end.
 _UNLIKE = 0.05
 _WHITE = 248  # grey level
-_FLOOR_PX = 0.06  # what the sampling and compression of a photograph leave, along centimetres
-SPACING = 0.0025  # m, between points of a line
+_FLOOR_PX = 0.06  # smallest error over centimetres, by a photograph's sampling and compression
+SPACING = 0.0025  # m, distance between points of a line
 _MOST_POINTS = 400
 _FAR = 0.2  # largest distance of the line's end from a fixture in the picture, of the length
 _LEAST = 0.2  # least part of the length that must be measured
@@ -58,10 +59,10 @@ class Trace:
 def trace_cable(
     image: Picture, view: View, strands: tuple[Array, ...], expected: ExpectedLine
 ) -> Trace:
-    """Lay a smooth curve through the strands and move it onto the middle between the edges.
+    """Fit a smooth curve to the strands and move it onto the middle between the edges.
 
-    Two rounds on nearly raw profiles tell which of them show the cable; a last one measures on
-    profiles that are averaged along the cable, over sound ones only.
+    Two rounds on nearly raw profiles find those that show the cable; the last round measures on
+    profiles averaged along the cable, over sound ones only.
     """
     diameter, varied = expected.diameter, expected.scene.varied
     curve, t = _first_curve(strands, expected)
@@ -82,8 +83,8 @@ def trace_cable(
         shape = edge_shape(smooth, direction, usual, guess)
         rough = find_edges(smooth, direction, shape)
         sound = raw.inside & _is_usual(rough, usual, diameter)
-        # Not in front of the board: there the interval of EI of ten rendered poses was half as wide
-        # with it, and did not hold the truth.
+        # Not in front of the board: with it the interval of EI from ten rendered poses was half as
+        # wide and did not contain the truth.
         if not varied:
             sound &= ~_beside_end(rough, t, sound, diameter)
         if sound.sum() < 8:
@@ -92,8 +93,8 @@ def trace_cable(
         curve = fit_curve(t, points, sound.astype(float), 2 * diameter, 0.5 * diameter)
         usual = sound
         raw = sample_profiles(bright, view, curve, t, diameter)
-    # In a plane light shifts all photographs alike, harmonics that `edge_bias` takes up better: EI
-    # of the rendered `connector` is 0.2 % off then, 2 % with what is left of them here.
+    # In a plane, light shifts the edges alike in all photographs, which `edge_bias` models better:
+    # EI of the rendered `connector` is 0.2 % off with it, 2 % with a correction here.
     rough = find_edges(raw.average(raw.inside, _RAW * diameter), direction, shape, varied)
     fine = find_edges(raw.average(sound, FINE * diameter), direction, shape, varied)
     sound = _without_rims(
@@ -111,8 +112,8 @@ def trace_cable(
 def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BSpline, Array]:
     """Smooth curve through the strands, extended straight at both ends, and its samples t.
 
-    To a fixture if it is near. If not, by two diameters: a skeleton ends half a width early, and
-    the profiles tell where the cable does.
+    It is extended to a near fixture, otherwise by two diameters: a skeleton ends half a width
+    early, and the profiles show where the cable ends.
     """
     diameter = expected.diameter
     points = np.vstack(strands)
@@ -135,16 +136,16 @@ def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BS
 
 
 def _is_usual(found: Crossings, usual: Flags, diameter: float) -> Flags:
-    """Profiles that are usual in height, width and place of the cable."""
+    """Profiles with usual height, width and place of the cable."""
     tall, wide = (part / np.median(part[usual]) for part in (found.height, found.width))
     alike = (tall > 0.35) & (tall < 2.5) & (np.abs(wide - 1) < 0.3)
     return alike & (np.abs(found.offset) < 0.4 * diameter)
 
 
 def _beside_end(found: Crossings, t: Array, sound: Flags, diameter: float) -> Flags:
-    """Profiles within a diameter of a line's end up to the last that looks unlike those farther in.
+    """Profiles near a line's end, within a diameter, up to the last that differs from inner ones.
 
-    The blur of the cable's end, or its holder, moves the middle long before a profile is unusual.
+    The blur of the cable's end, or its holder, moves the middle before a profile is unusual.
     """
     beside = np.zeros(len(t), bool)
     inwards = np.flatnonzero(sound)
@@ -160,10 +161,10 @@ def _beside_end(found: Crossings, t: Array, sound: Flags, diameter: float) -> Fl
 
 
 def _without_rims(sound: Flags) -> Flags:
-    """Leave out short sound stretches, and the rims of long unsound ones.
+    """Leave out short sound intervals, and the neighbourhood of long unsound ones.
 
-    Beside a holder, a pin or an occluder its colour leaks into the profile before that shows. The
-    line's ends, at the fixtures, are such rims too.
+    Beside a holder, a pin or an occluder its colour leaks into profiles that still look sound. The
+    same holds for the line's ends, at the fixtures.
     """
     rim = round(0.35 / _STEP)
     sound = sound.copy()
@@ -173,7 +174,7 @@ def _without_rims(sound: Flags) -> Flags:
 
 
 def _longer(flags: Flags, least: float) -> Flags:
-    """Those of the flags (K,) that stand in a run of more than `least`."""
+    """Flags (K,) in runs longer than `least`."""
     runs, _ = label(flags)
     return flags & (np.bincount(runs)[runs] > least)
 
@@ -181,10 +182,10 @@ def _longer(flags: Flags, least: float) -> Flags:
 def _std(rough: Array, fine: Array, sound: Flags, view: View) -> Array:
     """Standard deviation of each point (K,) [m].
 
-    The scatter of the rough places about the fine ones, over two diameters, falls with the square
-    root of the length of the averages. To it are added what the photograph's sampling leaves, and
-    the error of the board's pose: corner error over the root of the number of corners, times 1.5
-    for the lever to the cable.
+    It is the scatter of the rough places about the fine ones, over two diameters, which decreases
+    with the square root of the length of the averages; plus the error of the photograph's sampling,
+    and of the board's pose: corner error over the root of the number of corners, times 1.5 for the
+    lever to the cable.
     """
     deviation = 2.0 / _STEP
     weight = gaussian_filter1d(sound.astype(float), deviation)
@@ -227,7 +228,7 @@ def extract_centerline(
     cable : KnownCable
         Its fixtures, (2,) [m] each, and its size.
     workings : Workings, optional
-        Is filled with what the steps have seen, also where one of them fails.
+        Is filled with the results of the steps, also if one of them fails.
 
     Raises
     ------
@@ -263,12 +264,12 @@ def extract_centerline(
 
 @dataclass(frozen=True)
 class MeasuredLine:
-    """The trace of a cable and what of it counts."""
+    """The trace of a cable and its sound points."""
 
     trace: Trace
     kept: Indices  # (K,), sound profiles, evenly spaced
-    gaps: tuple[int, ...]  # indices of the kept ones after which a stretch is missing
-    seen: float  # [m], length along the kept ones, without the gaps
+    gaps: tuple[int, ...]  # indices of kept profiles that are followed by a gap
+    seen: float  # [m], length along the kept profiles, without the gaps
     confidence: float  # share of the line inside the picture that was measured soundly
     messages: tuple[str, ...]  # on its width and soundness
     unreached: list[tuple[str, Array, Array, float]]
@@ -325,10 +326,7 @@ def measure_line(
 
 
 def _remarks(line: MeasuredLine, expected: ExpectedLine) -> Iterator[str]:
-    """Sentences on what is missing along the line, and on how it fits the fixtures and the length.
-
-    Of a gap: how much, where and why.
-    """
+    """Sentences on gaps of the line (size, place, reason), and its fit to fixtures and length."""
     trace, length = line.trace, expected.typical
     for i in line.gaps:
         missing = slice(line.kept[i], line.kept[i + 1])

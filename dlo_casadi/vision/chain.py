@@ -25,18 +25,18 @@ from dlo_casadi.vision.workplane import (
 )
 
 _State: TypeAlias = tuple[float, tuple[int, ...], float, float]  # cost, path, seen, total
-_BEAM = 40  # chains that are followed at a time
+_BEAM = 40  # number of chains that are followed at a time
 _LENGTH_TOLERANCE = 0.05  # relative; two clicked reference points are no better than this
-_LEAST = 0.25  # least share of the length that must be seen
-_TWIN = 0.5  # of the cable's length: longer strands beside it are a second cable
+_LEAST = 0.25  # smallest share of the length that must be seen
+_TWIN = 0.5  # of the cable's length: a longer strand beside it is a second cable
 _TWIN_CONTRAST = 0.6  # least contrast of a second cable, relative to the first
-_ROOT = 3.0  # diameters from the chain within which a strand that it covers twice begins
-_ALIKE = 0.5  # largest difference in colour of a cable's strands, of that from the surroundings
+_ROOT = 3.0  # diameters: largest distance from the chain at which a strand covered twice begins
+_ALIKE = 0.5  # largest difference in colour of a cable's strands, over that from the surroundings
 
 
 @dataclass(frozen=True)
 class Strand:
-    """An unbranched line in metres, and how it looks."""
+    """An unbranched line in metres, with its width and colour."""
 
     points: Array  # (K, 2) [m]
     width: float  # relative to the cable's
@@ -52,19 +52,19 @@ class Strand:
 
 @dataclass
 class Workings:
-    """What the steps of one extraction have seen: filled as far as it comes."""
+    """Intermediate results of one extraction, up to the step that it has reached."""
 
     view: View | None = None  # of the plane in which the cable is looked for
     expected: ExpectedLine | None = None
     plane: WorkPlane | None = None
-    candidate: NDArray[np.float32] | None = None  # (h, w), how much its pixels stand out
+    candidate: NDArray[np.float32] | None = None  # (h, w), contrast of its pixels
     cut: float = 0.0  # level above which a pixel may be cable
     strands: list[Strand] = field(default_factory=list)  # all at that level
     chosen: tuple[Array, ...] = ()  # those that make up the cable, from start to end
     unsound: Array = field(default_factory=lambda: np.zeros((0, 2)))
     """Places (K, 2) [m] on it that do not look like the cable."""
     pixels: Array | None = None  # (K, 2) [px], the line that was found
-    gaps: tuple[int, ...] = ()  # indices of those after which a stretch is missing
+    gaps: tuple[int, ...] = ()  # indices of pixels that are followed by a gap
 
 
 @dataclass(frozen=True)
@@ -128,9 +128,9 @@ def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> 
 def _strands(
     mask: Flags, candidate: NDArray[np.float32], contrast: Contrast, expected: ExpectedLine
 ) -> list[Strand]:
-    """Strands of a mask in metres, without their staircase, cut where they pass a fixture.
+    """Strands of a mask in metres, smoothed, and cut where they pass a fixture.
 
-    What lies beyond a fixture, a tail of the cable, is then not taken for the measured part.
+    The tail of the cable beyond a fixture is then no part of the measured line.
     """
     plane, width_px = contrast.plane, expected.diameter / contrast.plane.pixel
     margin = max(2, round(width_px))
@@ -196,7 +196,7 @@ def order_strands(strands: Sequence[Strand], expected: ExpectedLine) -> Chain | 
                 best = (closed, path, supported, whole)
             reach = total + gap[tip] + seen
             usable = np.isfinite(link[tip]) & (reach < 1.15 * length + 2 * diameter)
-            usable[[w for p in path for w in (p, p ^ 1)]] = False  # a strand and its other way
+            usable[[w for p in path for w in (p, p ^ 1)]] = False  # a strand in both directions
             for w in np.flatnonzero(usable).tolist():
                 onwards = cost + float(link[tip, w] - worth[w])
                 following.append((onwards, (*path, w), supported + float(seen[w]), float(reach[w])))
@@ -236,10 +236,10 @@ def _links(ways: list[Array], diameter: float, scene: Scene) -> tuple[Array, Arr
 
 
 def _of_one_colour(strands: list[Strand], chosen: list[Strand]) -> list[Strand]:
-    """Strands of the colour of the longest one of the chosen, and not of a shadow's.
+    """Strands of the same colour as the longest of the chosen ones, without shadows.
 
-    Away from the board a shadow is a line of its own, and the cable's contrast changes with what is
-    behind it, but not its colour.
+    Away from the board a shadow is a line of its own; the cable's contrast changes with its
+    background, but not its colour.
     """
     ours = max(chosen, key=lambda strand: strand.length)
     most = _ALIKE * float(np.linalg.norm(ours.step))
@@ -247,9 +247,9 @@ def _of_one_colour(strands: list[Strand], chosen: list[Strand]) -> list[Strand]:
 
 
 def _with_folds(chain: Chain, strands: list[Strand], diameter: float) -> Chain:
-    """The chain, with strands inserted along which the cable goes forth and back.
+    """The chain with strands inserted that the cable follows forth and back.
 
-    Seen from its side, a bend is a strand with a free end that the cable covers twice: it begins
+    Seen from its side, a bend is a strand with a free end that the cable covers twice. It begins
     where the chain turns back, and both parts of the chain there lead into it.
     """
 

@@ -1,4 +1,4 @@
-"""Photographs: read from disk, whole or not at all; the steps of an extraction drawn."""
+"""Photographs: complete ones read from disk, and the steps of an extraction drawn."""
 
 import warnings
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from dlo_casadi.vision.chain import Workings
 _BLUE, _ORANGE, _RED = (178, 114, 0), (0, 159, 230), (0, 94, 213)
 _GREEN, _GREY = (115, 158, 0), (150, 150, 150)
 _SATURATED = 4.0  # contrast that is drawn white, over the cut
-_WHITE, _MUCH_WHITE = 250, 0.3  # grey level, and share of a picture that is overexposed
-_BLURRED_PX = 2.0  # standard deviation of edges from which markers of some 30 px are not read
+_WHITE, _MUCH_WHITE = 250, 0.3  # grey level; share of it from which a picture is overexposed
+_BLURRED_PX = 2.0  # std of blurred edges beyond which markers of some 30 px cannot be read
 
-# Pictures with more pixels are not decoded. The camera step was measured to hold 15 bytes a pixel:
-# 1.5 GB for this many, which show a board of 1 m at 0.1 mm a pixel.
+# Largest number of pixels of a picture. The camera step holds 15 bytes a pixel, measured: 1.5 GB
+# for this many, which show a board of 1 m at 0.1 mm a pixel.
 MOST_PIXELS = 100_000_000
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 
@@ -82,11 +82,11 @@ def read_image(path: Path | str) -> Picture:
 
 
 def _opened(data: bytes) -> ImageFile.ImageFile | None:
-    """The picture of which only the header is read; None if it is no known image."""
+    """The picture, only its header read; None if it is no known image."""
     Image.init()
     for name in _FORMATS:
         with warnings.catch_warnings(), suppress(SyntaxError, OSError, ValueError):
-            warnings.simplefilter("ignore")  # of damaged tags that nobody needs
+            warnings.simplefilter("ignore")  # on damaged tags, which are not used
             return Image.OPEN[name][0](BytesIO(data), "")  # raises for files of other formats
     return None
 
@@ -125,8 +125,8 @@ def draw_steps(image: Picture, workings: Workings) -> dict[str, Picture]:
     """Draw the steps of an extraction that were reached.
 
     `image` (H, W, 3) uint8 is the photograph. The workings are filled by `extract_centerline` or
-    `see_cable`, as far as it came; they are empty where the board was not found: the photograph is
-    then all there is to see.
+    `see_cable`, up to the step that failed; where the board was not found they are empty, and only
+    the photograph is drawn.
 
     Returns
     -------

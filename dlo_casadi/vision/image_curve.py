@@ -13,15 +13,15 @@ from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.profiles import chord_length, normals
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
-_NEAREST = 0.2  # m: least distance from which a cable is photographed
-_BESIDE = 1.6  # widths between two stretches below which they share an edge
-_APART = 2.0  # widths along the line from which two places are different stretches
-TIP = 4.0  # widths from a fixture beyond which a message names the line's end
-_CAP = 3.0  # standard deviations at which a pair costs as much as a pixel that is left over
-_GOOD = 2.0  # largest distance of the pixels of a pair, standard deviations
-_STEP = 0.05  # cost of a pair: prefers the shortest of equal ways along an epipolar line
-_NEAR_PX = 2.0  # how far off a curve may be seen; pixels three times as far are not of it
-_POSE_PX = 0.5  # error of an epipolar line from the cameras' places
+_NEAREST = 0.2  # m: smallest distance from which a cable is photographed
+_BESIDE = 1.6  # widths: distance of two parts of the line below which they share an edge
+_APART = 2.0  # widths: distance along the line from which two places are different parts
+TIP = 4.0  # widths: distance from a fixture beyond which a message names the line's end
+_CAP = 3.0  # standard deviations at which a pair costs as much as an unmatched pixel
+_GOOD = 2.0  # standard deviations: largest distance of the pixels of a pair
+_STEP = 0.05  # cost of a pair, which prefers the shortest of equal ways along an epipolar line
+_NEAR_PX = 2.0  # error of a projected curve; pixels three times as far do not belong to it
+_POSE_PX = 0.5  # error of an epipolar line from the cameras' poses
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,8 @@ def see_cable(
 ) -> ImageCurve:
     """Find the cable in front of the board, order it from start to end, refine it to sub-pixel.
 
-    The photograph is searched as the plane that faces the camera at the distance of the fixtures,
-    (3,) [m] each. `viewpoint` tells where the camera stands; the rest is as in
-    `extract_centerline`.
+    The photograph is searched in the plane that faces the camera at the distance of the fixtures,
+    (3,) [m] each. `viewpoint` is the pose of the camera; the rest is as in `extract_centerline`.
     """
     diameter, workings = cable.diameter, workings or Workings()
     depths = viewpoint.in_camera(cable.fixtures)[:, 2]
@@ -121,11 +120,11 @@ def see_cable(
 
 
 def _expected_line(cable: KnownCable, viewpoint: Viewpoint, distance: float) -> ExpectedLine:
-    """The line in the facing plane, and how long it may be there.
+    """The expected line in the facing plane, with bounds on its length there.
 
-    At least the way between the fixtures there, or some diameters. At most the cable where it is
-    nearest: half of what is not needed to reach from one fixture to the other can lead ahead, all
-    of it where the end is free.
+    The lower bound is the distance of the fixtures there, or some diameters. The upper bound is the
+    cable's length where it is nearest: half of its length beyond the distance of the fixtures may
+    lead towards the camera, with a free end all of it.
     """
     flat = viewpoint.flattened(cable.fixtures, distance)
     fixtures, length = viewpoint.in_camera(cable.fixtures), cable.length
@@ -140,11 +139,10 @@ def _expected_line(cable: KnownCable, viewpoint: Viewpoint, distance: float) -> 
 
 
 def other_stretches(points: Array, t: Array, width: float) -> Array:
-    """Where another stretch of a line lies beside each of its points.
+    """Signed distance (K,) from each point of a line to the nearest other part of it.
 
-    Of closely spaced points (K, 2) at lengths t (K,) along a line of the same units' `width`: the
-    signed distance (K,) to the nearest other stretch, positive to the left; nan where there is none
-    that shares an edge.
+    It is positive to the left, and nan where no other part shares an edge. Points (K, 2) are
+    closely spaced, at lengths t (K,) along a line of this `width`, all in the same units.
     """
     normal = normals(np.gradient(points, axis=0))
     pairs = cKDTree(points).query_pairs(_BESIDE * width, output_type="ndarray")
@@ -163,10 +161,10 @@ def other_stretches(points: Array, t: Array, width: float) -> Array:
 
 
 def loops_either_way(curve: ImageCurve) -> list[ImageCurve]:
-    """The curve as it was ordered, and with each of its loops run through the other way.
+    """The curve as it was ordered, and with each of its loops in the opposite order.
 
-    Where a line meets itself, one photograph tells little of whether its two stretches cross or
-    turn back: the loop between them may be in either order.
+    Where a line meets itself, one photograph hardly shows whether the two parts cross or turn back:
+    the loop between them may have either order.
     """
     apart = np.linalg.norm(curve.pixels[:, None] - curve.pixels[None], axis=2)
     t = chord_length(curve.pixels)
@@ -191,8 +189,8 @@ def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Indices, Indices, f
         sum min(d_kl / s_kl, 3)^2 + 0.05,  d^2 = (b^T E a)^2 / (|(E a)_xy|^2 + |(E^T b)_xy|^2)
 
     through all pairs (k, l) that never goes back, by dynamic programming; s^2 adds up the
-    variances of both pixels and of the cameras' places. Pixels at the ends may be left over, at
-    the price of a pair that does not match: what one photograph hides costs alike everywhere.
+    variances of both pixels and of the cameras' poses. Pixels at the ends may stay unmatched, at
+    the cost of a bad pair: parts hidden in one photograph cost the same everywhere.
 
     Returns
     -------
@@ -224,10 +222,10 @@ def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Indices, Indices, f
 
 
 def places_along(curve: ImageCurve, points: Array) -> Array:
-    """Where along a line in space the pixels of a photograph lie, in order.
+    """Places (K,), 0 to 1, of a photograph's pixels along a line in space, in order.
 
-    (K,) share, 0 to 1, of the way along the points (M, 3) [m] of the line, evenly and closely
-    spaced, of the one that is seen nearest to each pixel; nan where none is near.
+    The line's points (M, 3) [m] are evenly and closely spaced; the place is that of the point whose
+    image is nearest to the pixel, nan if none is near.
     """
     seen = curve.viewpoint.to_pixels(points)
     away = np.linalg.norm(curve.pixels[:, None, :] - seen[None, :, :], axis=2) / _NEAR_PX
@@ -237,10 +235,10 @@ def places_along(curve: ImageCurve, points: Array) -> Array:
 
 
 def nearest_in_order(away: Array) -> Indices:
-    """Columns of a table of distances (K, M) that rows belong to, never going back.
+    """Column of each row in a table of distances (K, M), never decreasing.
 
-    Distances in standard deviations. Of several columns of a row the nearest is taken; -1 where
-    the row is left over at an end.
+    Distances are in standard deviations. Of several columns of a row the nearest is taken; -1 where
+    the row is unmatched at an end.
     """
     first, second = _cheapest_way(away**2 + _STEP)
     order = np.argsort(-away[first, second], kind="stable")  # the nearest is written last
@@ -250,7 +248,7 @@ def nearest_in_order(away: Array) -> Indices:
 
 
 def triangulate(one: ImageCurve, other: ImageCurve, first: Indices, second: Indices) -> Array:
-    """Points (P, 3) [m] of least squares from the rays of matched pixels.
+    """Least-squares points (P, 3) [m] of the rays of matched pixels.
 
     With a = q_xy / q_z and q = R p + t each ray gives two equations, (a R_z - R_xy) p = t_xy - a
     t_z.
@@ -271,7 +269,7 @@ def _cheapest_way(cost: Array) -> tuple[Indices, Indices]:
 
     In a row, D_l = c_l + min(A_l, D_l-1) with A the best from the row before; with C the running
     sum of c that is D_l = C_l + min_{m <= l} (A_m - C_m-1), which needs no loop. A row and a column
-    before the table, and what is added beyond its end, are the price of pixels that are left over.
+    before the table, and a cost beyond its end, are the price of unmatched pixels.
     """
     high, wide = cost.shape
     total, beyond = np.zeros((high + 1, wide + 1)), np.full((high + 1, wide + 1), np.inf)

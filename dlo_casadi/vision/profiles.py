@@ -13,17 +13,17 @@ from scipy.sparse import csr_array, diags_array
 from dlo_casadi.vision.camera import Array, Flags, View
 
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
-_BESIDE = 2.2  # where the surroundings begin, in blurs beyond the edge
-_BODY = 0.4  # half of the part in the middle that shows the cable's own level, in widths
-_LOCAL = 2.0  # diameters along the cable, over which steps are averaged
-# Widths along the cable to either side over which it is lit alike. Beside a card that hides part of
-# a rendered cable lines on a board are 0.93 mm off with 2, 0.73 mm with 5 and 0.69 mm with 12.
+_BESIDE = 2.2  # blurs beyond the edge: where the surroundings begin
+_BODY = 0.4  # widths: half of the middle part that shows the cable's own level
+_LOCAL = 2.0  # diameters along the cable over which steps are averaged
+# Widths along the cable, to either side, of constant illumination. Beside a card that hides part of
+# a rendered cable, lines on a board are 0.93 mm off with 2, 0.73 mm with 5 and 0.69 mm with 12.
 _LIT = 5.0
-_INNER = 0.15  # of the width: nearer to the middle both sides look alike
-_CLEAR = 1.3  # blurs inside an edge: there nine tenths of the step are behind; beyond, blur counts
-_MOST_SHADE = 0.5  # of the step: a larger difference is not shading
-_FAINT = 0.3  # of the usual step: smaller ones are not the cable
-_BARE = 0.35  # share of the cable's width that no highlight reaches
+_INNER = 0.15  # of the width: nearer to the middle both sides look the same
+_CLEAR = 1.3  # blurs inside an edge where nine tenths of the step are reached
+_MOST_SHADE = 0.5  # of the step: largest difference by shading
+_FAINT = 0.3  # of the usual step: the smallest step of the cable
+_BARE = 0.35  # share of the cable's width without highlights
 DEGREE = 3  # of all splines
 
 
@@ -45,12 +45,12 @@ def length_of(points: Array) -> float:
 
 
 def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: float) -> BSpline:
-    """Fit a cubic spline r(t) that bends no more than the points ask for.
+    """Fit a cubic smoothing spline r(t).
 
         minimise  sum_k w_k |r(t_k) - p_k|^2  +  W (smooth / knot)^4 sum_i |D^2 c_i|^2
 
     with knots every `knot` metres, second differences D^2 of the coefficients c, and W the sum of
-    the weights per coefficient. Gaps need no special case: there the curve bends least.
+    the weights per coefficient. In gaps the penalty alone determines the curve.
 
     `t` (K,) [m] increases along the points (K, 2) [m]; the weights (K,) are inverse variances up to
     a factor. Wavelengths (over 2 pi) well below `smooth` are smoothed away.
@@ -89,7 +89,7 @@ class Profiles:
     def average(self, trusted: Flags, along: float) -> "Profiles":
         """Average trusted profiles along the curve, with a Gaussian of deviation `along` [m].
 
-        That lowers the noise of the pixels and of their compression, and bends nothing, since the
+        That reduces the noise of pixels and compression without a bias by curvature, since the
         profiles follow the curve.
         """
         deviation = max(along / float(np.median(np.diff(self.t))), 0.1)
@@ -103,7 +103,7 @@ class Profiles:
 
 @dataclass(frozen=True)
 class EdgeShape:
-    """How wide the cable is in the photograph, and how blurred its edges."""
+    """Width of the cable in the photograph, and blur of its edges."""
 
     width: float = 0.0  # [m], distance of the two edges
     blur: float = 0.0  # [m], standard deviation of an edge's blur
@@ -124,7 +124,7 @@ def sample_profiles(
 ) -> Profiles:
     """Read the photograph along the normals of the curve.
 
-    Profiles that leave the photograph are marked, and hold the colours of its border.
+    Profiles that leave the photograph are marked, and have the colours of its border.
     """
     pixel, (high, wide) = 1.0 / view.scale, view.shape
     half = 1.2 * diameter + 3 * pixel
@@ -144,8 +144,7 @@ def sample_profiles(
 def cable_direction(profiles: Profiles, trusted: Flags, diameter: float) -> Array:
     """Weights of colours (3,) that separate the cable from its surroundings.
 
-    Luminance, where it does: JPEG keeps colour at half the resolution, and smears it. Otherwise
-    Fisher's direction,
+    Luminance if it does: JPEG stores colour at half the resolution. Otherwise Fisher's direction,
 
         g ~ (C_cable + C_around)^-1 (mean_cable - mean_around)
     """
@@ -166,8 +165,8 @@ def local_directions(
 ) -> Array:
     """Weights of colours (K, 3) for a cable that passes in front of different surroundings.
 
-    Where the step from the surroundings to the cable, smoothed along it, falls below half of the
-    usual one or turns round in the common direction g, its own direction is taken, scaled to the
+    Where the step from the surroundings to the cable, smoothed along it, is less than half of the
+    usual one in the common direction g, or reversed, its own direction is taken, scaled to the
     usual step h:
 
         g_k = h d_k / |d_k|^2,  d_k the step in all colours
@@ -241,10 +240,10 @@ def edge_shape(profiles: Profiles, direction: Array, trusted: Flags, first: Edge
 
 
 def _own_level(body: Array, around: Array) -> Array:
-    """Level (K,) of the cable in the middle of each profile (K, P), beside any highlight.
+    """Level (K,) of the cable in the middle of each profile (K, P), without any highlight.
 
-    Whether it is darker or brighter than its surroundings is the same for all profiles; the
-    outer thirds of the body tell, which a highlight seldom reaches.
+    Whether it is darker or brighter than its surroundings is the same for all profiles, and judged
+    in the outer thirds of the body, which a highlight seldom reaches.
     """
     half = body.shape[1] // 2
     outer = np.hstack([body[:, half // 2 : half], body[:, half + half // 2 :]])

@@ -1,4 +1,4 @@
-"""Smooth curves in space through what several photographs show of them."""
+"""Smooth curves in space, fitted to pixels of several photographs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,13 +22,15 @@ from dlo_casadi.vision.profiles import (
     sample_profiles,
 )
 
-_GRID = 401  # places along the curve among which a pixel's nearest is searched
-_TANGENTIAL = 1e-5  # m: std of the prior that holds a curve along itself, which no picture shows
-_HUBER = 3.0  # standard deviations beyond which a pixel counts less
-# Spectral densities q of the third derivative that are tried, in L^2, where a curve of length L has
-# 0 <= t <= 1: from a bow of 0.3 L to waves of 300 L; afterwards those near the last.
+_GRID = 401  # number of places along the curve in the search for the nearest to a pixel
+_TANGENTIAL = 1e-5  # m: std of the prior on motions of a curve along itself, which are not visible
+_HUBER = 3.0  # standard deviations beyond which a pixel is weighted less
+# Trial spectral densities q of the third derivative, in L^2 for a curve of length L on 0 <= t <= 1:
+# from a single bend of 0.3 L to waves of 300 L; then factors of the last one.
 _WANDER, _WANDER_NEXT = np.logspace(-1.0, 5.0, 13), np.array([0.3, 0.6, 1.0, 1.7, 3.0])
-_LOOPS, _SETTLED = 15, 3e-5  # m: a quarter of the smallest std of a line from three photographs
+# Maximum number of iterations, and largest step at convergence [m]: a quarter of the smallest std
+# of a line from three photographs.
+_LOOPS, _TOLERANCE = 15, 3e-5
 _FINE = np.linspace(0.0, 1.0, 1001)  # places along a line in space, closely spaced
 
 
@@ -80,17 +82,17 @@ class SpaceCurve:
 
 @dataclass(frozen=True)
 class CurveFit:
-    """A curve, how well it is known, and where on it each pixel lies."""
+    """A curve, its covariance, and the place on it of each pixel."""
 
     curve: SpaceCurve
     covariance: Array  # (n, 3, n, 3) [m^2] of its coefficients, across the curve
-    params: tuple[Array, ...]  # (K,) of each photograph's pixels; nan where not of the curve
-    residuals: tuple[Array, ...]  # (K,) [px], distances across the projected curve; nan there
+    params: tuple[Array, ...]  # (K,), t of each photograph's pixels; nan where not of the curve
+    residuals: tuple[Array, ...]  # (K,) [px], distances across the projected curve, or nan
     surprise: float  # -2 log of the marginal likelihood, up to a constant: compares hypotheses
 
     @property
     def places(self) -> list[Array]:
-        """Places (K, 3) [m] of the pixels of each photograph; nan where it does not belong."""
+        """Places (K, 3) [m] of the pixels of each photograph; nan where not of the curve."""
         return [
             np.where(np.isfinite(t)[:, None], self.curve.position(np.nan_to_num(t)), np.nan)
             for t in self.params
@@ -108,7 +110,7 @@ def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
     n = spans + DEGREE
     basis = SpaceCurve(np.zeros((n, 3))).design((along - along[0]) / (along[-1] - along[0]))
     rough = np.diff(np.eye(n), 3, axis=0)
-    # a point weighs as much as a wave of three spans that is as high as it is off
+    # a residual costs as much as a wave of three spans of the same amplitude
     normal = basis.T @ basis + len(points) / n * rough.T @ rough
     return SpaceCurve(np.asarray(np.linalg.solve(normal, basis.T @ points), float)).evenly()
 
@@ -116,20 +118,20 @@ def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
 def fit_curve_to_images(
     curves: Sequence[ImageCurve], first: SpaceCurve, params: Sequence[Array] | None = None
 ) -> CurveFit:
-    """Move a curve onto what all photographs show of it.
+    """Fit a curve to its pixels in all photographs.
 
         minimise  sum (n . (pi(r(t_k)) - u_k) / s_k)^2 + sum_v d_v^T C_v^-1 d_v
                   + 1/q integral |r'''|^2 dt
 
     over the coefficients of r and small motions d_v of each camera (Gauss-Newton): n is the normal
-    of the projected curve, t_k the nearest place on it, C_v the covariance of the camera's pose. So
-    a place where one photograph shows the curve along an epipolar line is left to the others. s_k
-    counts pixels that share their errors as fewer. The prior, a white third derivative of spectral
-    density q, fills gaps as smoothly as the rest of the curve is; q has the largest marginal
-    likelihood. Pixels far off count less (Huber).
+    of the projected curve, t_k the nearest place on it, C_v the covariance of the camera's pose.
+    Where one photograph shows the curve along an epipolar line, the others determine it. s_k is
+    larger for pixels with common errors. The prior, a white third derivative of spectral density
+    q, makes gaps as smooth as the rest of the curve; q maximises the marginal likelihood. Pixels
+    far off are weighted less (Huber).
 
-    The curve `first` must be seen within some pixels of the right place. `params` tell about where
-    on it the pixels of each photograph lie; the nearest places, in order, if not given.
+    The image of `first` must be within some pixels of the right place. `params` are approximate
+    places on it of each photograph's pixels; by default the nearest ones, in order.
 
     References
     ----------
@@ -150,7 +152,7 @@ def fit_curve_to_images(
     rough = np.asarray(block_diag(bending, np.zeros((6 * m, 6 * m))), float)
     wander = _WANDER * curve.length**2
     for loop in range(_LOOPS):
-        # Rows that hold the curve where it is along itself, where no photograph does.
+        # Rows that hold the curve along itself, which no photograph does.
         t = np.linspace(0.0, 1.0, 3 * n)
         still = curve.design(t)[:, :, None] * curve.tangent(t)[:, None, :] / _TANGENTIAL
         rows = [np.hstack([still.reshape(3 * n, -1), np.zeros((3 * n, 6 * m))])]
@@ -176,7 +178,7 @@ def fit_curve_to_images(
         moved = float(np.abs(change.position(_FINE)).max())
         motions = x[3 * n :].reshape(m, 6)
         curve = SpaceCurve(x[: 3 * n].reshape(n, 3)).evenly()
-        if loop > 2 and moved < _SETTLED:
+        if loop > 2 and moved < _TOLERANCE:
             break
     covariance = cho_solve(factor, np.eye(len(x)))[: 3 * n, : 3 * n].reshape(n, 3, n, 3)
     return CurveFit(curve, covariance, tuple(params), tuple(residuals), surprise)
@@ -185,8 +187,9 @@ def fit_curve_to_images(
 def _solve(
     A: Array, e: Array, x: Array, rough: Array, prior: Array, wander: Array
 ) -> tuple[float, float, Array, tuple[Array, bool]]:
-    """Gauss-Newton step with the likeliest of the densities `wander`: -2 log p, q, dx, factor of H.
+    """Gauss-Newton step with the most likely of the densities `wander`.
 
+    Returns -2 log p, q, dx and the factor of H:
     -2 log p(e | q) = |e - A dx|^2 + x^T (P + K / q) x + log det(H) + m log q, with the normal
     matrix H = A^T A + P + K / q and m the rank of K across the curve.
     """
@@ -208,7 +211,7 @@ def _linearise(
 ) -> tuple[Array, Array, Array, Array]:
     """Nearest places (K,) on the projected curve, from near ones t; nan beyond its ends.
 
-    Behind them the residuals (K,) [px] across it, nan where no place is known, and minus the slopes
+    Then the residuals (K,) [px] across it, nan where there is no place, and minus the derivatives
     of the others by coefficients (k, 3 n) and motions (k, 6).
     """
     camera, t, error = seen.viewpoint.moved(motion), t.copy(), np.full(len(t), np.nan)
@@ -232,10 +235,10 @@ def _linearise(
 def measure_shared_outlines(
     fit: CurveFit, curves: list[ImageCurve], images: list[Picture]
 ) -> tuple[CurveFit, list[ImageCurve]]:
-    """Measure the stretches that share an outline in a photograph, now that the rest is known.
+    """Measure parts of the line that share an outline in a photograph, given the rest of it.
 
-    Whether they cross in it is what makes the line in space likelier; then once more with the
-    sides of that line.
+    They cross in it if that makes the line in space more likely; then they are measured once more
+    with the sides of that line.
     """
     shared = []
     for curve in curves:
@@ -260,18 +263,18 @@ def measure_shared_outlines(
 def see_beside(
     image: Picture, seen: ImageCurve, line: SpaceCurve, params_seen: Array, crossed: bool | None
 ) -> tuple[ImageCurve, Array]:
-    """Measure the stretches that share an outline, given on which side each of them lies.
+    """Measure parts of the line that share an outline, given the side of each of them.
 
-    An outline of width W holds two stretches of the width w, known from the rest of the line and
-    the distance from the camera: their middles lie (W - w) / 2 beside its own, to either side.
+    An outline of width W contains two parts of the width w, known from the rest of the line and
+    the distance from the camera: their middles are (W - w) / 2 to either side of its own.
 
-    `params_seen` (K,) tell where on the line the pixels lie, nan where they do not belong to it.
-    `crossed` tells whether two stretches change sides where their outline is narrowest, or keep
-    the sides on which they lie where it is widest; None takes the sides of the line.
+    `params_seen` (K,) are the places of the pixels on the line, nan where they do not belong to it.
+    `crossed` says whether two parts change sides where their outline is narrowest, or keep the
+    sides that they have where it is widest; None takes the sides of the line.
 
     Returns
     -------
-    What is seen, in the order of the line, and the parameters of its pixels.
+    The curve in the photograph, in the order of the line, and the places of its pixels.
     """
     params, curve = _FINE, line.position(_FINE)
     viewpoint, distance = seen.viewpoint, seen.distance
@@ -299,7 +302,7 @@ def see_beside(
         both = EdgeShape(usual + float(np.abs(beside[run]).max()), seen.blur * pixel)
         found = find_edges(smooth, seen.direction, both)
         apart = np.maximum(found.width - width[run], 0.0)
-        side = np.sign(beside[run])  # on which the other stretch lies: 1 to the left
+        side = np.sign(beside[run])  # side of the other part: 1 to the left
         if crossed is not None:
             widest_last = abs(beside[run][-1]) > abs(beside[run][0])
             side = np.full(len(side), side[-1 if widest_last else 0])
@@ -313,7 +316,7 @@ def see_beside(
         if not good.any():
             continue
         pixels.append(view.to_pixels(points[good]).reshape(-1, 2))
-        # Both the outline and the rest of the line tell how far apart the two lie.
+        # Both the outline and the rest of the line give the distance of the two.
         doubt = 0.5 * float(np.sqrt(np.mean((apart - np.abs(beside[run]))[good] ** 2))) / pixel
         told = np.sqrt(np.median(seen.std) ** 2 + (0.5 * seen.width_std) ** 2 + doubt**2)
         std.append(np.full(int(good.sum()), told))

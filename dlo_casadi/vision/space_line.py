@@ -29,25 +29,25 @@ from dlo_casadi.vision.space_curve import (
 )
 from dlo_casadi.vision.workplane import KnownCable
 
-_AGREE = 0.6  # least share of a photograph's pixels on the common line: each may hide parts
-_READINGS = 8  # largest number of ways to read the photographs of a pose: loops are few
-_SURE = 0.9  # share from which the first curve of a pair is good enough
-_AGREE_PX = 1.0  # px added to four standard deviations: errors of the cameras' places
-_FAR = 0.05  # largest distance of the line's end from its fixture, of the length
-_LONGER = 1.1  # largest length of a line in space, up to its fixtures, of the cable's
-_NARROW = np.radians(5.0)  # between two cameras; below, depths are ten times worse than the rest
-# Diameters, of the spline: no cable bends sharper; with half of it the lines in space of rendered
-# photographs move by less than a tenth of their std.
+_AGREE = 0.6  # smallest share of a photograph's pixels on the common line: each may hide parts
+_READINGS = 8  # largest number of orders of loops that are tried: loops are few
+_SURE = 0.9  # share of pixels from which the first curve of a pair is good enough
+_AGREE_PX = 1.0  # px, errors of the cameras' poses, added to four standard deviations
+_FAR = 0.05  # of the length: largest distance of the line's end from its fixture
+_LONGER = 1.1  # of the cable's length: largest length of a line in space up to its fixtures
+_NARROW = np.radians(5.0)  # smallest angle of two cameras: depths are then ten times less accurate
+# Length of a span of the spline [diameters]: no cable bends more sharply. With half of it lines in
+# space from rendered photographs change by less than a tenth of their std.
 _SPAN = 2.0
-_SPANS = (20, 100)
-_UNKNOWN = 0.05  # unknown part of the length beyond which a message says why
-_KNOWN = 0.25  # diameters: standard deviation beyond which a point is left out
-_MISSING = 0.1  # of the length: a line that is shorter by more misses a hidden stretch
+_SPANS = (20, 100)  # smallest and largest number of spans
+_UNKNOWN = 0.05  # of the length: unknown part beyond which a message says why
+_KNOWN = 0.25  # diameters: largest standard deviation of a point
+_MISSING = 0.1  # of the length: a line shorter by more lacks a hidden part
 
 
 @dataclass(frozen=True)
 class SpaceLine:
-    """A line in space, and how well each of its points is known."""
+    """A line in space, with the uncertainty of each point."""
 
     points: Array
     """(K, 3) [m], in the board frame, ordered from start to end, evenly spaced."""
@@ -60,7 +60,7 @@ class SpaceLine:
 
 @dataclass(frozen=True)
 class Views:
-    """What the photographs of one pose show."""
+    """Lines found in the photographs of one pose, and in space."""
 
     line: SpaceLine | None
     """None where fewer than two photographs agree."""
@@ -132,12 +132,12 @@ def measure_views(
 
 @dataclass(frozen=True)
 class _Agreement:
-    """A curve that photographs, read in one way, show together."""
+    """A curve common to photographs, with one order of their loops."""
 
     curves: Mapping[str, ImageCurve]
     fit: CurveFit
-    share: float  # of its pixels in the photograph that agrees least
-    worst: str  # that photograph
+    share: float  # share of its pixels in the photograph that agrees least
+    worst: str  # name of that photograph
     score: tuple[float, float]
     """What of two readings the better one has more of: agreement, then likelihood."""
 
@@ -145,9 +145,9 @@ class _Agreement:
 def agreeing_fit(
     curves: dict[str, ImageCurve], problems: dict[str, str], cable: KnownCable
 ) -> CurveFit | None:
-    """The curve that most photographs agree on, of all that are left in `curves`.
+    """The curve on which most photographs in `curves` agree.
 
-    Those that contradict it are moved from the curves to the problems.
+    Photographs that contradict it are moved from `curves` to `problems`.
     """
     while len(curves) > 1:
         pairs = _pairs(curves)
@@ -162,7 +162,7 @@ def agreeing_fit(
                 )
             break
         best: _Agreement | None = None
-        # All ways to read the photographs, those first that turn the fewest loops round.
+        # All orders of the loops, those with the fewest reversed loops first.
         ways = [loops_either_way(curve) for curve in curves.values()]
         turned = sorted(product(*(range(len(way)) for way in ways)), key=np.count_nonzero)
         for chosen in turned[:_READINGS]:
@@ -171,9 +171,9 @@ def agreeing_fit(
             if found is not None and (best is None or found.score > best.score):
                 best = found
             if best is not None and best.share > _SURE and len(curves) > 2:
-                break  # of three drawn photographs of a loop a wrong order left 84 % at most
+                break  # with three drawn photographs of a loop a wrong order reached 84 % at most
         if best is None:
-            # The photograph whose line ends farthest from where the fixtures are declared.
+            # The photograph whose line ends farthest from the declared fixtures.
             off = {n: float(_tips_off(curve, cable).max()) for n, curve in curves.items()}
             worst = max(off, key=lambda name: off[name])
             others = [name for name in curves if name != worst]
@@ -199,7 +199,7 @@ def agreeing_fit(
 
 
 class _Pair(NamedTuple):
-    """Two photographs, what matches in them, and the angle [rad] between their directions."""
+    """Two photographs, their matched pixels, and the angle [rad] between their directions."""
 
     one: ImageCurve
     other: ImageCurve
@@ -210,7 +210,7 @@ class _Pair(NamedTuple):
 
 
 def _pairs(curves: Mapping[str, ImageCurve]) -> list[_Pair]:
-    """All pairs of photographs, first those that match well and are seen from different places."""
+    """All pairs of photographs, first those that match well and have a large angle."""
     pairs = []
     for one, other in combinations(curves.values(), 2):
         ahead = float(one.viewpoint.rotation[2] @ other.viewpoint.rotation[2])
@@ -220,9 +220,9 @@ def _pairs(curves: Mapping[str, ImageCurve]) -> list[_Pair]:
 
 
 def _agreement_of(curves: Mapping[str, ImageCurve], cable: KnownCable) -> _Agreement | None:
-    """The curve from a pair that most photographs agree on; None where no pair gives one.
+    """The curve from a pair on which most photographs agree; None where no pair gives one.
 
-    It is no longer than the cable, and ends where the photographs show its ends.
+    It is no longer than the cable, and ends where it ends in the photographs.
     """
     best: _Agreement | None = None
     seen = list(curves.values())
@@ -254,13 +254,13 @@ def _agreement_of(curves: Mapping[str, ImageCurve], cable: KnownCable) -> _Agree
 
 
 def _tips_off(curve: ImageCurve, cable: KnownCable) -> Array:
-    """Distances [px] of the line's ends from the fixtures, as the photograph shows them."""
+    """Distances [px] of the line's ends from the fixtures in the photograph."""
     places = curve.viewpoint.to_pixels(cable.fixtures)
     return np.asarray(np.linalg.norm(curve.pixels[[0, -1]][: len(places)] - places, axis=1))
 
 
 def _guessed(curve: ImageCurve, cable: KnownCable) -> Array:
-    """Places (K, 3) [m] of pixels, if depth went evenly from fixture to fixture along the line."""
+    """Places (K, 3) [m] of pixels, with depth linear along the line from fixture to fixture."""
     viewpoint = curve.viewpoint
     depths = viewpoint.in_camera(cable.fixtures)[:, 2]
     along = chord_length(curve.pixels)
@@ -270,9 +270,9 @@ def _guessed(curve: ImageCurve, cable: KnownCable) -> Array:
 
 
 def _line_and_messages(fit: CurveFit, cable: KnownCable) -> tuple[SpaceLine | None, list[str]]:
-    """Evenly spaced points that are well known, and how they fit the fixtures and the length.
+    """Evenly spaced points of small uncertainty, and messages on the fixtures and the length.
 
-    No line where a stretch of the cable is shown by no photograph.
+    There is no line if a part of the cable is not visible in any photograph.
     """
     length = cable.length
     away = fit.curve.away_from(cable.fixtures)
@@ -306,7 +306,7 @@ def _line_and_messages(fit: CurveFit, cable: KnownCable) -> tuple[SpaceLine | No
 def _unsure(
     curves: Mapping[str, ImageCurve], photographs: Mapping[str, Picture], diameter: float
 ) -> str:
-    """Why a part of the line is not known, and what to try."""
+    """Sentence on an unknown part of the line: why, and what to try."""
     places = {
         name: float(np.sqrt(np.linalg.eigvalsh(curve.viewpoint.covariance[3:, 3:])[-1]))
         for name, curve in curves.items()

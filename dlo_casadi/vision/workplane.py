@@ -1,4 +1,4 @@
-"""The cable's plane as a coarse picture, and the strands that stand out from it."""
+"""A coarse picture of the cable's plane, and the strands of high contrast in it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, View
 CABLE_PX = 6.0  # width of the cable in this picture
 _MAX_PIXELS = 3.0e6
 _MAX_ENLARGEMENT = 1.5
-_LONGEST_SIDE = 32767  # pixels of one side of this picture at most: what `cv2.remap` takes
-# Sides of a photograph, shrunk until the cable is CABLE_PX wide: below, nothing of it is left.
+_LONGEST_SIDE = 32767  # largest side of this picture in pixels, a limit of `cv2.remap`
+# Smallest side of a photograph in pixels, after shrinking until the cable is CABLE_PX wide.
 _LEAST_PIXELS = 8
-_MARKER_MARGIN = 1.45  # of the marker: its white margin is one cell of six or more
+_MARKER_MARGIN = 1.45  # size of a marker with its white margin (a cell of six or more), relative
 _SIGNIFICANT = 5.0  # standard deviations of the background's noise
 _MAX_STRANDS = 60
 _NARROWEST, _WIDEST = 0.4, 1.8  # of the cable's width
@@ -24,7 +24,7 @@ _NARROWEST, _WIDEST = 0.4, 1.8  # of the cable's width
 
 @dataclass(frozen=True)
 class KnownCable:
-    """What is known of a cable before it is seen."""
+    """Known data of a cable for its search in a photograph."""
 
     start: ArrayLike
     """Fixture (2,) or (3,) [m] in the board frame."""
@@ -41,14 +41,14 @@ class KnownCable:
 
 @dataclass(frozen=True)
 class Scene:
-    """How a cable may look, and what may be around it."""
+    """Options of the search: possible surroundings, and shapes of the line."""
 
-    around: float  # of the length: how far beyond its reach other cables are looked for
-    good: float  # cost per length of a cable that is seen nearly from fixture to fixture
-    turn: float  # price of a turn between strands, in diameters per rad^2
-    short: float  # diameters between strands up to which a turn may lie anywhere in the gap
+    around: float  # of the length: distance beyond its reach within which other cables are sought
+    good: float  # cost per length of a cable that is visible nearly from fixture to fixture
+    turn: float  # cost of a turn between strands, in diameters per rad^2
+    short: float  # diameters: longest gap in which a turn may lie anywhere
     sharpest: tuple[float, float]  # [rad], largest turn between strands, and that in a short gap
-    varied: bool  # its background changes on the way, and it may go forth and back
+    varied: bool  # whether the background varies along it, and it may go forth and back
 
 
 ALONG_BOARD = Scene(0.3, -0.7, 2.0, 1.5, (2.5, 1.0), varied=False)
@@ -61,11 +61,10 @@ than the board. Its length in the picture is not known beforehand: more of it mu
 
 @dataclass(frozen=True)
 class ExpectedLine:
-    """What is known of the cable's line in a plane before it is seen.
+    """Known data of the cable's line for its search in a plane.
 
-    Its length lies between `shortest` and `longest`: both are the cable's where that lies in the
-    plane; in front of it the picture may show less (a part that points to the camera) or more (a
-    near one).
+    Its length is between `shortest` and `longest`. Both are that of a cable in the plane; in front
+    of it the line may be shorter (a part that points to the camera) or longer (a near one).
     """
 
     fixtures: Array  # (1, 2) or (2, 2) [m], the start, and the end unless that is free
@@ -76,11 +75,11 @@ class ExpectedLine:
 
     @property
     def typical(self) -> float:
-        """Length [m] by which other lengths and areas are judged."""
+        """Length [m], the scale of other lengths and areas."""
         return 0.5 * (self.shortest + self.longest)
 
     def tips(self, points: Array) -> list[tuple[str, Array, Array, float]]:
-        """Name and place of each fixture, the line's end there, and how far [m] that is off."""
+        """Name and place of each fixture, the line's end there, and their distance [m]."""
         ends = zip(("start", "end"), self.fixtures, points[[0, -1]], strict=False)
         return [(name, at, tip, float(np.linalg.norm(tip - at))) for name, at, tip in ends]
 
@@ -93,7 +92,7 @@ class WorkPlane:
     pixel: float  # [m], side of one of its pixels
     origin: Array  # (2,) [m], board coordinates of the centre of its first pixel
     inside: Flags  # (h, w), inside the photograph and off the markers
-    reachable: Flags  # (h, w), of that, near enough to the fixtures for the cable
+    reachable: Flags  # (h, w), inside, and near enough to the fixtures for the cable
 
     def to_board(self, at: Array) -> Array:
         """Points (K, 2) [m] of pixels (K, 2) of the working picture."""
@@ -110,7 +109,7 @@ def rectify(image: Picture, view: View, expected: ExpectedLine) -> WorkPlane:
     A cable of length L between two fixtures stays inside the ellipse |p - start| + |p - end| <= L,
     which with the foci +-c and the long half axis a has the half sides sqrt(a^2 - |c|^2 + c_i^2);
     with a free end inside the disc |p - start| <= L. Both are widened a little, since the scale
-    may be off. The picture goes on beyond where a second cable is looked for.
+    may be off. The picture is larger where a second cable is searched for.
     """
     height, width = image.shape[:2]
     fixtures, diameter, length = expected.fixtures, expected.diameter, expected.longest
@@ -170,9 +169,9 @@ def rectify(image: Picture, view: View, expected: ExpectedLine) -> WorkPlane:
 
 
 def _sources(view: View, origin: Array, pixel: float, rows: int, columns: int) -> Array:
-    """Pixels (rows, columns, 2) of the photograph that the working picture shows.
+    """Pixels (rows, columns, 2) of the photograph for each pixel of the working picture.
 
-    Computed on every eighth pixel and interpolated: the map bends by far less than a pixel there.
+    Computed on every eighth pixel and interpolated: the map is nearly linear between them.
     """
     step = 8
     nodes_x = (np.arange(-1, columns // step + 2) + 0.5) * step - 0.5
@@ -194,10 +193,10 @@ class Contrast:
 
 
 def local_contrast(plane: WorkPlane, width_px: float) -> Contrast:
-    """Subtract the median over a window of four cable widths, which sees no cable.
+    """Subtract the median over a window of four cable widths, which a cable does not change.
 
-    Slow changes of the light and steps at the rims of larger objects remain in the median and so
-    cancel; a cable, whether darker, brighter or of another colour, does not.
+    Slow changes of the light and steps at the edges of larger objects are in the median and cancel;
+    a cable, whether darker, brighter or of another colour, does not.
     """
     background = cv2.medianBlur(plane.image, 2 * round(2.0 * width_px) + 1)
     difference = plane.image.astype(np.float32) - background.astype(np.float32)
@@ -231,11 +230,11 @@ def candidate_maps(contrast: Contrast, area_px: float) -> Iterator[NDArray[np.fl
 
 
 def thresholds(values: NDArray[np.float32], area_px: float) -> tuple[float, ...]:
-    """Levels at which to cut the values of a candidate picture, from the area of a cable.
+    """Thresholds of a candidate picture, from the area of a cable.
 
-    The level P is exceeded by 0.4 of the cable's area, and so is typical of its core: its rim lies
-    near P / 2. A higher cut parts it from a deep shadow, a lower one recovers a cable beside
-    stronger objects.
+    The level P is exceeded in 0.4 of the cable's area and so is typical of its core; its edge is
+    near P / 2. A higher threshold separates it from a deep shadow, a lower one recovers a cable
+    beside stronger objects.
     """
     core = _upper_level(values, 0.4 * area_px)
     cuts = (0.5 * core, 0.75 * core, 0.3 * core)
@@ -254,11 +253,11 @@ def _upper_level(values: NDArray[np.float32], area: float) -> float:
 def find_strands(mask: Flags, width_px: float) -> list[tuple[Indices, float]]:
     """Thin a mask (Zhang and Suen) and cut it into strands, longest first.
 
-    A highlight along the cable is closed first. Parts of the wrong width, junctions and spurs
-    shorter than the cable is wide are left out: whether the strands on both sides of a cut
-    continue each other is decided by their directions, not by the pixels between them.
+    A highlight along the cable is closed first. Parts of the wrong width, junctions, and spurs
+    shorter than the cable's width are left out: directions, not the pixels between, decide whether
+    the strands on both sides of a cut continue each other.
 
-    Of each strand column and row (K, 2) of its neighbouring pixels, in order, and the median width
+    Returns for each strand the column and row (K, 2) of its pixels, in order, and the median width
     [px] of the mask about it.
     """
     whole = mask.astype(np.uint8) * 255
@@ -270,14 +269,14 @@ def find_strands(mask: Flags, width_px: float) -> list[tuple[Indices, float]]:
     core = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
     square = np.ones((3, 3), np.uint8)
     filled = cv2.morphologyEx(part, cv2.MORPH_CLOSE, core)
-    # Bodies wider than two cables are holders, occluders, markers: left out with a rim.
+    # Bodies wider than two cables (holders, occluders, markers) are left out with a margin.
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, 2 * (2 * round(width_px) + 1,))
     filled[cv2.dilate(cv2.morphologyEx(filled, cv2.MORPH_OPEN, disc), square) > 0] = 0
     depth = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
     lines = cv2.ximgproc.thinning(filled, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN) > 0
     lines &= depth < _WIDEST / 2 * width_px + 0.5
-    # Three or more lines meet where that many steps lead from off to on around a pixel: a corner of
-    # a staircase has many neighbours but only two such steps.
+    # At a junction of three or more lines there are as many steps from off to on around a pixel; a
+    # corner of a staircase has many neighbours, but only two such steps.
     ring = [(0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0)]
     padded, (height, width) = np.pad(lines, 1), lines.shape
     around = np.array([padded[i : i + height, j : j + width] for i, j in ring])
