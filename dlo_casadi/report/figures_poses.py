@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.fitted_cable import CableShape
@@ -38,9 +37,8 @@ _VISIBLE = 0.02
 _FACTORS = (1, 5, 10, 20, 50, 100)
 # Sizes [inch] of a page: least width, width of a panel with what is beside it, tallest single row.
 _NARROWEST, _PANEL, _TALLEST = 7.5, 3.1, 8.0
-# Room [inch] for ticks and names of axes, the headline, the legend, titles of two lines, the edge.
-_LEFT, _BOTTOM, _BESIDE = 0.8, 0.85, 0.3
-_TOP, _LEGEND, _ABOVE, _EDGE = 0.95, 0.45, 0.45, 0.1
+# Height [inch] of what is above a panel, and above and below all of them.
+_ABOVE, _AROUND = 0.15, 1.4
 # How far beyond the tip of an arrow its number stands, as a share of its length.
 _BEYOND = 0.2
 
@@ -73,12 +71,8 @@ def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
         center, span = np.zeros(2), room.window
     factor = _magnification(stages, config.cable.length)
     rows, columns = _arranged(len(poses))
-    size, spaces = _laid_out(rows, columns, float(span[1] / span[0]), ticks=room is None)
-    # Asked where every tick and title ends, an engine would take as long as all the drawing.
-    with canvas.styled(size, layout=None) as drawing:
-        grid = drawing.subplots(
-            rows, columns, squeeze=False, sharex=True, sharey=True, gridspec_kw=spaces
-        )
+    with canvas.styled(_page_size(rows, columns, float(span[1] / span[0]))) as drawing:
+        grid = drawing.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         shown = zip(grid.flat, poses, scenes, marks, strict=False)
         for axes, pose, scene, (under, over) in shown:
             if room is not None:
@@ -88,20 +82,22 @@ def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
             canvas.draw_marks(axes, over)
             axes.set_xlim(center[0] - span[0] / 2, center[0] + span[0] / 2)
             axes.set_ylim(center[1] - span[1] / 2, center[1] + span[1] / 2)
-        for axes in grid.ravel()[len(poses) :]:
+        for axes in grid.flat[len(poses) :]:
             axes.set_axis_off()
         if room is None:
-            _label_grid(grid, len(poses))
-            _make_room(grid)
+            for axes in grid[:, 0]:
+                axes.set_ylabel("y [m]")
+            for axes in grid.flat[max(0, len(poses) - columns) : len(poses)]:
+                axes.set_xlabel("x [m]")
+                axes.tick_params(labelbottom=True)
         handles = _legend_of(outcome, poses, stages)
-        drawing.legend(handles=handles, loc="lower center", ncols=len(handles))
+        drawing.legend(handles=handles, loc="outside lower center", ncols=len(handles))
         said = "" if factor == 1 else f"; deviations drawn {factor} times as large"
         said += "" if room is None else f"; squares of {room.square:g} mm"
         drawing.suptitle(
             f"{config.cable.name}: predicted from the end conditions alone\n"
             f"RMS distance to the measured points above each pose{said}",
             fontsize=11,
-            y=1 - _EDGE / size[1],
         )
     return drawing
 
@@ -196,55 +192,13 @@ def _window(lines: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     return (low + high) / 2, span
 
 
-def _laid_out(
-    rows: int, columns: int, slope: float, *, ticks: bool
-) -> tuple[tuple[float, float], dict[str, float]]:
-    """Size [inch] of a page of panels `slope` times as high as wide, and the spaces about them."""
-    left, bottom, beside = (_LEFT, _BOTTOM, _BESIDE) if ticks else (_EDGE, _LEGEND, _EDGE)
+def _page_size(rows: int, columns: int, slope: float) -> tuple[float, float]:
+    """Size [inch] of a page of panels about `slope` times as high as wide."""
     width = max(_PANEL * columns, _NARROWEST)
-    panel = (width - left - _EDGE - (columns - 1) * beside) / columns
-    tall = slope * panel
+    tall = slope * width / columns
     if rows == 1 and tall > _TALLEST:
-        tall, width = _TALLEST, max(width - columns * (panel - _TALLEST / slope), _NARROWEST)
-        panel = (width - left - _EDGE - (columns - 1) * beside) / columns
-    height = _TOP + rows * tall + (rows - 1) * _ABOVE + bottom
-    spaces = {
-        "left": left / width,
-        "right": 1 - _EDGE / width,
-        "top": 1 - _TOP / height,
-        "bottom": bottom / height,
-        "wspace": beside / panel,
-        "hspace": _ABOVE / tall,
-    }
-    return (width, height), spaces
-
-
-def _label_grid(grid: NDArray[np.object_], count: int) -> None:
-    """Name the axes at the left and below the lowest panels that are not empty."""
-    columns = grid.shape[1]
-    for axes in grid[-1]:
-        axes.set_xlabel("x [m]")
-    for axes in grid[:, 0]:
-        axes.set_ylabel("y [m]")
-    for column in range(columns):
-        lowest = max(k for k in range(count) if k % columns == column)
-        below = grid.ravel()[lowest]
-        below.set_xlabel("x [m]")
-        below.tick_params(labelbottom=True)
-
-
-def _make_room(grid: NDArray[np.object_]) -> None:
-    """Move all panels to the right where the ticks and the name of the first axis need it."""
-    first = grid[0, 0]
-    drawing = first.get_figure()
-    first.apply_aspect()  # which moves it within its place
-    taken = first.yaxis.get_tightbbox(drawing.canvas.get_renderer())
-    missing = _EDGE - taken.x0 / drawing.dpi
-    if missing > 0:
-        places = first.get_gridspec()
-        places.update(left=places.left + missing / drawing.get_figwidth())
-        for axes in grid.ravel():
-            axes.set_position(axes.get_subplotspec().get_position(drawing))
+        width, tall = max(width * _TALLEST / tall, _NARROWEST), _TALLEST
+    return width, rows * (tall + _ABOVE) + _AROUND
 
 
 def _arranged(count: int) -> tuple[int, int]:
