@@ -1,4 +1,4 @@
-"""What goes wrong becomes a message and an exit code."""
+"""Errors and interrupts become a message and an exit code."""
 
 import errno
 import io
@@ -13,12 +13,12 @@ from dlo_casadi.errors import DloError
 OK, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
-# Errors of a stream. Those of files have become an OutputError: what is left is the output.
+# Errors of writing to the output stream; errors of files have become an OutputError before.
 _LOST = (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class _Signals:
-    """Whether a signal has come: a library underneath may swallow the exception that it raises."""
+    """Record of received signals: a library may swallow the exceptions that they raise."""
 
     def __init__(self) -> None:
         self.received = False
@@ -29,7 +29,7 @@ class _Signals:
         raise KeyboardInterrupt
 
     def check(self) -> None:
-        """Raise what has been swallowed."""
+        """Raise KeyboardInterrupt if a signal was swallowed."""
         if self.received:
             raise KeyboardInterrupt
 
@@ -39,7 +39,7 @@ signals = _Signals()
 
 def guarded(work: Callable[[], int]) -> int:
     """Run a command, its imports included, and return its exit code."""
-    # SIGINT, too: a shell may have started the command with it ignored.
+    # Also for SIGINT: a shell may have started the command with SIGINT ignored.
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     signals.received = False
     try:

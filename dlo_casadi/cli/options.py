@@ -1,4 +1,4 @@
-"""What the subcommands share: their options, the look of their help, and where they print."""
+"""Common parts of the subcommands: options, format of the help, and output."""
 
 import argparse
 import json
@@ -64,15 +64,15 @@ def command(
 ) -> Callable[[Callable[[argparse.Namespace], int | None]], Callable[[Sequence[str]], int]]:
     """Make a subcommand of the function of the same name: from arguments to exit code.
 
-    Its docstring tells what it does, and after an empty line examples, one command a line. Where
-    it takes a `CONFIG` the function finds it loaded.
+    Its docstring is the help: what it does and, after an empty line, examples, one command a line.
+    A `CONFIG` among the options is loaded before the call.
 
     Parameters
     ----------
     options : Option
         In the order in which the help lists them.
     codes : str
-        What the exit codes mean here, if it is more than in every command.
+        Meaning of the exit codes, if it is more than in every command.
     json : str or None
         Help of `--json`, which comes with `--quiet`; without both if None.
     """

@@ -1,4 +1,4 @@
-"""How far a run has come: live on a terminal, line by line elsewhere."""
+"""Progress of a run: live on a terminal, line by line elsewhere."""
 
 import time
 from collections.abc import Sequence
@@ -21,15 +21,15 @@ from dlo_casadi.cli.guard import signals
 from dlo_casadi.errors import counted
 from dlo_casadi.runtime.parallel import Tally
 
-# Without a terminal: no more than one line in so many seconds about a part that is under way.
+# Without a terminal, shortest time between two lines about the same part [s].
 PATIENCE = 10.0
 
 
 @dataclass
 class Shown:
-    """Shows progress, unless it is `quiet`: not on the console of the results.
+    """Shows progress, unless it is `quiet`, on another console than the results.
 
-    Those can then be redirected alone.
+    The results can thus be redirected alone.
     """
 
     console: Console = field(default_factory=lambda: Console(stderr=True))
@@ -61,7 +61,7 @@ class Shown:
     def update(
         self, part: str, done: int, total: int | None, line: str, description: str, detail: str = ""
     ) -> None:
-        """Move the bar of a part, or print a line at its end and now and then before."""
+        """Move the bar of a part, or print a line at its end and from time to time before."""
         if self.bars is not None:
             if part not in self._tasks:
                 self._tasks[part] = self.bars.add_task(part, detail="")
@@ -75,10 +75,10 @@ class Shown:
 
 @dataclass
 class Watch(Shown):
-    """Shows how far a run has come, and how long its part will take at most.
+    """Shows the progress of a run, and the longest time that its present part will take.
 
-    The remaining time is that of the named part, from the pace of what is done; a part that is
-    one piece has none.
+    The remaining time is that of the named part, extrapolated from its progress; a part in one
+    piece has none.
     """
 
     _begun: dict[str, float] = field(default_factory=dict)
@@ -104,23 +104,23 @@ class Watch(Shown):
         self.update(name, done, total, line, name, detail)
 
     def warn(self, warnings: Sequence[str]) -> None:
-        """What a run that may take long should have been told before; its report repeats it."""
+        """Print warnings before a run that may take long; its report repeats them."""
         for text in warnings:
             self.message(f"warning: {text}")
 
 
 @dataclass
 class Counter(Shown):
-    """Shows how far many equal tasks have come, and between which times the rest will take.
+    """Shows the progress of many equal tasks, and an interval of the time left.
 
     Parameters
     ----------
     noun : str
-        What is counted.
+        Noun of the counted things.
     size : int
-        How many of them a task holds.
+        Number of things in a task.
     count : int, optional
-        All of them: the last task may hold fewer.
+        Number of all things: the last task may have fewer.
     """
 
     noun: str = "task"
@@ -152,7 +152,7 @@ class Counter(Shown):
 
 
 def duration(seconds: float) -> str:
-    """As precise as one needs it: 40 s, 12 min, 3.5 h."""
+    """A duration in words, rounded: 40 s, 12 min, 3.5 h."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

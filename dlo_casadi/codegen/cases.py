@@ -1,4 +1,4 @@
-"""What differs between the solver of a cable in a plane and of one in space."""
+"""Differences between the solvers of a cable in a plane and in space."""
 
 import re
 from dataclasses import dataclass
@@ -25,16 +25,16 @@ def template(name: str) -> str:
 
 
 def case_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> "Case":
-    """What the templates of this cable are filled with."""
+    """Contents of the templates for this cable."""
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
     return kind(model, p, rest, inline)
 
 
 @dataclass(frozen=True)
 class Case:
-    """What the templates are filled with: the cable's numbers, and words of its kind.
+    """Contents of the templates: the cable's numbers, and the parts of its kind.
 
-    `name` begins the names of its templates, `try_steps` are Newton steps for a part of a path.
+    `name` begins the names of its templates; `try_steps`: Newton steps for a part of a path.
     """
 
     model: CableModel
@@ -51,12 +51,12 @@ class Case:
 
     @property
     def numbers(self) -> list[float]:
-        """Numbers that no kernel holds, in the order of the template's macros."""
+        """Numbers that are in no kernel, in the order of the template's macros."""
         raise NotImplementedError
 
     @property
     def values(self) -> dict[str, int | str]:
-        """What the marks of the templates stand for."""
+        """Values of the templates' marks."""
         raise NotImplementedError
 
     @property
@@ -92,7 +92,7 @@ class _PlaneCase(Case):
     """A cable in a plane."""
 
     name, try_steps = "plane", 13
-    # Doubles of a workspace per node, as in the template: arrays, border, segments of two points.
+    # Doubles of a workspace per node, as in the template: arrays, border, two-point segments.
     doubles = 12 + 2 + 2 * 15
 
     @property
@@ -123,8 +123,8 @@ class _PlaneCase(Case):
     def values(self) -> dict[str, int | str]:
         model, chain, kernels = self.model, self.model.chain, self.meshes["kernel"]
         count, gives = chain.n_nodes, [c > 0 for c in self.compliances]
-        # Each first guess is descended from freely, then led by springs in 15 stages; a descent
-        # takes 100 steps, and 6 more off saddles. The template checks the number.
+        # From each first guess there is one free descent, and one guided by springs in 15 stages; a
+        # descent takes 100 steps, and 6 more off saddles. The template checks the number.
         guesses = 5 if (model.start, model.end) == ("pinned", "pinned") else 4
         return {
             "WORKSPACE": self.doubles * (count + 1),
@@ -134,7 +134,7 @@ class _PlaneCase(Case):
             "HIGH": count - (model.end == "clamped" and not gives[1]),
             "GIVES_START": gives[0],
             "GIVES_END": gives[1],
-            # Elimination and solution: about 30 operations a node; the trial point, too.
+            # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
             "STEPS": (1 + 16 * guesses) * (100 + 6),
             "HOLDERS": "" if kernels.ends is None else "    add_ends(q, w->table);",
@@ -147,14 +147,14 @@ class _SpaceCase(Case):
     name, try_steps = "space", 12
     # Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
     doubles, coarse_shapes = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 8
-    # Fewest arcs of the coarse mesh, and elements of the fine one in each of them. Of 3,000 random
-    # clamped problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than if all
-    # first guesses are followed on the fine mesh.
+    # Fewest arcs of the coarse mesh, and number of fine elements in each. Of 3,000 random clamped
+    # problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first
+    # guesses on the fine mesh.
     least_coarse, coarsening = 6, 2.0
 
     @property
     def coarse_elements(self) -> int:
-        """Arcs of the mesh on which first guesses are followed; 0 where that is the mesh itself."""
+        """Number of arcs of the mesh for first guesses; 0 if it is the model's own."""
         model = self.model
         count = min(model.n, max(self.least_coarse, round(model.n / self.coarsening)))
         itself = count == model.n and model.element == "arc"
@@ -207,8 +207,8 @@ class _SpaceCase(Case):
     @property
     def values(self) -> dict[str, int | str]:
         n, coarse = self.model.n, self.coarse_elements
-        # Each first guess is descended from on the coarse mesh, from its minimum on the fine mesh,
-        # and should all that be in vain, on the fine mesh from the start; a descent takes 80
+        # From each first guess there is a descent on the coarse mesh, from its minimum one on the
+        # fine mesh, and if all fail, one on the fine mesh from the first guess; a descent takes 80
         # steps. The template checks the number.
         guesses = 3 if self.model.end == "free" else 8
         return {

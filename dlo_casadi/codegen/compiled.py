@@ -34,7 +34,7 @@ from dlo_casadi.model.cable_model import CableModel
 # Poses, or rows of numbers laid out as dlo_pose in the C header.
 Poses = Sequence[Pose] | FloatArray
 
-# Arguments of the functions in the header: a pointer, an int, a number of things (size_t).
+# Types of the arguments of functions in the header: a pointer, an int, a count (size_t).
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "n": ctypes.c_size_t}
 _ARGUMENTS = {
     "dlo_solve": "pipppn",
@@ -47,7 +47,7 @@ _ARGUMENTS = {
 
 
 def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",)) -> Path:
-    """Compile a solver into a shared library in a folder, with these flags and those it needs.
+    """Compile a solver into a shared library in a folder, with these and the required flags.
 
     Raises
     ------
@@ -119,8 +119,8 @@ class CompiledSolver:
         Parameters
         ----------
         pose : Pose
-            Its branch says which way a cable in a plane turns; without one the stable equilibrium
-            of lowest energy is meant. If none is found to turn so, the status is "other_branch".
+            Its branch selects which way a cable in a plane turns; without one the result is the
+            stable equilibrium of lowest energy. If none turns so, the status is "other_branch".
         warm : Shape, optional
             Where to start from.
         throw : bool
@@ -231,7 +231,7 @@ class CompiledSolver:
     def clearance(
         self, shape: Shape, obstacles: Sequence[Obstacle], slope: Slope | None = None
     ) -> Gap:
-        """Where the cable comes nearest to obstacles, and how far it is from them.
+        """The nearest place of the cable to obstacles, and its distance from them.
 
         Parameters
         ----------
@@ -270,7 +270,7 @@ class CompiledSolver:
         return _filled(self._records.shape, shape)
 
     def _call(self, name: str, *arguments: Any) -> int:
-        """Status of a function of the library; those but the clearance end with a workspace."""
+        """Status of a call into the library; all functions but the clearance take a workspace."""
         work = np.empty(self.workspace)
         given = (*arguments, work, work.size)[: len(_ARGUMENTS[name])]
         places = (a.ctypes.data if isinstance(a, np.ndarray) else a for a in given)

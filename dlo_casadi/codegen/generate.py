@@ -18,11 +18,11 @@ from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
 
-# The way of a path from pose to pose is parted into so many at most, as in the templates.
+# Maximum number of steps between two poses of a path, as in the templates.
 FINEST = 4096
-# By which a generated file is known, in all templates.
+# Text by which a generated file is recognised, in all templates.
 MARK = "written by dlo-casadi"
-# Keywords of C99, C11 and C++, and what every program defines.
+# Keywords of C99, C11 and C++, and names that every program defines.
 _KEYWORDS = """
 auto break case char const continue default do double else enum extern float for
 goto if inline int long register restrict return short signed sizeof static struct
@@ -41,9 +41,9 @@ class Solver:
     Parameters
     ----------
     prefix : str
-        Of all public names and of the files.
+        Prefix of all public names and of the files.
     hash : str
-        SHA-256 of all that decides the solver's numbers: see `solver_hash`.
+        SHA-256 of all that determines the solver's numbers: see `solver_hash`.
     files : dict
         File name -> text.
     workspace : int
@@ -56,10 +56,10 @@ class Solver:
     workspace: int
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write all files into the folder, which is made if it is missing: all of them or none.
+        """Write all files into the folder, or none; the folder is made if it does not exist.
 
-        Files of these names are replaced if they are generated ones, known by a mark in each;
-        other files in the folder stay.
+        Files of these names are replaced if they contain the mark of generated ones; other files in
+        the folder stay.
 
         Raises
         ------
@@ -76,10 +76,10 @@ class Solver:
 
 
 def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
-    """SHA-256 of everything that decides the solver's numbers: DLO_MODEL_HASH in its header.
+    """SHA-256 of all that determines the solver's numbers: DLO_MODEL_HASH in its header.
 
-    Effects of the camera and of the history enter no solver, so they are left out. The hash in a
-    parameters.yaml is another one: that of the whole fitted model.
+    Effects of the camera and of the history do not enter a solver and are left out. The hash in a
+    parameters.yaml is a different one, of the whole fitted model.
     """
     left_out = [e for e in model.effects if isinstance(e, MeasurementEffect | StateEffect)]
     prefixes = tuple(f"{effect.label}." for effect in left_out)
@@ -104,7 +104,7 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
 
 
 def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
-    """What the templates' marks stand for, of any cable."""
+    """Values of the templates' marks for any cable."""
     model, node, kind = case.model, case.model.node, case.model.chain.kind
     effects = comment(", ".join(effect.name for effect in model.effects)) or "none"
     held = f"start {model.start}, end {model.end}"
@@ -162,11 +162,11 @@ def check_prefix(prefix: str) -> None:
 
 
 def comment(text: str) -> str:
-    """Any text as a part of a comment in C: one line of ASCII that cannot end it.
+    """Any text as a part of a comment in C: one line of ASCII that cannot end the comment.
 
-    What is no printable ASCII stands as its escape, a backslash as two. A space parts the signs
-    that begin or end a comment, and those that begin a trigraph: `??/` is a backslash, and one
-    at the end of a line continues it. To be followed by something else on its line.
+    Characters that are not printable ASCII become escapes, a backslash two. A space separates the
+    characters that begin or end a comment, and those that begin a trigraph: `??/` is a backslash,
+    which at the end of a line continues it. More must follow on the same line.
     """
     line = text.encode("unicode_escape").decode()
     return re.sub(r"(?<=/)(?=\*)|(?<=\*)(?=/)|(?<=\?)(?=\?)", " ", line)
@@ -203,7 +203,7 @@ def generate(
     rest : (n_rests,) [1/m]
         Rest curvature of the bending cells; of a drifting cable the latest.
     prefix : str
-        Begins all public names: `<prefix>_solve`.
+        Prefix of all public names: `<prefix>_solve`.
     inline : bool
         Whether numbers that all elements share are written into the code; otherwise all numbers
         are in one table, and cables of one kind differ in it alone.

@@ -1,4 +1,4 @@
-"""C text of the model's segments: CasADi prints the very functions that all else differentiates."""
+"""C text of the model's segments, printed by CasADi from the functions used everywhere else."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -18,9 +18,9 @@ from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import SegmentNumbers, lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
 
-# Numbers that differ by less come from differences of the same mesh.
+# Largest difference of two numbers that count as equal: rounding of the mesh.
 _ROUNDING = 1e-14
-# What CasADi calls by names of its own; the others are those of libm.
+# Functions that CasADi calls by names of its own; the others are those of libm.
 _CALLS = {"casadi_sq": "square", "casadi_sign": "sign_of", "casadi_real": "double"}
 _HELPERS = {
     "square": "static double square(double a) { return a * a; }\n",
@@ -45,9 +45,9 @@ def table_to_c(numbers: Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class Kernel:
-    """Segments first <= j < last of one kind, which differ in numbers alone: their rows.
+    """Segments first <= j < last of one kind, which differ only by a row of numbers each.
 
-    `members` are (first, last), `rows` (last - first, k) the numbers of each segment, and `derive`
+    `members` are (first, last), `rows` (last - first, k) the numbers of each segment; `derive`
     makes the function.
     """
 
@@ -61,7 +61,7 @@ class Kernel:
         return self.derive()
 
     def loop(self, name: str, table_at: int) -> str:
-        """Statement that calls it for all its segments; its rows begin there in the table."""
+        """Statement that calls it for all its segments, whose rows begin at `table_at`."""
         (first, last), width = self.members, self.rows.shape[1]
         row = f"table + {table_at} + (j - {first}) * {width}" if width else "table"
         state = self.function.numel_in(0) // 2
@@ -88,11 +88,11 @@ class Kernel:
 
 @dataclass(frozen=True)
 class Kernels:
-    """All that the generated solver knows of a model's mechanics.
+    """The mechanics of a model in the generated solver.
 
-    `segments` are in the order of the cable; `ends` is the holders' own energy by the first and
-    last node, where they have any; `shared` (n_parameters,) or (0,) are the parameters that stand
-    in the table, ahead of the segments' rows.
+    `segments` are in the order of the cable; `ends` is the energy of the holders, if any, as a
+    function of the first and last node; `shared` (n_parameters,) or (0,) are the parameters in the
+    table, before the segments' rows.
     """
 
     segments: tuple[Kernel, ...]
@@ -101,7 +101,7 @@ class Kernels:
 
     @property
     def table(self) -> list[float]:
-        """What the kernels read: shared numbers, then the rows of all segments."""
+        """Numbers that the kernels read: shared ones, then the rows of all segments."""
         rows = [kernel.rows.ravel() for kernel in self.segments]
         return [float(number) for number in np.concatenate([self.shared, *rows])]
 
@@ -112,14 +112,14 @@ class Kernels:
 
     @property
     def code_size(self) -> int:
-        """Bytes of their machine code, about."""
+        """Approximate size of their machine code in bytes."""
         return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.segments))
 
 
 def text_of(meshes: dict[str, Kernels]) -> tuple[str, str, int]:
-    """Functions in C of all meshes, the statements that call them, and the length of their table.
+    """C functions of all meshes, the statements that call them, and the length of their table.
 
-    Of two meshes the second one is called if `w->coarse` is set.
+    With two meshes the second one is called if `w->coarse` is set.
     """
     functions: list[str] = []
     loops: list[str] = []
@@ -143,9 +143,9 @@ def text_of(meshes: dict[str, Kernels]) -> tuple[str, str, int]:
 
 
 def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
-    """Bytes of a compiled solver, about: of its own code and kernels, and its table.
+    """Approximate size of a compiled solver in bytes: its code, its kernels and its table.
 
-    Of 13 solvers in the plane and in space, with gcc 12 -O2 on x86-64, it is within 8 %.
+    Within 8 % for 13 solvers in the plane and in space, with gcc 12 -O2 on x86-64.
     """
     return 25_000 + sum(kernels.code_size for kernels in meshes) + 8 * len(numbers)
 
@@ -156,7 +156,7 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
-    # A force on a single place pulls at all of a segment, at nothing of it, or it stands in there.
+    # A point force acts on all of a segment, on none of it, or at a place inside it.
     shares = np.array([np.array(lagrangian_of(model).shares(p, place)).ravel() for place in places])
     inside = (shares > 0) & (shares < 1)
     alone = np.arange(len(own))[:, None] * inside
@@ -186,7 +186,7 @@ def _kernel(
     for i, k in enumerate(np.flatnonzero(~alike)):
         values[k] = row[i]
     start = values[0]
-    # The cell's start counts from the segment's: segments of one kind differ in that alone.
+    # The cell's start is relative to the segment's: otherwise segments of one kind would differ.
     place = ca.vertcat(start, first[1], start + (first[2] - first[0]), *first[3:])
     numbers = SegmentNumbers(
         p,
@@ -201,11 +201,11 @@ def _kernel(
 def _told(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Function:
     """(x, lam, row, p) -> a segment's Lagrangian and its derivatives in one vector.
 
-    Of x, the states of both nodes, and lam [N], the force on the end's holder; also where that is
-    free, for its derivative is the advance. In order: value; by lam: advance [m]; in space the
-    rotation vector from node to node [rad]; slopes by the first, last node; Hessian by first-first,
-    first-last, last-last, first-lam, last-lam, lam-lam: rows one after another, of symmetric blocks
-    the upper triangle column by column.
+    x are the states of both nodes, lam [N] is the force on the end's holder, also with a free end:
+    the derivative by it is the advance. In order: value; by lam: advance [m]; in space the rotation
+    vector from node to node [rad]; gradient by the first, last node; Hessian by first-first,
+    first-last, last-last, first-lam, last-lam, lam-lam: row by row, of symmetric blocks the upper
+    triangle column by column.
     """
     x, lam = ca.SX.sym("x", 2 * model.node.coordinates), ca.SX.sym("lam", model.node.dimension)
     derive = {1: _of_headings, 3: _of_frames}[model.node.increment]
@@ -223,7 +223,7 @@ def _of_headings(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumber
     )  # CasADi's stubs: one result
     value, advance = both
     if model.end == "free":
-        # lam is zero there; its derivative is the way from segment to segment all the same.
+        # lam is zero at a free end, but the derivative by it is still the advance.
         value += ca.dot(lam, advance)
     hessian, gradient = ca.hessian(value, ca.vertcat(x, lam))
     bends, borders = _triangle(hessian[:2, :2]), _rows(hessian[:2, 2:])
@@ -276,7 +276,7 @@ _OUTPUT = re.compile(r"if \(res\[0\]!=0\) res\[0\]\[(\d+)\]=(.*?);")
 
 
 def _statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[str]) -> str:
-    """What CasADi prints for a function, reading and writing our names.
+    """C statements that CasADi prints for a function, with our names of inputs and outputs.
 
     `inputs` are the C arrays of its inputs, `targets` the left side and the operator of each
     assignment to a number of its output.
@@ -296,7 +296,7 @@ def _statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[
 
 
 def _ends_text(function: ca.Function) -> str:
-    """What holds the first and the last node of a planar cable beside their conditions."""
+    """C text of the energy of the holders of a planar cable."""
     targets = ["q->lagrangian +="]
     targets += ["first[SLOPE_0] +=", "last[SLOPE_1] +=", "first[BEND_00] +=", "last[BEND_11] +="]
     return f"""\

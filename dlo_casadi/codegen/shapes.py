@@ -1,4 +1,4 @@
-"""What the compiled solver takes and returns, and how the structures of its C lie in memory."""
+"""Arguments and results of the compiled solver, and the memory layout of its C structures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ STATUSES = (
     "turns_shed",
 )
 _BRANCHES = {None: 0, "ccw": 1, "cw": 2}
-# What to try, by the name of the status.
+# Status -> advice.
 _HINTS = {
     "unreachable": "is the end in metres?",
     "iteration_limit": "warm: the shape of a pose nearby.",
@@ -94,7 +94,7 @@ class ShapePath:
 
 @dataclass(frozen=True)
 class Slope:
-    """Derivatives of a shape by k numbers of its pose, last index.
+    """Derivatives of a shape by k numbers of its pose, which are the last index.
 
     In a plane by end x, y [m], start heading, end heading [rad], k = 4. In space by start x, y, z
     [m], the rotation of the start about the world's axes x, y, z [rad], and the same of the end,
@@ -155,7 +155,7 @@ class Gap:
     Parameters
     ----------
     distance : float [m]
-        Between the surfaces; negative where the cable cuts in.
+        Between the surfaces; negative if the cable penetrates the obstacle.
     place : float
         Arc length over length.
     point, normal : (dimension,)
@@ -163,7 +163,7 @@ class Gap:
     gradient : (4,) or (12,)
         Of the distance by the columns of the slope; zeros without one.
     obstacle : int
-        Which one.
+        Index of the nearest obstacle.
     """
 
     distance: float
@@ -220,7 +220,7 @@ def _record(*fields: list[Any]) -> np.dtype[Any]:
 
 
 def pose_size(model: CableModel) -> int:
-    """Numbers of dlo_pose: both ends, and in space the turns; headings count theirs themselves."""
+    """Size of dlo_pose: both ends and, in space, `turns`, which headings contain in a plane."""
     return EndConditions.size(model.node) + int(model.in_space)
 
 
@@ -279,7 +279,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
 
 
 def no_equilibrium(status: str, pose: Pose, length: float) -> str:
-    """Message on a pose that ends in a status other than ok."""
+    """Message for a status other than ok."""
     start, end = (", ".join(f"{x:.4f}" for x in place or ()) for place in (pose.start, pose.end))
     hint = _HINTS.get(status)
     return (

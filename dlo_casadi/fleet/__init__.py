@@ -1,4 +1,4 @@
-"""Many sessions or poses: tables that an interrupted run goes on with, and a page of sessions."""
+"""Many sessions or poses: tables that survive interruptions, and an overview page of sessions."""
 
 from typing import Any
 

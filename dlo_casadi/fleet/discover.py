@@ -1,4 +1,4 @@
-"""Which sessions a folder or a pattern holds."""
+"""The sessions in a folder or of a pattern."""
 
 import glob
 import hashlib
@@ -24,7 +24,7 @@ class Session:
     Parameters
     ----------
     key : str
-        Its path below the folder that all have in common, with `/`: no two have the same.
+        Its path below the common folder of all, with `/`: unique.
     path : Path
         The YAML file, absolute.
     """
@@ -36,14 +36,14 @@ class Session:
 def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
     """Find all configurations in a folder and below, or of a pattern.
 
-    In a folder a YAML file counts if it has a `cable:` or an `experiment:` and is no result of
-    a fit; hidden folders are left out. What a pattern names counts without a question; `**`
-    stands for any folders.
+    In a folder a YAML file counts if it has a `cable:` or an `experiment:` and is no result of a
+    fit; hidden folders are left out. All files that match a pattern count; `**` stands for any
+    folders.
 
     Returns
     -------
     Path, tuple of Session
-        The folder that all have in common, and the sessions in the order of their keys.
+        The common folder, and the sessions in the order of their keys.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
 
 
 def _is_session(path: Path) -> bool:
-    """Whether a YAML file is meant as a configuration."""
+    """Whether a YAML file is intended as a configuration."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -83,10 +83,10 @@ def _is_session(path: Path) -> bool:
 
 
 def digest_of(session: Session, options: tuple[Any, ...]) -> str:
-    """SHA-256 of what decides a session's results.
+    """SHA-256 of all that determines a session's results.
 
     The package's version, the options of the run, the configuration's bytes, and the name and
-    bytes of each file that its poses name; a file that cannot be read counts as that.
+    bytes of each file that its poses name; an unreadable file enters as such.
     """
     digest = hashlib.sha256()
 
@@ -109,7 +109,7 @@ def digest_of(session: Session, options: tuple[Any, ...]) -> str:
 
 
 def _content(path: Path) -> bytes:
-    """SHA-256 of a file's bytes; nothing of one that cannot be read."""
+    """SHA-256 of a file's bytes; empty if it cannot be read."""
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").digest()

@@ -1,4 +1,4 @@
-"""Which sessions are unlike the others, and the page that shows these first."""
+"""Outlying sessions, and the overview page that lists them first."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from dlo_casadi.fleet.rows import Row, last_error
 if TYPE_CHECKING:
     from jinja2 import Template
 
-# Beyond it a value is called an outlier (Iglewicz and Hoaglin, 1993).
+# Modified z-score beyond which a value is an outlier (Iglewicz and Hoaglin, 1993).
 OUTLYING = 3.5
-# With fewer sessions nothing is unlike the others.
+# Fewest sessions among which there may be outliers.
 FEWEST = 5
-# A z-score where all others are equal to the last digit.
+# Largest z-score, also of a value where all others are equal to the last digit.
 LARGEST = 99.0
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A row and what is odd about it.
+    """A row and its outlier scores.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Judged:
 
     @property
     def verdict(self) -> str:
-        """The diagnosis's, or why there is none."""
+        """Verdict of the diagnosis, or why there is none."""
         row = self.row
         return str(
             (row["verdict"] or "not diagnosed") if row["status"] == "done" else row["status"]
@@ -57,7 +57,7 @@ class Judged:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why to look at it first; empty if nothing is odd."""
+        """Reasons to look at it first; empty if it is not unusual."""
         if self.row["status"] != "done":
             return (self.verdict,)
         stiffness, error = self.stiffness_z or 0.0, self.error_z or 0.0
@@ -72,7 +72,7 @@ class Judged:
 
     @property
     def order(self) -> tuple[bool, bool, bool, float, str]:
-        """Place in a list that begins with the oddest."""
+        """Sorting key: the most unusual sessions first."""
         return (
             self.row["status"] == "done",
             "unexplained" not in self.reasons,
@@ -83,7 +83,7 @@ class Judged:
 
 
 def judge(rows: Sequence[Row]) -> list[Judged]:
-    """All rows, the oddest first: failed, unexplained, outlying, then the others by score."""
+    """All rows, the most unusual first: failed, unexplained, outlying, then the others by score."""
     measures = [row["bending_stiffness"] for row in rows], [last_error(row) for row in rows]
     scores = [
         robust_z([None if x is None or x <= 0 else float(np.log(x)) for x in values])
@@ -135,7 +135,7 @@ def overview_html(rows: Sequence[Row], output: Path) -> str:
 
 @cache
 def _template() -> Template:
-    # Workers, which import this room, draw no page.
+    # Imported here, since workers import this module but write no page.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -149,7 +149,7 @@ def _template() -> Template:
 
 
 def _link(row: Row, output: Path) -> str | None:
-    """The session's page: of its results, or of why there are none."""
+    """Link to the page of the session's results, or of its failure."""
     for name in ("report.html", "report.json") if row["status"] == "done" else ("failed.html",):
         if (output / "sessions" / row["session"] / name).is_file():
             return quote(f"sessions/{row['session']}/{name}")

@@ -1,4 +1,4 @@
-"""The table of many sessions: its columns, the row of one, rows and table on the disk."""
+"""The table of many sessions: columns, the row of a session, and files of rows and table."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Row = dict[str, Any]
 STAGES = get_args(StageName)
 TIMES = (*TIMED, "total")
 _INTERVAL = ("_low_95", "_high_95")
-# What a stage tells beside its parameters.
+# Errors of a stage, with their units.
 _ERRORS = {"rmse_fit": "m", "rmse_held_out": "m", "chi2_per_dof": ""}
 
-# Column -> kind and unit; a column is empty (null) where a session has no such thing. The names of
-# all columns that differ from run to run begin with `time_`.
+# Column -> type and unit; null where a session has no such value. Names of columns that differ from
+# run to run begin with `time_`.
 COLUMNS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("session", "status", "message", "cable", "verdict"), ("text", "")),
     "effects": ("effects", ""),
@@ -140,7 +140,7 @@ def write_row(output: Path, row: Row) -> None:
 
 
 def read_row(output: Path, key: str, digest: str) -> Row | None:
-    """Read the row of a session if it belongs to what the session is now."""
+    """Read the row of a session if it belongs to the session's present digest."""
     try:
         row: Row = json.loads(_row_file(output, key).read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Fit all sessions that are not fitted yet, and fold what is done into table and page."""
+"""Fit all sessions that are not fitted yet, and write the table and the page of all results."""
 
 import time
 import traceback
@@ -27,14 +27,14 @@ from dlo_casadi.runtime.parallel import Tally, map_as_completed
 from dlo_casadi.session import run_session
 
 PAGE = "index.html"
-# The table is folded anew after so many seconds, and at most for this share of the time.
+# Shortest time between two updates of the table [s], and largest share of the time spent on them.
 FOLD_AFTER = 10.0
 FOLD_SHARE = 0.02
 
 
 @dataclass(frozen=True)
 class Options:
-    """What is done with each session.
+    """Options for each session.
 
     Parameters
     ----------
@@ -50,14 +50,14 @@ class Options:
 
 @dataclass(frozen=True)
 class FleetResult:
-    """What a run has led to.
+    """Result of a run.
 
     Parameters
     ----------
     rows : tuple of dict
         One per session, in the order of their keys.
     taken_over : int
-        Rows of an earlier run.
+        Number of rows of an earlier run.
     output : Path
     """
 
@@ -96,12 +96,12 @@ def fit_fleet(
     executor : Executor
     options : Options, optional
     retry_failed : bool
-        Whether sessions that failed are tried again. Those lost always are: with a killed worker,
-        or because their results could not be written.
+        Whether failed sessions are tried again. Lost ones always are: with a killed worker, or
+        because their results could not be written.
     begin : callable
-        Told how many rows are taken over and how many sessions are left.
+        Called with the numbers of rows taken over and of sessions left.
     progress : callable, optional
-        Told how far the run has come, after each session.
+        Called with the progress after each session.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def fit_fleet(
     next_fold = time.perf_counter() + FOLD_AFTER
 
     def fold() -> None:
-        """Write table and page from time to time, for a small share of it."""
+        """Write table and page from time to time, see FOLD_AFTER and FOLD_SHARE."""
         nonlocal next_fold
         begun = time.perf_counter()
         write_table(output, rows.values())
@@ -153,7 +153,7 @@ def fit_fleet(
 
 @dataclass(frozen=True)
 class Job:
-    """One session to fit, with all that a worker must know."""
+    """One session to fit, with all that a worker needs."""
 
     session: Session
     digest: str  # of what decides the results
@@ -162,7 +162,7 @@ class Job:
 
     @property
     def folder(self) -> Path:
-        """The session's own results: named after its file, so that no two can meet."""
+        """Folder of the session's results: named after its file, and so unique."""
         return self.output / "sessions" / self.session.key
 
     def __repr__(self) -> str:
@@ -170,7 +170,7 @@ class Job:
 
 
 def fit_one(job: Job) -> Row:
-    """Fit a session and write its results, at last its row; a failure is a row with a message.
+    """Fit a session, write its results and then its row; a failure is a row with a message.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def _fitted(job: Job, begin: float) -> Row:
         diagnosis = config.diagnosis.model_copy(update={"enabled": False})
         config = replace(config, diagnosis=diagnosis)
     if job.options.reports:
-        # It brings the libraries that draw; without figures a worker starts in half the time.
+        # It imports the drawing libraries; without figures a worker starts in half the time.
         from dlo_casadi.report.writer import ResultsFolder
 
         with ResultsFolder(job.folder, config) as folder:

@@ -1,4 +1,4 @@
-"""Poses to solve: a grid or a list, handed out in chunks and never held as a whole."""
+"""Poses to solve, a grid or a list, in chunks that fit into memory."""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ class Grid:
     Parameters
     ----------
     x, y : (float, float, float) [m, m, -]
-        First, last and number of places, a whole one.
+        First and last place, and the number of places.
     fixed : dict
         Start [m] and headings [rad] of all poses, by COLUMNS.
     """
@@ -48,12 +48,12 @@ class Grid:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of poses."""
         return int(self.x[2]) * int(self.y[2])
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """What decides them, as plain data."""
+        """Plain data that determine the poses."""
         x, y = self._axes
         return {"grid_x": x, "grid_y": y, "fixed": dict(self.fixed)}
 
@@ -109,12 +109,12 @@ class PoseList:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of poses."""
         return int(self._data.count_rows())
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """What decides them, as plain data."""
+        """Plain data that determine the poses."""
         with self.path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
         return {"list_sha256": digest, "fixed": dict(self.fixed)}

@@ -1,4 +1,4 @@
-"""Shapes of a fitted cable in very many poses: chunks on any executor, in one file at the end."""
+"""Shapes of a fitted cable in very many poses: solved in chunks on any executor, into one file."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
 
 
 SCHEMA = "dlo-shapes/1"
-# A process holds the shapes of one chunk at a time, of so many bytes as the solver writes them.
+# Size of a chunk's shapes [bytes]; a process holds one chunk at a time.
 CHUNK_BYTES = 12_000_000
-# By a part of the column's name; [m] otherwise.
+# Part of a column's name -> its unit; [m] otherwise.
 _UNITS = {"force": "N", "moment": "N m", "energy": "J", "heading": "rad"}
 _ORDER = "x and y of the nodes in turn, from start to end"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is computed for each pose.
+    """Inputs of the computation for each pose.
 
     Parameters
     ----------
@@ -61,17 +61,17 @@ class Plan:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that decides the shapes, as in the C header."""
+        """SHA-256 of all that determines the shapes, as in the C header."""
         return solver_hash(self.model, self.p, self.rest)
 
     @property
     def chunk(self) -> int:
-        """Poses of a chunk."""
+        """Number of poses in a chunk."""
         n, k = self.model.n, self.model.chain.n_nodes
         return max(1, CHUNK_BYTES // (8 * (2 * (n + 1) + k + 12)))
 
     def part(self, index: int) -> Path:
-        """Where a finished chunk lies."""
+        """File of a finished chunk."""
         return self.parts / f"{index:08d}.arrow"
 
 
@@ -111,9 +111,9 @@ def shape_table(
     metadata : dict, optional
         More to be written into the file, as plain data.
     restart : bool
-        Throw away what lies there, whatever it is.
+        Discard existing output and parts.
     progress : callable, optional
-        Told how far the chunks have come.
+        Called with the progress of the chunks.
 
     Returns
     -------
@@ -179,7 +179,7 @@ def shape_table(
 
 
 def _identity_of(path: Path) -> str | None:
-    """Identity of a table; None of anything else."""
+    """Identity of a table; None for any other file."""
     pa, pq = parquet_library()
     try:
         found = (pq.read_schema(path).metadata or {}).get(b"identity")
@@ -194,7 +194,7 @@ def _parts_in_order(
     executor: Executor,
     progress: Callable[[Tally], None] | None,
 ) -> Iterator[Path]:
-    """Compute what is missing; yield each finished chunk as soon as those before it are there."""
+    """Compute missing chunks; yield each chunk as soon as all before it are finished."""
     total = -(-poses.count // plan.chunk)
     there = {k for k in range(total) if plan.part(k).exists()}
     chunks = (Chunk(k, chunk) for k, chunk in enumerate(poses.chunks(plan.chunk)) if k not in there)
@@ -282,7 +282,7 @@ def table_of(
 
 
 def _schema(model: CableModel, metadata: dict[str, Any]) -> pyarrow.Schema:
-    """Types and units of the columns, and what the file says of the cable."""
+    """Types and units of the columns, and the file's metadata on the cable."""
     none = np.zeros((0, len(COLUMNS))), np.zeros(0, records_of(model).shape), np.zeros(0, np.intc)
     said = {
         "cable": model.cable.name,
