@@ -46,4 +46,4 @@ def test_every_module_can_be_imported_and_one_run_holds_its_folder(tmp_path):
     assert done.returncode == 0, done.stderr
     said, count = done.stdout.splitlines()
     assert said == f"another run is writing to {tmp_path}; wait for its end"
-    assert int(count.split()[0]) > 150
+    assert int(count.split()[0]) > 100
