@@ -41,7 +41,7 @@ PARTS = (
     *("speed", "growth", "throughput", "random", "starts", "ipopt", "memory", "peers", "fleet"),
     *("space", "space_random", "space_peers"),
 )
-# Parts that need more than the package: the extras, and what of them is imported.
+# Part -> extra of the package that it needs, and the module imported from it.
 EXTRAS = {"fleet": ("table,dask", ("pyarrow", "distributed"))}
 
 
@@ -63,7 +63,7 @@ def run_speed() -> dict[str, Any]:
 
 
 def run_growth() -> dict[str, Any]:
-    """Time against n of all methods that stand it."""
+    """Time against n, of each method up to the largest n that it can take."""
     sizes = (10, 20, 50, 100, 200, 500, 1000)
     out: dict[str, Any] = {"n": sizes}
     for element in ELEMENTS:

@@ -1,4 +1,4 @@
-"""Cells of the tables that hold sessions against their truth."""
+"""Cells of the tables that compare sessions with their truth."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def session(wire: str, tags: FloatArray) -> tuple[dict[str, Any], float]:
 
 
 def main() -> int:
-    """Fit each shape, print what it tells."""
+    """Fit each shape and print the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tags", type=Path, help="tags.csv")
     told = 0

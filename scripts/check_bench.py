@@ -29,7 +29,7 @@ from dlo_casadi.session.outcome import Outcome
 
 ROOT = Path(__file__).resolve().parent.parent
 TRUTH = ROOT / "tests" / "data" / "bench_truth"
-# What the truth calls an effect -> its name here and its parameters by theirs.
+# Name of an effect in truth.yaml -> its name here, and its parameters by their names there.
 NAMES = {
     "lump": ("lumped_mass", ("position", "mass")),
     "taper": ("stiffness_gradient", ("slope",)),
@@ -52,7 +52,7 @@ def config_of(name: str) -> Path:
 
 
 def true_effects(name: str) -> dict[str, dict[str, float]]:
-    """Effects that are in a session, by their names here."""
+    """Effects in a session, by their names here."""
     truth = yaml.safe_load((TRUTH / name / "truth.yaml").read_text())
     found: dict[str, dict[str, float]] = {}
     for key, value in truth["effects"].items():

@@ -54,7 +54,7 @@ from dlo_casadi.session.stages import fit_stage
 
 ROOT = Path(__file__).resolve().parent.parent
 SESSIONS = ("short_clean", "held_headings", "weightless_fit", "thin")
-# Effects that are hidden in space, in turn.
+# Effects that are hidden in space, one after the other.
 HIDDEN = (
     "lumped_mass",
     "tether",
@@ -66,7 +66,7 @@ HIDDEN = (
 )
 # Boundaries of the cables that do not repeat: a clamp, and a free tip.
 HANGING = "overhang"
-# Nearer than this [rad] to where two sides are equally low such a cable falls to either one.
+# Distance of the clamp [rad] from where both sides are equally low within which either is possible.
 EITHER_SIDE = 0.2
 
 
@@ -168,7 +168,7 @@ def spatial(config, generator, hidden=None):
         slip = turned * Rotation.from_rotvec(2e-3 * generator.standard_normal(3))
         moved = tuple(end + 1e-4 * generator.standard_normal(3))
         true = replace(held, end=moved, end_orientation=tuple(slip.as_quat()))
-        # Of a state each pose depends on those before it.
+        # With a state each pose depends on those before it.
         found = predict_poses(model, p, rest, [*poses, true])[-1]
         if found is None or not found.equilibrium.stable:
             continue
@@ -302,7 +302,7 @@ def run_one(index: int, seed: int, kind: str) -> dict:
 
 
 def in_band(fit, measured) -> list[bool]:
-    """Of each point left out, whether it lies in the 90 % band of its pose."""
+    """Whether each left-out point lies in the 90 % band of its pose."""
     shapes, inside = fit_stage("batch", fit, measured, {}, ()).shapes, []
     for item in measured:
         shape = shapes.get(item.pose.name)
@@ -312,7 +312,7 @@ def in_band(fit, measured) -> list[bool]:
 
 
 def within(interval, true) -> bool:
-    """Whether a stiffness lies in its interval; an end that does not exist is no limit."""
+    """Whether a stiffness lies in its interval, which may be unbounded."""
     if interval is None:
         return False
     low = -np.inf if interval.low is None else interval.low

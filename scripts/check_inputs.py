@@ -51,9 +51,9 @@ SHARES = {
 # Processor time [s] of families that compute.
 SECONDS = {"fit": 30.0}
 GOOD = ("ok", "refused")
-# Offenders that are shown.
+# Number of offenders that are shown.
 _SHOWN = 5
-# Lines of what an offender has said.
+# Number of lines of an offender's output that are shown.
 _LINES = 8
 
 
@@ -76,7 +76,7 @@ def make_case(bases: Bases, seed: int, index: int) -> Case:
     """Make input number `index`."""
     family = family_of(seed, index)
     random = generator_of(seed, index)
-    random.random()  # which told the family
+    random.random()  # the number that chose the family
     if family == "parameters":
         return _parameters(bases, random)
     every = (*bases.sessions, *bases.photographs)
@@ -157,7 +157,7 @@ def run_case(case: Case, folder: Path) -> tuple[str, str]:
 
 
 def left_behind(case: Case, folder: Path, code: int | str | None) -> str:
-    """What a run has left that is neither whole nor absent."""
+    """Incomplete files and drafts that a run has left."""
     found = {str(path.relative_to(folder)) for path in folder.iterdir()} - set(case.files)
     if case.command[0] != "fit":
         return ", ".join(sorted(found))
@@ -212,7 +212,7 @@ def print_counts(counts: Counter[tuple[str, str]]) -> None:
 
 
 def run_only(seed: int, index: int, keep: Path | None) -> int:
-    """Run one input in this process, and say what it says."""
+    """Run one input in this process, and print its output."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         (place / "bases").mkdir()

@@ -62,19 +62,19 @@ from dlo_casadi.report.terminal import candidate_table, print_summary
 from dlo_casadi.report.writer import OWNED
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
 
-# Of the length: how far the generated C may be from Python.
+# Largest difference between the generated C and Python, as a share of the length.
 APART = 1e-6
-# How a clamp's direction is called in the plane and in space.
+# Names of a clamp's direction in the plane and in space.
 DIRECTIONS = ("heading", "orientation")
-# Times the median of its kind: a run that is told of.
+# Duration of a run, over the median of its kind, from which it is reported.
 SLOW = 3.0
-# What cannot be found missing in a session with nothing hidden.
+# Verdict that is right in a session with nothing hidden.
 CLEAN = "complete"
 
 
 @dataclass
 class Row:
-    """What one session came to."""
+    """Result of one session."""
 
     name: str
     verdict: str = "none"
@@ -121,7 +121,7 @@ def run_cell(cell: Cell, size: Size, seed: int, keep: Path | None = None) -> Row
             folder.mkdir(parents=True, exist_ok=True)
         begin = time.perf_counter()
         stack.enter_context(warnings.catch_warnings())
-        warnings.simplefilter("error")  # a warning of a library is a slip of ours
+        warnings.simplefilter("error")  # a warning of a library is a mistake of this package
         try:
             session = draw_session(cell, size, generator_of(seed, CELLS.index(cell)), folder)
             begin = time.perf_counter()
@@ -195,7 +195,7 @@ def judge_stiffness(result: Result, true: float, row: Row) -> None:
 
 
 def missing_files(results: Path, session: Session, result: Result) -> Iterator[str]:
-    """What a folder of results lacks, or has of a draft."""
+    """Missing files of a folder of results, and drafts left in it."""
     present = {path.name for path in results.iterdir()}
     if present != set(OWNED):
         yield f"the folder holds {', '.join(sorted(present))}"

@@ -1,4 +1,4 @@
-"""What readings of forces and moments tell, on sessions simulated by this toolkit's own model.
+"""What wrench measurements tell, on sessions simulated by this toolkit's own model.
 
     python scripts/check_readings.py [--sets 4] [--tables clean mass loads clamps] [--jobs N]
         [--figure power.png]
@@ -51,7 +51,7 @@ from dlo_casadi.session.measure import conditions
 ROOT = Path(__file__).resolve().parent.parent
 STD, FORCE_STD, MOMENT_STD = 3e-4, 0.015, 1e-3  # m, N, N m
 TABLES = ("clean", "mass", "loads", "clamps")
-NUMBERS = (0, 1, 3, 6, 12)  # of poses with readings
+NUMBERS = (0, 1, 3, 6, 12)  # of poses with wrench measurements
 MASS, POSITION = 0.03, 0.3  # kg, m: of the lumped mass
 STIFFNESS, HEADING = 1500.0, 0.35  # N m/rad, rad: of the spring at the start
 APART = 10.0  # of twice the log evidence, as BIC_APART of the diagnosis
@@ -59,7 +59,7 @@ RIVALS = {"loads": "lumped_mass over point_force", "clamps": "start_spring over 
 
 
 def measured_with(config: Config, readings: tuple[str, ...], number: int) -> Config:
-    """The configuration with places for readings on that many of the poses to fit."""
+    """The configuration with wrench measurements declared in that many fit poses."""
     poses, left = [], number
     for pose in config.experiment.poses:
         given = {}
@@ -202,7 +202,7 @@ def told(generator, hidden, wrong: str, readings, number: int, held: str, other:
     return {"number": number, "gain": gains[right] - gains[wrong]}
 
 
-# Where fits of effects start whose place or stiffness has no slope at their nominal value.
+# Starts of fits of effects that have no derivative by their place or heading at the nominal value.
 START = {
     "lumped_mass": {"lumped_mass.mass": 0.02, "lumped_mass.position": POSITION},
     "point_force": {"point_force.fy": -0.2, "point_force.position": POSITION},
@@ -260,7 +260,7 @@ def main() -> None:
 
 
 def draw(rows: list[dict], path: Path) -> None:
-    """Evidence against the number of readings: medians and quartiles of all sets."""
+    """Evidence against the number of wrench measurements: medians and quartiles of all sets."""
     with styled((6.4, 4.2)) as drawing:
         axes = drawing.subplots()
         for (table, label), color in zip(RIVALS.items(), (BLUE, VERMILLION), strict=True):
@@ -285,7 +285,7 @@ def gains_of(rows: list[dict], table: str) -> np.ndarray:
 
 
 def print_tables(rows: list[dict]) -> None:
-    """What the sets have shown."""
+    """Summary of all sets."""
     found = [row["clean"] for row in rows if "clean" in row]
     if found:
         alarms = sum(bool(row["added"]) or row["unexplained"] for row in found)

@@ -23,9 +23,9 @@ from dlo_casadi.config import load_config
 from dlo_casadi.session import run_session
 from dlo_casadi.session.outcome import Outcome
 
-# Of what a mean shape and noise leave of each held-out marker, at most so much more.
+# Largest error of held-out markers, over that of a mean shape with noise.
 ALLOWED = 1.25
-# Half of the interval over the stiffness, and error of a clamp's angle [rad], at most.
+# Largest relative half width of the stiffness's interval, and error of a clamp's angle [rad].
 NARROW, ANGLE = 0.3, 0.03
 # Name of a hidden effect in truth.yaml -> that of the program, and its parameter's true value.
 HIDDEN = {
@@ -35,7 +35,7 @@ HIDDEN = {
 
 
 def found_effect(outcome: Outcome, truth: dict[str, Any]) -> tuple[str, bool]:
-    """What was named, and whether it is what was hidden, or tied with it."""
+    """The effect that was named, and whether it is the hidden one, or tied with it."""
     named = [effect.name for effect in outcome.effects]
     text = "+".join(named) or "-"
     wanted = {HIDDEN[key][0] for key in truth["effects"]}

@@ -45,12 +45,12 @@ HIDDEN: dict[str, tuple[str, Any]] = {
     "taper": ("stiffness_gradient", lambda v: {"slope": v}),
     "tether": ("tether", lambda v: {"position": v[0], "stiffness": v[1]}),
 }
-# Parameters are right within so many standard deviations and that share.
+# Largest error of a right parameter, in standard deviations and as a share of its value.
 STDS, SHARE = 3.0, 0.25
 
 
 def effects(outcome: Outcome, truth: dict[str, Any]) -> tuple[str, bool]:
-    """What was named, and whether it is what was hidden, or tied with it, and as large."""
+    """The effect that was named, and whether it is the hidden one (or tied), of the right size."""
     named = [effect.name for effect in outcome.effects]
     tied = {other for effect in outcome.effects for other in effect.indistinguishable_from}
     right, text = len(named) == len(truth["effects"]), "+".join(named) or "-"

@@ -45,7 +45,7 @@ POSES = 100
 TIGHT, LOOSE = 1e-7, 1e-5
 # Shapes within this are the same [lengths], energies within this alike [EI / L + weight L].
 SAME, ALIKE = 1e-6, 1e-6
-# Steps by which a cable is wound up by a turn.
+# Number of steps in which a cable is twisted by a full turn.
 WOUND = 80
 # Shooting ends at this error of the end, or after so many shots. Share of poses to be solved.
 REACHED, SHOTS, SHARE = 1e-8, 6, 0.995

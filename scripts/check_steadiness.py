@@ -1,4 +1,4 @@
-"""Whether results hold if what is declared of a session changes a little.
+"""Whether results stay the same if declared values of a session change a little.
 
     python scripts/check_steadiness.py FOLDER [FOLDER ...] [--changes std,prior,mesh]
                                        [--poses N] [--jobs N] [--without-diagnosis]
@@ -51,12 +51,12 @@ class Row:
 
     @property
     def half_width(self) -> float:
-        """Of the 95 % interval of ln EI; infinite where it is unbounded."""
+        """Width of the 95 % interval of ln EI; infinite if it is unbounded."""
         _, low, high = self.stiffness
         return np.inf if low is None or high is None else float(np.log(high / low)) / 2
 
     def against(self, base: Row) -> list[str]:
-        """What is not as in the session as it is."""
+        """Differences from the unchanged session."""
         moved = abs(np.log(self.stiffness[0] / base.stiffness[0]))
         return [
             *["FLIP"] * (self.verdict != base.verdict),
@@ -100,7 +100,7 @@ def variants(
     fitted = [k for k, pose in enumerate(experiment.poses) if pose.role == "fit"]
     if "poses" in changes and len(fitted) > 1:
         for k in fitted[:: -(-len(fitted) // poses)]:
-            # It was held all the same: what it leaves behind is there in the poses after it.
+            # It was held all the same, and has changed the rest curvature of later poses.
             out = list(experiment.poses)
             out[k] = out[k].model_copy(update={"role": "held_out"})
             yield f"without {out[k].name}", changed(poses=tuple(out))

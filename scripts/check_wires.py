@@ -1,4 +1,4 @@
-"""Real wires, every trial left out once: prediction of the next hanging beside how it repeats.
+"""Real wires, every repeat left out once: its prediction beside the difference of repeats.
 
     python scripts/check_wires.py [black_wire white_wire]
 

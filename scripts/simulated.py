@@ -27,7 +27,7 @@ def random_session(
     curvature: float,
     hidden: Mapping[str, float] | None = None,
 ) -> list[Observed] | None:
-    """What sensors see of each pose; None where one has no stable equilibrium.
+    """Measurements of each pose; None if one has no stable equilibrium.
 
     What a model has within tolerances, its rest curvature and the ends of each pose are drawn.
 

@@ -307,7 +307,7 @@ def test_loads_add_and_a_tilt_turns_every_weight():
 
 
 @ALL
-def test_reactions_carry_the_weight_and_the_pull_of_a_tether(element):
+def test_reactions_carry_the_weight_and_the_force_of_a_tether(element):
     model = CableModel(CABLE, n=20, element=element, effects=(Tether(),))
     anchor = np.array([0.3, 0.4])
     p = np.array([0.05, 5.0, 0.4, *anchor])

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 FloatArray = NDArray[np.floating]
 
 AXIS = np.array([1.0, 0.0, 0.0])
-# Of the state (13,): place, quaternion, force in the world, moment in the material frame.
+# Parts of the state (13,): place, quaternion, force in the world, moment in the material frame.
 PLACE, FRAME, FORCE, MOMENT = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
 
 
@@ -49,7 +49,7 @@ class Rod:
         return self.rest(s) + y[..., MOMENT] / self.stiffness
 
     def rates(self, s: FloatArray | float, y: FloatArray) -> FloatArray:
-        """Slopes (..., 13) of states (..., 13) at arc lengths s."""
+        """Derivatives (..., 13) by s of states (..., 13) at arc lengths s."""
         k, turn = self.strain(s, y), _matrices(y[..., FRAME])
         vector, w = y[..., 3:6], y[..., 6:7]
         frame = np.concatenate(
@@ -171,7 +171,7 @@ def from_an_arc(rod: Rod, ends: Ends, side: float, tolerance: float, steps: int 
 
 
 def same_sign(q: FloatArray) -> FloatArray:
-    """Quaternions (k, 4) of which neighbours have the same sign."""
+    """Quaternions (k, 4) with signs such that neighbours have a positive product."""
     flips = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
 
@@ -182,7 +182,7 @@ def same_sign(q: FloatArray) -> FloatArray:
 def shot(
     rod: Rod, y: FloatArray, steps: int = 400
 ) -> tuple[tuple[FloatArray, FloatArray], FloatArray, NDArray[np.intp]]:
-    """States that starts (m, 13) lead to, what moves them, and their conjugate points.
+    """States reached from starts (m, 13), their variations, and their conjugate points.
 
     Runge and Kutta's method of fourth order on the equations and on their variation: of place and
     turn (body axes) at s by force and moment at the start. Where this 6 x 6 matrix is singular, s
@@ -224,7 +224,7 @@ def shot(
 
 
 def _varied(rod: Rod, s: float, y: FloatArray, v: FloatArray, force: FloatArray) -> FloatArray:
-    """Slopes (m, 9, 6) of variations of place, turn and moment."""
+    """Derivatives (m, 9, 6) by s of variations of place, turn and moment."""
     turn, k = _matrices(y[:, FRAME]), rod.strain(s, y)
     eta, moment = v[:, 3:6], v[:, 6:]
     pull = _hat(_into(turn, y[:, FORCE])) @ eta + np.swapaxes(turn, 1, 2) @ force

@@ -31,7 +31,7 @@ RACES = ("-g", "-O1", "-fsanitize=thread")
 
 
 def run(problems: int = 100) -> dict[str, Any]:
-    """Statuses counted (ok, unreachable, ...) and what the tools said; "silent" is good."""
+    """Counted statuses (ok, unreachable, ...), and the output of the tools or "silent"."""
     out: dict[str, Any] = {}
     for element, start, end, gravity in KINDS:
         # A law of the section inside quadratic elements in space takes minutes to compile.

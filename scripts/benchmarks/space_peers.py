@@ -1,4 +1,4 @@
-"""What a shape in space costs with other tools: IPOPT, MuJoCo's cable and PyElastica.
+"""Time of a shape in space with other tools: IPOPT, MuJoCo's cable and PyElastica.
 
 The cable of space_speed, straight at rest, in its first poses. As in `peers`, the simulators are
 relaxed to rest; that they do more, and that building models and PyElastica's compilation are not
@@ -78,7 +78,7 @@ def start_at(pose: Pose, n: int, fine: FloatArray) -> Start:
 
 
 def distances(nodes: FloatArray, fine: FloatArray) -> FloatArray:
-    """Of nodes (n + 1, 3) from the fine mesh's at the same arc length [m]; n divides FINE."""
+    """Distances [m] of nodes (n + 1, 3) from those of the fine mesh; n divides FINE."""
     return np.linalg.norm(nodes - fine[:: FINE // (len(nodes) - 1)], axis=1)
 
 

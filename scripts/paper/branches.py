@@ -17,7 +17,7 @@ FloatArray = NDArray[np.floating]
 
 
 def add(part: Part) -> None:
-    """Both bows of every pose, with the printed parameters and for the limper cable."""
+    """Both shapes of every pose, with the printed parameters and for the limper cable."""
     section = Section("second-equilibrium", "The second equilibrium")
     part.sections.append(section)
     cases = [
@@ -68,7 +68,7 @@ def add(part: Part) -> None:
 def _both_ways(
     stiffness: float, bent: bool
 ) -> list[tuple[list[float | None], list[FloatArray | None]]]:
-    """Energies and shapes of both bows of every pose; None where a bow is no equilibrium."""
+    """Energies and shapes of both branches of every pose; None where one has no equilibrium."""
     model = CableModel(published.cable(stiffness), n=20, element="arc")
     rest = published.RestShape(published.rest_angles() * bent).on(model)
     out = []

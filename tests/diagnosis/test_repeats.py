@@ -21,7 +21,7 @@ NOISE = 3e-4
 
 
 def hung_again(seed: int, scatter: float, count: int = 5) -> list[MeasuredPose]:
-    """Hangings of one pose whose rest shape differs from one to the next [1/m]."""
+    """Repeats of one pose whose rest shape differs from one to the next [1/m]."""
     rng = np.random.default_rng(seed)
     pose = Pose((0.0, 0.0), (0.45, -0.05), start_heading=-0.6, end_heading=0.5)
     s = np.linspace(0.02, 0.98, 40) * MODEL.cable.length
@@ -46,12 +46,12 @@ def test_hangings_that_differ_by_more_than_the_noise_limit_every_prediction(scat
     ("errors", "doubt", "kept"),
     [
         ([0.8, 1.0, 0.9, 1.1, 0.7], None, True),  # an effect worth it, were the points independent
-        ([0.8, 1.0, 0.9, 1.1, 0.7], 0.005, False),  # but two of five hangings are no better
+        ([0.8, 1.0, 0.9, 1.1, 0.7], 0.005, False),  # but two of five repeats are no better
         ([0.3, 0.4, 0.3, 0.5, 0.4], 0.005, True),  # all are
     ],
 )
 def test_only_a_clear_gain_counts_where_poses_do_not_repeat(errors, doubt, kept):
-    """Mean squares of what is left out, hanging by hanging; 1 without the effect."""
+    """Mean square errors of each left-out repeat; 1 without the effect."""
     counts = np.full(5, 40.0)
     before = CrossValidation(counts * 1.0, counts, True)
     added = SimpleNamespace(candidate=SimpleNamespace(nuisance=False))

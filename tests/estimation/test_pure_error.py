@@ -81,9 +81,9 @@ def test_poses_that_repeat_to_the_noise_or_are_taken_once_leave_it_as_declared()
 
 @pytest.mark.parametrize("left_out", [0, 1])
 def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
-    """Real: the black wire, clicked to 1 mm, hangs 7 to 23 mm from its last hanging.
+    """Real: repeats of the black wire, clicked to 1 mm, differ by 7 to 23 mm from the last one.
 
-    Taken at 1 mm, four hangings ask for EI of 0.03 N m^2 and a rest shape bent the other way, whose
+    Taken at 1 mm, four repeats ask for EI of 0.03 N m^2 and a rest shape bent the other way, whose
     lowest equilibrium is 280 mm away from all of them. Its makers found 1.2e-3 N m^2.
     """
     config = load_config(ROOT / "configs" / "black_wire.yaml")
@@ -99,7 +99,7 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     assert others == [None] * 5
     floor = repeatability([replace(item, held_out=False) for item in measured], 1.5)
     assert rms_distance(predictions, measured, held_out=True) < 1.5 * floor
-    # The band is as wide as hangings differ, of which a distance in a plane has up to two parts.
+    # The band is as wide as repeats differ, of which a distance in a plane has up to two parts.
     uncertainty = uncertainty_of(fit)
     assert floor / 2 < uncertainty.hanging < floor
     (found,) = (item.equilibrium for item in predictions[left_out : left_out + 1])

@@ -84,7 +84,7 @@ def test_what_poses_that_are_alike_have_in_common_is_not_random():
 
 
 def test_modes_have_the_std_along_the_cable():
-    """RMS over all hangings and places: the sum of the variances."""
+    """RMS over all repeats and places: the sum of the variances."""
     cells = np.stack([np.arange(400), np.arange(1, 401)], axis=1) * 0.002
     waves = modes_of(cells, 0.8)
     for smoothness in (0.5, 0.12):

@@ -1,4 +1,4 @@
-"""What noise, fixtures and parameters let expect of a pose's distances, against drawn hangings."""
+"""What noise, fixtures and parameters let expect of a pose's distances, against drawn repeats."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def poses_of(model):
     return [Pose((0.0, 0.0, 0.0), end, **held, name=str(end)) for end in ends]
 
 
-def hangings(model, p, poses, scatter, marked, rng, near=None):
+def repeats(model, p, poses, scatter, marked, rng, near=None):
     """Measured poses whose ends are off by a scatter (d,) [m] each, near known equilibria."""
     ends = [pose.end + scatter * rng.normal(size=len(scatter)) for pose in poses]
     there = [replace(pose, end=tuple(end)) for pose, end in zip(poses, ends, strict=True)]
@@ -55,9 +55,7 @@ def test_expected_distances_are_those_of_drawn_hangings(model, marked):
     rng, poses = np.random.default_rng(0), poses_of(model)
     d = len(poses[0].start)
     true = np.full(d, TOLERANCES.end)
-    fit = fit_model(
-        model, hangings(model, model.nominal, poses, true, marked, rng), TOLERANCES, STD
-    )
+    fit = fit_model(model, repeats(model, model.nominal, poses, true, marked, rng), TOLERANCES, STD)
     stage = fit_stage("batch", fit, fit.problem.history, {})
     expected = np.array([stage.shapes[pose.name].expected for pose in poses])
     scatter = np.array([uncertainty_of(fit).scatter[f"end_{axis}"] for axis in "xyz"[:d]])
@@ -67,7 +65,7 @@ def test_expected_distances_are_those_of_drawn_hangings(model, marked):
     for score in rng.normal(size=DRAWN):  # no end holds a twist, so that EI alone acts
         p = fit.p.copy()
         p[0] += score * fit.std("bending_stiffness")
-        drawn = hangings(model, p, poses, scatter, marked, rng, near)
+        drawn = repeats(model, p, poses, scatter, marked, rng, near)
         distances = [item.distances(curve) for item, curve in zip(drawn, curves, strict=True)]
         ratio.append(np.mean((np.array(distances) / expected) ** 2))
     # Three standard errors of their mean, and a hundredth for what is not linear.

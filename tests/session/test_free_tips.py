@@ -121,7 +121,7 @@ def test_held_out_poses_on_either_side_are_told_with_both_errors():
 
 
 def test_a_cable_that_does_not_repeat_may_fall_to_either_side():
-    """Heavy ones differ by 0.3 1/m from hanging to hanging: over 0.5 m, by 0.15 rad at most."""
+    """Heavy ones differ by 0.3 1/m from repeat to repeat: over 0.5 m, by 0.15 rad at most."""
     pose = held(0.08)
     eq = fallen(pose)
 
