@@ -132,7 +132,7 @@ class Counter(Shown):
         return BarColumn(30), "{task.description}", TimeElapsedColumn()
 
     def show(self, tally: Tally) -> None:
-        """Show how far the tasks have come."""
+        """Show the progress of the tasks."""
         signals.check()
         text = self._text(tally)
         line = f"{text}; {duration(tally.elapsed)} so far"

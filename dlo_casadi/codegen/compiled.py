@@ -144,7 +144,7 @@ class CompiledSolver:
         return _shape(out[0], status)
 
     def step(self, shape: Shape, pose: Pose, *, steps: int = 4) -> Shape:
-        """Shape in a pose close by, in at most so many Newton steps; see its `status`.
+        """Shape in a nearby pose after at most `steps` Newton steps; see its `status`.
 
         Raises
         ------

@@ -111,14 +111,14 @@ class NodeCurve:
         """Positions (K, d) [m] at arc lengths s, or derivatives by s."""
         return self.frame(s, derivative)[derivative]
 
-    def moved(self, s: FloatArray, slopes: FloatArray) -> FloatArray:
+    def moved(self, s: FloatArray, change: FloatArray) -> FloatArray:
         """Change (K, d, q) [m] at fixed s, from the change (n + 1, d or 2 d, q) of `numbers`."""
         e, w = self.weights(s)
         w = w[:, :, None, None]
-        out = w[:, 0] * slopes[e, : self.d] + w[:, 1] * slopes[e + 1, : self.d]
+        out = w[:, 0] * change[e, : self.d] + w[:, 1] * change[e + 1, : self.d]
         if self.slopes is not None:
             h = self.length / self.n
-            out += h * (w[:, 2] * slopes[e, self.d :] + w[:, 3] * slopes[e + 1, self.d :])
+            out += h * (w[:, 2] * change[e, self.d :] + w[:, 3] * change[e + 1, self.d :])
         return np.asarray(out)
 
     def followed(

@@ -1,4 +1,4 @@
-"""A fitted cable, how well its parameters are known, and its shape in one pose."""
+"""A fitted cable with the uncertainty of its parameters, and its shape in one pose."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""CableModel: a cable, its mesh, boundaries and effects; and how well declared values are known."""
+"""CableModel: a cable, its mesh, boundaries and effects; and tolerances of declared values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -306,7 +306,7 @@ class CableModel:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How well the declared values are known, one standard deviation."""
+    """Standard deviations of the declared values."""
 
     length: float = 5e-4
     end: float = 2e-4

@@ -1,4 +1,4 @@
-"""Rest curvature: its basis of B-splines, and how it differs from pose to pose."""
+"""Rest curvature: its basis of B-splines, and its random scatter from pose to pose."""
 
 from dataclasses import dataclass
 

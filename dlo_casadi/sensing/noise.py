@@ -342,7 +342,7 @@ class _Estimate:
     noise: NoiseModel
     deviance: float
     log_slow: float  # logarithm of that variance, relative to the other estimates
-    log_slow_variance: float  # and how uncertain it is
+    log_slow_variance: float  # variance of that logarithm
 
 
 def _white(samples: list[NoiseSample], cable_length: float) -> _Estimate:
