@@ -18,6 +18,7 @@ from dlo_casadi.diagnosis.refits import (
     confirm,
     confirm_cause,
     confirm_from_data,
+    from_data,
     refit_without,
     screened_from_data,
 )
@@ -54,7 +55,7 @@ from dlo_casadi.thresholds import (
     BIC_APART,
     DIFFERENT,
     LEFT,
-    NEAREST,
+    NEAR_LEADER,
     REFITTED,
     SIGNIFICANCE,
     UNSEEN,
@@ -363,15 +364,14 @@ class Search:
     def _from_data(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None]]:
         """Fits from the measured shapes of the candidates that come nearest to them.
 
-        Beside a misfit scores are no order, and a refit leads where the declared model has gone.
+        Beside a misfit scores tell nothing, and a refit leads where the declared model has gone.
         """
-        listed = candidates_of(current, self.center, self.exclude)
-        begun = screened_from_data(current, listed, self.executor)
-        least = min((start.guess.objective for _, start in begun), default=0.0)
-        near = [pair for pair in begun if pair[1].guess.objective <= NEAREST * least]
-        refit = partial(confirm_from_data, current)
-        tried = list(map_in_order(self.executor, refit, near[:REFITTED]))
-        return [item for item, _ in begun], tried
+        near, softness = from_data(current)
+        listed = candidates_of(near, self.center, self.exclude)
+        screened = screened_from_data(near, softness, listed)
+        likely = [x for x in screened if x.score >= NEAR_LEADER * screened[0].score]
+        refit = partial(confirm_from_data, current, near)
+        return screened, list(map_in_order(self.executor, refit, likely[:REFITTED]))
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that explain the forces.

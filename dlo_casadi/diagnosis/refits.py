@@ -7,46 +7,34 @@ An unknown force has found shapes that fit, and in every pose a force f_j at one
 cable; a load is its cause if its own law gives these forces. All are linear in their parameters
 once the place is known (a tether in k and k a: f = k a - k r): least squares tell where to start.
 
-Or the fit begins at the measured shapes. All at once (`start.all_at_once`) no equilibrium is
-needed: nodes stay near what was measured, forces come into balance while parameters become right.
+Or the fit begins at the measured shapes: relaxed, see `estimation.relaxation`, it needs no
+equilibrium, and what is left over of its balance of forces tells which effect is missing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.screening import Screened, survival
+from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.descent import descend, refit, with_border_of
-from dlo_casadi.estimation.fit import STEPS_OF_A_RIVAL, loosened
+from dlo_casadi.estimation.descent import carried_shapes, descend, refit
+from dlo_casadi.estimation.fit import fit_relaxed, misfits
 from dlo_casadi.estimation.problem import Priors, Problem, Values
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, begin, hung, relaxed
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import (
-    FIRST_LOOK,
-    Guess,
-    all_at_once,
-    equilibria_near,
-    measured_shapes,
-)
-from dlo_casadi.estimation.unknowns import Search, Unknowns
-from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.cable_model import END_ROLL, CableModel
-from dlo_casadi.runtime.parallel import map_in_order
-
-FloatArray = NDArray[np.floating]
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.variances import refine
+from dlo_casadi.model.cable_model import CableModel
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -55,17 +43,13 @@ PROMISED = 0.5
 # Starts whose objectives end so near to one another have led to one place, and smaller shares begin
 # nearer to the base still. Reports of eighteen sessions were the same without that limit.
 ONE_PLACE = 1.0
+# Softness [rad] at which a relaxed model is scored, and the residual over the noise up to which its
+# shapes are those measured: what is left over of the balance tells what is missing there.
+SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
+# Residual over the noise at which a start has reached the noise.
+REACHED = 1.5
 # Gauss-Newton steps of one refit, and of one from forces that scatter from pose to pose.
 MOST_STEPS, STEPS_FROM_FORCES = 25, 60
-# Decades of stiffness about that of the fit without the effect, and about the prior's. In five
-# sessions in which an effect is missing such fits were off by factors of 0.35 to 2.3, priors by 0.6
-# to 1.9.
-DECADES_NEAR = (-0.5, 0.5)
-# Places of an effect that are tried first, and starts that are followed.
-PLACES_TRIED, FOLLOWED = 5, 2
-# Iterations with the effect's size free, its place and the stiffnesses held; with the stiffnesses,
-# too; with all.
-STEPS = (FIRST_LOOK, 4, 8)
 
 
 @dataclass(frozen=True)
@@ -104,32 +88,38 @@ class Confirmed:
         return self.screened.candidate
 
 
-def screened_from_data(
-    base: Fit, listed: Sequence[Candidate], executor: Executor
-) -> list[tuple[Screened, Start]]:
-    """Candidates of a base that is astray, started from the measured shapes, best first.
+def from_data(base: Fit) -> tuple[Fit, float]:
+    """A base that lacks something, relaxed at the measured shapes; no equilibrium.
 
-    The score is by how much twice the objective falls, at the noise of a search, below that of
-    the model without a candidate, which starts from the measured shapes, too; where it cannot,
-    nothing is listed.
+    At its known noise, from nominal parameters: those of the base fit what it lacks. Its softness
+    [rad] is the least of SCORED at which the shapes are still those measured.
     """
-    cable, origins = base.model.cable, origins_of(base)
-    without = start_from_data(base, origins, None)
-    containing = [x for x in listed if any(x.contains(other, cable) for other in listed)]
-    simple = [x for x in listed if x not in containing]
-    found = map_in_order(executor, partial(start_from_data, base, origins), simple)
-    begun = list(zip(simple, found, strict=True))
-    for candidate in containing:
-        inside = [(x, start) for x, start in begun if start and candidate.contains(x, cable)]
-        smaller = min(inside, key=lambda pair: pair[1].guess.objective, default=None)
-        begun.append((candidate, start_from_data(base, origins, candidate, smaller)))
-    out = []
-    for candidate, start in begun:
-        if start is not None and without is not None:
-            score = max(2 * (without.guess.objective - start.guess.objective), 0.0)
-            p_value = survival(score, len(candidate.frees), np.inf)
-            out.append((Screened(candidate, score, p_value, {}), start))
-    return sorted(out, key=lambda pair: -pair[0].score)
+    model, known = base.model, base.noise.before or base.noise
+    p = np.where(base.problem.unknowns.free, model.nominal, base.p)
+    problem = replace(_from_data(base, model), noise=known, weights=None)
+    start = problem.unknowns.pack(p, np.zeros(model.n_coefficients))
+    problem, values = begin(problem, start)
+    best = None
+    for softness in SCORED:
+        values = Relaxation(problem, softness).solve(values)
+        near = Fit(problem, problem.evaluate(values))
+        if best is not None and near.point.data > MEASURED * problem.n_residuals:
+            break
+        best = near, softness
+    assert best is not None
+    return best
+
+
+def _from_data(base: Fit, model: CableModel) -> Problem:
+    """The problem of a model beside a base, at its noise and with priors that know no scatter."""
+    unknowns = Unknowns(model, base.free_in(model), base.values_in(model))
+    priors = Priors.of(base.problem.priors.tolerances, model)
+    return replace(base.problem, unknowns=unknowns, priors=priors)
+
+
+def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) -> list[Screened]:
+    """Score tests in a relaxed model, best first."""
+    return RelaxedScreen(near, listed, softness).run(np.inf) if listed else []
 
 
 def confirm(base: Fit, screened: Screened) -> Confirmed | None:
@@ -147,11 +137,75 @@ def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirm
     return Confirmed.of(screened, base, fit)
 
 
-def confirm_from_data(base: Fit, begun: tuple[Screened, Start]) -> Confirmed | None:
-    """Fit with a candidate added, from where it was started; None if that is no equilibrium."""
+def confirm_from_data(base: Fit, near: Fit, screened: Screened) -> Confirmed | None:
+    """Fit with a candidate added, from the relaxed base; None if that leads to no equilibrium.
+
+    Weighed as the base where the candidate does not bring it to the noise of the points.
+    """
     with suppress(EstimationError):
-        return Confirmed.of(begun[0], base, fit_from_data(base, begun[1]))
+        fit = _fit_from_data(near, screened)
+        if fit is not None and misfits(fit):
+            fit = descend(fit.reweighed(base.noise, base.problem.priors))
+        elif fit is not None:
+            fit = refine(fit, first=True)
+        return Confirmed.of(screened, base, fit)
     return None
+
+
+def _fit_from_data(near: Fit, screened: Screened) -> Fit | None:
+    """The fit that a relaxed model leads to with a candidate, from the first start that succeeds.
+
+    Starts: the relaxed shapes with the candidate not there yet; the measured shapes anew, in
+    parameters in which the candidate is linear; the relaxed shapes with its one-step estimate. A
+    pose that turns into another equilibrium on the way of one rarely does so on the others'.
+    """
+    scan, best = screened.candidate.scans[0], None
+    places = {name: value for name, value in screened.start.items() if name in scan}
+    ways = (
+        partial(_beside, near, screened.candidate, places),
+        partial(_anew, near, screened.candidate, places),
+        partial(_beside, near, screened.candidate, screened.start),
+    )
+    for way in ways:
+        fit = way()
+        if fit and (best is None or fit.point.objective < best.point.objective):
+            best = fit
+        near_noise = best and best.point.data < REACHED * best.problem.n_residuals
+        if best and best.converged and near_noise:
+            break
+    return best
+
+
+def _beside(near: Fit, candidate: Candidate, values: Mapping[str, float]) -> Fit | None:
+    """Fit with a candidate from relaxed shapes, its parameters at values or nominal."""
+    model = candidate.add_to(near.model)
+    problem = _from_data(near, model)
+    theta = problem.unknowns.pack(near.values_in(model, values), near.coefficients)
+    shapes = carried_shapes(problem, near, relaxed=True)
+    begun = Values(problem.unknowns.off_bounds(theta), shapes, near.point.projections)
+    return fit_relaxed(problem, hung(problem, begun))
+
+
+def _anew(near: Fit, candidate: Candidate, places: Mapping[str, float]) -> Fit | None:
+    """Fit with a candidate from the measured shapes and nominal parameters."""
+    linear, own = candidate.add_linear_to(near.model), candidate.add_to(near.model)
+    problem = _from_data(near, linear)
+    known = dict(zip(linear.names, linear.nominal.tolist(), strict=True)) | dict(places)
+    begun = np.array([known[name] for name in linear.names])
+    p = np.where(problem.unknowns.free, begun, problem.unknowns.fixed)
+    theta = problem.unknowns.pack(p, np.zeros(linear.n_coefficients))
+    problem, found = begin(problem, problem.unknowns.off_bounds(theta))
+    found = relaxed(problem, found, SOFTNESS[1:3])
+    if linear != own:
+        known = dict(zip(linear.names, problem.unknowns.p(found.theta).tolist(), strict=True))
+        prefix = f"{candidate.effect.label}."
+        part = {name: value for name, value in known.items() if name.startswith(prefix)}
+        known |= candidate.of_linear(own.cable, part)
+        rest = problem.unknowns.coefficients(found.theta)
+        problem = _from_data(near, own)
+        p = np.array([known[name] for name in own.names])
+        found = replace(found, theta=problem.unknowns.pack(p, rest))
+    return fit_relaxed(problem, found, SOFTNESS[2:])
 
 
 def _followed(
@@ -209,180 +263,3 @@ def start_from(force: UnknownForce, candidate: Candidate) -> dict[str, float]:
     found = np.linalg.lstsq(arms, force.force_per_pose.ravel(), rcond=None)[0]
     values = dict(zip(names, map(float, found), strict=True)) | {"position": force.position}
     return candidate.of_linear(model.cable, values)
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where a fit of a model begins: a problem, and nodes and parameters that are near balance."""
-
-    problem: Problem
-    guess: Guess
-
-
-class Origin(NamedTuple):
-    """Where starts begin: parameters by name, and shapes of m poses along the measured lines.
-
-    `x` (m, n_nodes, coordinates); `projections` (K_j,) [m] of the points of each fitted pose.
-    """
-
-    values: dict[str, float]
-    x: FloatArray
-    projections: list[FloatArray]
-
-
-def origins_of(base: Fit) -> tuple[Origin, ...]:
-    """What a fit that is astray has found, and what was declared."""
-    names, problem = base.model.names, _searched_problem(base, base.model)
-    declared = np.where(problem.unknowns.free, base.model.nominal, base.p)
-    # Either way round, as the fit has found to fit best.
-    turns = base.model.node.turning(base.point.shapes.x) / (2 * np.pi)
-    found = []
-    for p, own in ((base.p, turns), (declared, None)):
-        values = dict(zip(names, map(float, p), strict=True))
-        shapes, projections = measured_shapes(problem, values.get(END_ROLL, 0.0), own)
-        found.append(Origin(values, shapes.x, projections))
-    return tuple(found)
-
-
-def start_from_data(
-    base: Fit,
-    origins: Sequence[Origin],
-    candidate: Candidate | None,
-    smaller: tuple[Candidate, Start] | None = None,
-) -> Start | None:
-    """The best of some starts from the measured shapes.
-
-    Parameters
-    ----------
-    base : Fit
-        Of a model that lacks something.
-    origins : sequence of Origin
-        Of that fit.
-    candidate : Candidate, optional
-        What is added to its model; by default nothing.
-    smaller : (Candidate, Start), optional
-        A candidate that this one contains, and where that has led: the start, if it can be.
-    """
-    model = linear = base.model if candidate is None else candidate.add_to(base.model)
-    scans: tuple[dict[str, float], ...] = ({},)
-    if candidate is not None:
-        scans, linear = candidate.scans, candidate.add_linear_to(base.model)
-    weights = None if smaller is None else smaller[1].problem.weights
-    first = _First(base, linear, origins, weights)
-    looks: list[tuple[Guess, dict[str, float]]] = []
-    if candidate is not None and smaller is not None:
-        looks = [(guess, scans[0]) for guess in first.beyond(candidate, *smaller)]
-    looks = looks or first.looks(scans[:: -(-len(scans) // PLACES_TRIED)])
-    problem, best = first.problem, None
-    if linear != model:
-        problem = replace(_searched_problem(base, model), weights=problem.weights)
-    for look, scan in sorted(looks, key=lambda look: look[0].objective)[:FOLLOWED]:
-        guess: Guess | None = look
-        if candidate is not None and linear != model:
-            guess = first.continued(look, problem, candidate)
-        placed = np.array([name in scan for name in problem.unknowns.names])
-        for still, steps in ((placed, STEPS[1]), (np.zeros_like(placed), STEPS[2])):
-            guess = guess and all_at_once(problem, guess, still, steps)
-        if guess is not None and (best is None or guess.objective < best.objective):
-            best = guess
-    return None if best is None else Start(problem, best)
-
-
-class _First:
-    """First looks at a model, in parameters in which what it has more is linear."""
-
-    def __init__(
-        self,
-        base: Fit,
-        model: CableModel,
-        origins: Sequence[Origin],
-        weights: tuple[FloatArray, ...] | None,
-    ) -> None:
-        problem = replace(_searched_problem(base, model), weights=weights)
-        self.base, self.model = base, model
-        self.begun: list[tuple[dict[str, float], Shapes, list[FloatArray]]] = []
-        for values, x, projections in origins:
-            shapes = problem.equilibria.start_shapes(x)
-            if len(x) != len(problem.indices):
-                # A state makes shapes depend on those of poses that were held out.
-                shapes, projections = measured_shapes(problem, values.get(END_ROLL, 0.0))
-            self.begun.append((values, shapes, projections))
-        if weights is None:
-            theta = np.zeros(problem.unknowns.size)
-            problem = problem.weighed(Values(theta, *self.begun[0][1:]))
-        self.problem = problem
-        released = set(base.model.priors) - set(model.priors)
-        self.kept = set(base.model.names) - released - {END_ROLL}
-
-    def looks(self, scans: Sequence[dict[str, float]]) -> list[tuple[Guess, dict[str, float]]]:
-        """Guesses after a few steps at places and at stiffnesses, which stay."""
-        found = [
-            (guess, scan, k)
-            for scan in scans
-            for k in range(len(self.begun))
-            if (guess := self._look(scan, k)) is not None
-        ]
-        if not found:
-            return []
-        _, scan, k = min(found, key=lambda look: look[0].objective)
-        others = [self._look(scan, k, decade) for decade in DECADES_NEAR]
-        return [
-            *((guess, scan) for guess, scan, _ in found),
-            *((guess, scan) for guess in others if guess is not None),
-        ]
-
-    def _look(self, scan: Mapping[str, float], k: int, decade: float = 0.0) -> Guess | None:
-        values, shapes, projections = self.begun[k]
-        p, stiff = self.base.values_in(self.model, {**values, **scan}), self.model.stiffness_indices
-        # Torsion goes with bending: their ratio is known better than what a misfit leaves of it.
-        p[stiff] = 10**decade * p[0] / self.model.nominal[0] * self.model.nominal[stiff]
-        theta = self.problem.unknowns.pack(p, np.zeros(self.model.n_coefficients))
-        held = np.array([name in self.kept or name in scan for name in self.problem.unknowns.names])
-        return all_at_once(self.problem, Guess(theta, shapes, projections), held, STEPS[0])
-
-    def beyond(self, candidate: Candidate, smaller: Candidate, start: Start) -> list[Guess]:
-        """A guess from where a candidate has led that this one contains."""
-        other = start.problem.unknowns
-        ended, rest = other.p(start.guess.theta), other.coefficients(start.guess.theta)
-        there, here = f"{smaller.effect.label}.", f"{candidate.effect.label}."
-        renamed = (
-            here + name.removeprefix(there) if name.startswith(there) else name
-            for name in other.model.names
-        )
-        known = dict(zip(renamed, ended, strict=True))
-        p = np.array([known.get(q.name, q.nominal) for q in self.model.parameters])
-        shapes = with_border_of(start.guess.shapes, other.model, self.model)
-        begun = Guess(self.problem.unknowns.pack(p, rest), shapes, start.guess.projections)
-        held = np.array([name in self.kept for name in self.problem.unknowns.names])
-        guess = all_at_once(self.problem, begun, held, STEPS[0])
-        return [] if guess is None else [guess]
-
-    def continued(self, guess: Guess, problem: Problem, candidate: Candidate) -> Guess:
-        """A guess in the candidate's own parameters."""
-        names, found = problem.unknowns.model.names, self.problem.unknowns.p(guess.theta)
-        values = dict(zip(self.model.names, map(float, found), strict=True))
-        prefix = f"{candidate.effect.label}."
-        linear = {name: value for name, value in values.items() if name.startswith(prefix)}
-        values.update(candidate.of_linear(self.model.cable, linear))
-        rest = self.problem.unknowns.coefficients(guess.theta)
-        theta = problem.unknowns.pack(np.array([values[name] for name in names]), rest)
-        return replace(guess, theta=theta)
-
-
-def _searched_problem(base: Fit, model: CableModel) -> Problem:
-    """A model's batch problem as a search weighs it."""
-    problem, noise = base.problem, loosened(base.noise.before or base.noise, model)
-    unknowns = Unknowns(model, base.free_in(model), base.values_in(model))
-    return Problem(unknowns, problem.history, noise, Priors.of(problem.priors.tolerances, model))
-
-
-def fit_from_data(base: Fit, start: Start) -> Fit | None:
-    """The fit that a start leads to, weighed as the base; None where it leads to no equilibria."""
-    problem = start.problem
-    none = np.zeros(problem.unknowns.size, dtype=bool)
-    guess = all_at_once(problem, start.guess, none, Search.of(base.model).more)
-    point = equilibria_near(problem, guess, start.guess)
-    if point is None:
-        return None
-    near = descend(Fit(problem, point), STEPS_OF_A_RIVAL, tolerance=1e-2)
-    return descend(near.reweighed(base.noise, base.problem.priors))

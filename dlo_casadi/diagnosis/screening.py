@@ -26,11 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import StateEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.problem import NO_INFORMATION, Linearization, Point, Problem, Values
+from dlo_casadi.estimation.relaxation import Relaxation, hung
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
@@ -38,8 +40,6 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.thresholds import COLLINEAR, SCANS_PER_TEST
-
-FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -271,6 +271,35 @@ class Screen:
             q = self.model.parameters[i]
             below.append(q.lower == q.nominal and self.p[i] + change * q.scale < q.lower)
         return np.array(below)
+
+
+class RelaxedScreen(Screen):
+    """The same at a relaxed fit, whose shapes are those measured and whose forces do not balance.
+
+    Parameters
+    ----------
+    near : Fit
+        Relaxed, see `estimation.relaxation`.
+    softness : float [rad]
+        Of the balance.
+    """
+
+    def __init__(self, near: Fit, listed: Sequence[Candidate], softness: float) -> None:
+        super().__init__(near, listed)
+        self.softness = softness
+
+    def normals(self, executor: Executor) -> Iterator[AtScan]:
+        """Normal equations at each scan, everything of a pose's own eliminated."""
+        fit, unknowns = self.fit, Unknowns(self.model, self.fit.free_in(self.model), self.p)
+        problem = replace(fit.problem, unknowns=unknowns)
+        shapes = carried_shapes(problem, fit, relaxed=True)
+        for k in range(max(len(candidate.scans) for candidate in self.listed)):
+            active = [c for c in self.listed if k < len(c.scans)]
+            p = fit.values_in(self.model, _scan(active, k))
+            theta = unknowns.pack(p, fit.coefficients)
+            values = hung(problem, Values(theta, shapes, fit.point.projections))
+            normal = Relaxation(problem, self.softness).normal(values)
+            yield AtScan(active, k, normal.hessian, normal.gradient, unknowns.names)
 
 
 def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, FloatArray, int]:

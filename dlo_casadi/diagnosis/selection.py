@@ -13,7 +13,6 @@ from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
-from dlo_casadi.estimation.fit import fitted_closely
 from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of, settle
@@ -61,31 +60,21 @@ class Ranked:
 
 
 def explained_by(current: Fit, tried: Iterable[Confirmed | None]) -> list[Confirmed]:
-    """Candidates that leave none of a misfit once the points are taken as sure as they are.
+    """Candidates that leave none of a misfit: with them the points are as sure as they are known.
 
     Beside a misfit their gains tell little; they are compared by their evidence.
     """
     if current.noise.source != "misfit":
         return []
-    most = current.point.objective / 2
-    likely = [item for item in tried if item is not None and item.fit.point.objective < most]
-    fits = [(item, as_complete(item.fit)) for item in likely]
-    close = [(item, fit) for item, fit in fits if fit.noise.source != "misfit"]
-    least = min((fit.log_evidence for _, fit in close), default=0.0)
-    return [
-        replace(x, fit=fit, validation=cross_validate(fit), bic=2 * (fit.log_evidence - least))
-        for x, fit in close
-    ]
+    refits = [x for x in tried if x is not None and x.validation.complete]
+    close = [item for item in refits if item.fit.noise.source != "misfit"]
+    least = min((item.fit.log_evidence for item in close), default=0.0)
+    return [replace(item, bic=2 * (item.fit.log_evidence - least)) for item in close]
 
 
 def as_complete(fit: Fit) -> Fit:
     """A fit with an effect added, as that of a model that may be complete now."""
-    if fit.noise.source != "misfit":
-        return settle(fit)
-    try:
-        return fitted_closely(fit)
-    except EstimationError:
-        return fit
+    return fit if fit.noise.source == "misfit" else settle(fit)
 
 
 def sidak(p_value: float, tried: int) -> float:

@@ -82,22 +82,23 @@ class BatchEquilibrium:
 
     def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Size (m, n_cells) [1/m] of the curvature minus the rest curvature before each pose."""
-        given = self._given(shapes, p, rest)
+        given = self.given(shapes, p, rest)
         bends = self.assembly.strain(shapes, given) - given.rest
         return np.asarray(np.linalg.norm(self.assembly.chain.curvatures(bends), axis=1))
 
-    def _given(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Inputs:
+    def given(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Inputs:
+        """What the equilibria depend on, the rest curvature that each pose finds."""
         return Inputs.of(p, self.rests(shapes, p, rest), self._ends)
 
     # ---- equilibria ------------------------------------------------------------------------------
 
     def balance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> tuple[Vector, BandMatrix]:
         """Imbalance and tangent matrices; `rest` is that before the first pose, or of each."""
-        return self.assembly.balance(shapes, self._given(shapes, p, rest))[1:]
+        return self.assembly.balance(shapes, self.given(shapes, p, rest))[1:]
 
     def imbalance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Vector:
         """Imbalance alone, which costs far less."""
-        return self.assembly.imbalance(shapes, self._given(shapes, p, rest))
+        return self.assembly.imbalance(shapes, self.given(shapes, p, rest))
 
     def moved(self, shapes: Shapes, step: Vector) -> Shapes:
         """Shapes after a step of one column."""
@@ -141,7 +142,7 @@ class BatchEquilibrium:
         active, last = np.arange(self.m), np.full(self.m, np.inf)
         stale, matrix = np.ones(self.m, dtype=bool), None
         for _ in range(max_iterations):
-            given = self._given(now, p, rest).subset(active)
+            given = self.given(now, p, rest).subset(active)
             here = now.subset(active)
             fresh = stale[active] | coupled
             force, matrix = self._linearized(here, given, active, fresh, matrix)
@@ -180,7 +181,7 @@ class BatchEquilibrium:
         lost = np.flatnonzero(~converged)
         if not len(lost) or not self.model.in_space or self.model.has_state:
             return now, converged
-        given = self._given(shapes, p, rest).subset(lost)
+        given = self.given(shapes, p, rest).subset(lost)
         found = descend(self.assembly, shapes.subset(lost), given, DOWNHILL)
         kept = lost[found.converged]
         now.x[kept] = found.shapes.x[found.converged]
@@ -251,7 +252,7 @@ class BatchEquilibrium:
         Tangents
             Columns: the unknowns, then the model's deviations.
         """
-        given = self._given(shapes, p, rest)
+        given = self.given(shapes, p, rest)
         size, own = slopes.shape[1], len(self.used_deviations)
         deviation = np.zeros((len(self.model.deviation_names), size + own))
         deviation[self.used_deviations, size + np.arange(own)] = 1.0
@@ -282,7 +283,7 @@ class BatchEquilibrium:
 
         A mode may also change the parameters (n_parameters, q) and deviations (n_deviations, q).
         """
-        given = self._given(shapes, p, rest)
+        given = self.given(shapes, p, rest)
         return self._solved(shapes, given, self._still(given, modes, by_p, by_deviation))
 
     def _still(
@@ -337,7 +338,7 @@ class BatchEquilibrium:
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Tangents
     ) -> list[tuple[Observed, ObservedChange]]:
         """Predicted measurements of each pose, and their change along directions."""
-        given, length = self._given(shapes, p, rest), self.model.cable.length
+        given, length = self.given(shapes, p, rest), self.model.cable.length
         slopes = self.assembly.curve_slopes(shapes, given)
         each = zip(
             slopes.z,
@@ -353,7 +354,7 @@ class BatchEquilibrium:
 
     def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
         """Predicted measurements of each pose."""
-        given, length = self._given(shapes, p, rest), self.model.cable.length
+        given, length = self.given(shapes, p, rest), self.model.cable.length
         both = zip(
             self.assembly.curve(shapes, given), self.assembly.readings(shapes, given), strict=True
         )

@@ -7,9 +7,10 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.guesses import first_nodes
 from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.problem import (
@@ -24,8 +25,6 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
-
-FloatArray = NDArray[np.floating]
 
 # Longest step of a node along its derivative [rad]; beyond it the linearisation is poor.
 LONGEST_MOVE = 1.5
@@ -191,10 +190,11 @@ def refit(
     return descend(Fit(problem, point), steps)
 
 
-def carried_shapes(problem: Problem, fit: Fit) -> Shapes:
+def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shapes:
     """Shapes of a problem's poses from those of a fit, on the problem's mesh.
 
-    Poses that the fit did not need, because it carried no state, are predicted.
+    Poses that the fit did not need, because it carried no state, are predicted;
+    beside a relaxed fit they begin at a first guess.
 
     Raises
     ------
@@ -210,6 +210,11 @@ def carried_shapes(problem: Problem, fit: Fit) -> Shapes:
             rows.append((own.x[k], own.lam[k], own.deviation[k]))
             continue
         pose = problem.history[index].pose
+        if relaxed:
+            x = first_nodes(fit.model, fit.p, fit.rest, pose)[0]
+            none = np.zeros(fit.model.n_border), np.zeros(len(fit.model.deviation_names))
+            rows.append((x, *none))
+            continue
         try:
             if pose.branch == "previous" and rows:
                 before = problem.history[index - 1].pose, rows[-1][0]

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, on_other_mesh, refit
-from dlo_casadi.estimation.problem import Priors, Problem
+from dlo_casadi.estimation.problem import Priors, Problem, Values
+from dlo_casadi.estimation.relaxation import SOFTNESS, relaxed
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import ROLLS, starting_points
@@ -146,12 +147,12 @@ def _searched(problem: Problem, theta: FloatArray, decades: Sequence[float]) -> 
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )
-    if _misfits(best):
+    if misfits(best):
         if END_ROLL in problem.unknowns.names:
             other = _search(problem, theta, decades, FAR_ROLLS, either_way=True)
             lower = other is not None and other.point.objective < best.point.objective
             best = other if other is not None and lower else best
-        if _misfits(best):
+        if misfits(best):
             return _fit_to_misfit(best)
     return refine(best, first=True)
 
@@ -167,7 +168,7 @@ def _found(problem: Problem, theta: FloatArray, decades: Sequence[float]) -> Fit
     return best or _search(problem, theta, decades)
 
 
-def _misfits(fit: Fit) -> bool:
+def misfits(fit: Fit) -> bool:
     """Whether a fit leaves so much that its model lacks something."""
     return fit.residual_rms > Search.of(fit.model).misfit * fit.model.cable.length
 
@@ -197,6 +198,14 @@ def _search(
 def loosened(noise: NoiseModel, model: CableModel) -> NoiseModel:
     """Noise by which a search weighs the points."""
     return noise.doubted(Search.of(model).std * model.cable.length)
+
+
+def fit_relaxed(
+    problem: Problem, values: Values, softness: Sequence[float] = SOFTNESS
+) -> Fit | None:
+    """The minimum that relaxed values lead to; None if some pose has no equilibrium there."""
+    point = problem.balanced(relaxed(problem, values, softness), max_iterations=40)
+    return None if point is None else descend(Fit(problem, point), tolerance=1e-2)
 
 
 def fit_from(starts: Sequence[Fit]) -> Fit | None:
@@ -230,24 +239,6 @@ def _fit_to_misfit(near: Fit) -> Fit:
 
 def _first_priors(fit: Fit) -> Priors:
     return Priors.of(fit.problem.priors.tolerances, fit.model)
-
-
-def fitted_closely(fit: Fit) -> Fit:
-    """A fit to its misfit, continued to the noise; itself where more than noise is left.
-
-    Raises
-    ------
-    EstimationError
-        If the points are hardly more than the unknowns that they determine.
-    """
-    known = fit.noise.before
-    assert known is not None
-    # Through the scale of the search: at the noise a first step would bend all that is left.
-    near = descend(fit.reweighed(loosened(known, fit.model)), STEPS_OF_A_RIVAL, tolerance=1e-2)
-    if _misfits(near):
-        return fit
-    closely = refine(near.reweighed(known, _first_priors(near)), first=True)
-    return fit if _misfits(closely) else closely
 
 
 # ---- meshes ------------------------------------------------------------------------------------

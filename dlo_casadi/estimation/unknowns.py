@@ -55,6 +55,12 @@ class Unknowns:
         """Number of free parameters."""
         return len(self._used)
 
+    def off_bounds(self, theta: FloatArray) -> FloatArray:
+        """Theta whose parameters that vanish at a bound are one typical change away from it."""
+        vanish = [q.lower == q.nominal and not q.log for q in self._parameters]
+        own = np.array(vanish + [False] * self.n_rest, dtype=bool)
+        return np.where(own & (theta <= self.bounds[0]), theta + 1, theta)
+
     @property
     def n_rest(self) -> int:
         """Number of rest-curvature coefficients."""
@@ -149,9 +155,9 @@ class Unknowns:
         width = [np.log(high / low) if q.log else (high - low) / q.scale for low, high, q in ranges]
         return np.concatenate([np.array(width) / np.sqrt(12), np.full(self.n_rest, np.inf)])
 
-    def reach(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def reach(self, theta: FloatArray, farthest: float = FARTHEST) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bounds of theta after one step: logarithms change by FARTHEST at most."""
-        far = np.where(self._logs, FARTHEST, np.inf)
+        far = np.where(self._logs, farthest, np.inf)
         lower, upper = self.bounds
         return np.maximum(lower, theta - far), np.minimum(upper, theta + far)
 

@@ -1,0 +1,400 @@
+"""Where every fit begins: shapes, forces and parameters at once, the balance of forces a penalty.
+
+    min over theta and of every pose its nodes, multipliers and deviations
+        1/2 sum_j |W_j e_j|^2 + 1/2 sum_j |deviation_j / std|^2
+        + 1/2 (theta - mean)^T P (theta - mean) + 1/2 sum_j |S F_j|^2 / softness^2
+
+F_j is the gradient of the Lagrangian of pose j, S its scale: h / EI for the bending moment that is
+left over at a node, h / GJ for a twisting one, so that S F is the angle [rad] by which the node
+would turn. The measured shapes fix the nodes, in which the balance is linear in forces, loads and
+1 / EI: no equilibrium has to be known, nor a stiffness. The softness then falls to nothing. Where
+the model lacks something it may be held at a size at which the shapes are still those measured:
+what is left over of the balance there is what the model lacks.
+
+References
+----------
+Ramsay et al., Parameter estimation for differential equations: a generalized smoothing approach,
+J. R. Statist. Soc. B 69 (2007).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.effects import Load
+from dlo_casadi.estimation.problem import NO_INFORMATION, Normal, Problem, Values
+from dlo_casadi.estimation.start import EITHER_WAY, measured_shapes
+from dlo_casadi.model.assembly import Inputs, Shapes, Tangents
+from dlo_casadi.model.cable_model import END_ROLL
+from dlo_casadi.rod.band import Vector
+
+# The balance of forces [rad]: twice the noise of the angles between 12 markers of 0.3 mm on 1 m at
+# first, at which any stiffness is found; nothing at last.
+SOFTNESS = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
+# Error of an end condition that counts as a unit of the balance, in lengths or [rad]: below the
+# noise of the shapes at first, so that no step is refused for the curvature of the constraint.
+END = 1 / 30
+# Longest step of a node [rad], and of the logarithm of a stiffness.
+LONGEST, LARGEST = 0.7, 1.0
+# Damping [1/rad] of the nodes at first and at least; unknowns of the fit have a hundredth.
+FIRST_DAMPING, LEAST_DAMPING, OF_UNKNOWNS = 1.0, 0.1, 0.01
+# A step that is refused is tried with ten times the damping, so many times.
+REFUSED = 6
+# Iterations at each softness, and the relative decrease by which one has converged.
+STEPS, CONVERGED = 20, 5e-3
+# Rolls of the end [rad] from which a relaxed start counts twists: each is found from 1.2 rad away.
+FAR_ROLLS = (0.0, 1.2, -1.2, 2.4, -2.4)
+# Softness [rad] at which forces hardly move the measured shapes.
+SHAPES_ALONE = 0.1
+# Iterations that tell these rolls apart, and how many of them are followed.
+FIRST_STEPS, FOLLOWED = 5, 2
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """Triangles of a Gauss-Newton step: of each pose's own unknowns, and what is left for theta."""
+
+    own: list[FloatArray]
+    shared: FloatArray
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """A batch problem whose balance of forces is a penalty of a softness [rad].
+
+    The problem has its weights. A state is carried from pose to pose as the shapes have it; how it
+    changes with them is left out of the derivatives.
+    """
+
+    problem: Problem
+    softness: float
+
+    # ---- sizes -------------------------------------------------------------------------------
+
+    @cached_property
+    def _counts(self) -> tuple[int, int, int, int]:
+        """Numbers of a pose's node increments, of these and multipliers, with deviations, all."""
+        equilibria = self.problem.equilibria
+        a = equilibria.assembly
+        nodes = a.n * a.b
+        own = nodes + a.k + len(equilibria.used_deviations)
+        return nodes, nodes + a.k, own, own + self.problem.unknowns.size
+
+    @cached_property
+    def _stiffness(self) -> NDArray[np.intp]:
+        """Of each node's rows the parameter that scales it: bending or torsional stiffness."""
+        model = self.problem.unknowns.model
+        bending, torsion = model.stiffness_indices[0], model.stiffness_indices[-1]
+        node = model.node
+        kinds = [bending if name in node.curvatures else torsion for name in node.strains]
+        return np.tile(np.array(kinds), model.chain.n_nodes)
+
+    def _weights(self, p: FloatArray) -> FloatArray:
+        """Weights (n b + k,) of the rows of F at these parameters."""
+        model = self.problem.unknowns.model
+        cable = model.cable
+        force = cable.mass * float(np.linalg.norm(model.gravity)) + p[0] / cable.length**2
+        border = []
+        for name in model.border_names:
+            if ".place_" in name:  # the row is a force
+                border.append(1 / force)
+            else:
+                turned = "position" not in name and ".pull_" not in name
+                border.append(1 / END / (1.0 if turned else cable.length))
+        moments = model.chain.h / p[self._stiffness]
+        return np.concatenate([moments, border]) / self.softness
+
+    # ---- evaluation --------------------------------------------------------------------------
+
+    def objectives(self, values: Values) -> tuple[FloatArray, float]:
+        """Twice the objective: what each pose (m,) has in it, and the prior."""
+        problem = self.problem
+        shapes, p, _ = state = problem.state(values)
+        left = problem.equilibria.imbalance(*state).rows[:, :, 0] * self._weights(p)
+        own = shapes.deviation[:, problem.equilibria.used_deviations] / problem.deviation_std
+        each = (left**2).sum(axis=1) + (own**2).sum(axis=1)
+        seen = problem.observed(values)
+        for white, j, s in zip(problem.whitening, problem.used, values.projections, strict=True):
+            each[j] += float(((white @ problem.measured[j].residual(seen[j], s)) ** 2).sum())
+        gap = values.theta - problem.mean
+        return each, float(gap @ problem.precision @ gap)
+
+    def objective(self, values: Values) -> float:
+        """Twice the objective; infinite where it is not a number."""
+        each, prior = self.objectives(values)
+        total = float(each.sum()) + prior
+        return total if np.isfinite(total) else np.inf
+
+    def normal(self, values: Values) -> Normal:
+        """Gauss-Newton normal equations of theta, all of the poses' own unknowns eliminated."""
+        rows = self._reduced(values, 0.0).shared
+        return Normal(rows[:, :-1].T @ rows[:, :-1], -rows[:, :-1].T @ rows[:, -1], [])
+
+    def _along(self, values: Values, given: Inputs) -> Tangents:
+        """Every unknown of a pose on its own, then theta."""
+        problem = self.problem
+        unknowns, equilibria, model = problem.unknowns, problem.equilibria, problem.unknowns.model
+        a, m = equilibria.assembly, equilibria.m
+        nodes, border, own, q = self._counts
+        unit = np.broadcast_to(np.eye(own, q), (m, own, q))
+        deviation = np.zeros((m, len(model.deviation_names), q))
+        deviation[:, equilibria.used_deviations] = unit[:, border:]
+        p = np.zeros((m, len(model.parameters), q))
+        p[:, :, own:] = unknowns.slopes(values.theta)
+        rest = np.zeros((m, model.chain.n_rests, q))
+        rest[:, :, own:] = unknowns.rest_slopes
+        if model.has_state:
+            after = a.state_after(values.shapes, given)
+            still = np.zeros((1, a.n, a.b, q))
+            for j in range(m - 1):
+                one = np.array([j])
+                slopes = tuple(part[one] for part in after)
+                rest[j + 1] = a.state_along(slopes, still, rest[one], p[one])[0]
+        x = unit[:, :nodes].reshape((m, a.n, a.b, q))
+        lam = unit[:, nodes:border] + self._forces(values)[:, :, None] * self._growth(values)
+        return Tangents(x, lam, p, rest, deviation)
+
+    def _forces(self, values: Values) -> FloatArray:
+        """Multipliers and pulls of springs (m, k), which grow with the stiffness; 0 for places."""
+        held = np.array(
+            [".place_" not in name for name in self.problem.unknowns.model.border_names]
+        )
+        return values.shapes.lam * held
+
+    def _growth(self, values: Values) -> FloatArray:
+        """Change (q,) of the logarithm of the bending stiffness along a pose's unknowns and theta.
+
+        All forces grow with it, so that the balance of what is measured stays as it is.
+        """
+        unknowns = self.problem.unknowns
+        bending = unknowns.model.stiffness_indices[0]
+        slope = unknowns.slopes(values.theta)[bending] / unknowns.p(values.theta)[bending]
+        return np.concatenate([np.zeros(self._counts[2]), slope])
+
+    def _reduced(self, values: Values, damping: float, held: BoolArray | None = None) -> _Reduced:
+        """Orthogonal elimination of the poses' own unknowns."""
+        problem = self.problem
+        equilibria, size = problem.equilibria, problem.unknowns.size
+        nodes, border, own, _ = self._counts
+        free = np.ones(size, dtype=bool) if held is None else ~held
+        kept = np.concatenate([np.ones(own, dtype=bool), free])
+        state = problem.state(values)
+        given = equilibria.given(*state)
+        along = self._along(values, given)
+        _, force, matrix = equilibria.assembly.balance(values.shapes, given)
+        still = replace(along, x=np.zeros_like(along.x), lam=np.zeros_like(along.lam))
+        rows = equilibria.assembly.imbalance_by(values.shapes, given, still).rows
+        tangent = matrix.dense()
+        rows[:, :, :nodes] += tangent[:, :, :nodes]
+        rows += tangent[:, :, nodes:] @ along.lam
+        weights, left = self._weights(state[1]), force.rows[:, :, 0]
+        scaled = problem.unknowns.slopes(values.theta)[self._stiffness]
+        scaled = scaled / state[1][self._stiffness, None]
+        rows[:, :nodes, own:] -= left[:, :nodes, None] * scaled
+        rows, left = rows * weights[:, None], left * weights
+        std, used = problem.deviation_std, equilibria.used_deviations
+        prior = np.eye(len(std), own + size, border) / std[:, None]
+        damped = np.eye(border, own + size) * max(damping, NO_INFORMATION)
+        damped[nodes:] *= NO_INFORMATION
+        data = dict(zip(problem.used, self._data(values, along), strict=True))
+        triangles, shared = [], []
+        for j in range(equilibria.m):
+            parts = [(rows[j], left[j]), (prior, values.shapes.deviation[j, used] / std)]
+            parts += [(damped, np.zeros(border))] + ([data[j]] if j in data else [])
+            stacked = np.concatenate([np.column_stack([a[:, kept], -e]) for a, e in parts])
+            triangle: FloatArray = np.asarray(np.linalg.qr(stacked, mode="r"))
+            triangles.append(triangle[:own])
+            shared.append(triangle[own:, own:])
+        root, gap = self._prior, values.theta - problem.mean
+        shared.append(np.column_stack([root[:, free], -root @ gap]))
+        more = OF_UNKNOWNS * damping * np.eye(int(free.sum()))
+        shared.append(np.column_stack([more, np.zeros(len(more))]))
+        left_over: FloatArray = np.asarray(np.linalg.qr(np.concatenate(shared), mode="r"))
+        return _Reduced(triangles, left_over)
+
+    def _data(self, values: Values, along: Tangents) -> list[tuple[FloatArray, FloatArray]]:
+        """Whitened derivatives and residuals of each fitted pose."""
+        found = self.problem.residuals(values, along)
+        whites = self.problem.whitening
+        return [(w @ change, w @ e) for w, (e, change) in zip(whites, found, strict=True)]
+
+    @cached_property
+    def _prior(self) -> FloatArray:
+        """Root of the prior's precision."""
+        sizes, vectors = np.linalg.eigh(self.problem.precision)
+        return np.asarray(np.sqrt(np.maximum(sizes, 0.0))[:, None] * vectors.T)
+
+    # ---- solution ----------------------------------------------------------------------------
+
+    def solve(self, values: Values, held: BoolArray | None = None, steps: int = STEPS) -> Values:
+        """Levenberg-Marquardt from any values.
+
+        Parameters
+        ----------
+        held : (size,) bool, optional
+            Entries of theta that stay where they are; none by default.
+        """
+        damping, least = FIRST_DAMPING, self.objective(values)
+        for _ in range(steps):
+            found, reached = values, np.inf
+            for _ in range(REFUSED):
+                try:
+                    found = self._stepped(values, damping, held)
+                    reached = self.objective(found)
+                except np.linalg.LinAlgError:
+                    reached = np.inf
+                if reached < least:
+                    break
+                damping *= 10
+            if not reached < least:
+                break
+            gain, values, least = least - reached, found, reached
+            damping = max(damping / 10, LEAST_DAMPING)
+            if gain < CONVERGED * reached:
+                break
+        return values
+
+    def _stepped(self, values: Values, damping: float, held: BoolArray | None) -> Values:
+        """Values after a damped step within reach."""
+        problem = self.problem
+        unknowns, equilibria = problem.unknowns, problem.equilibria
+        nodes, border, own, _ = self._counts
+        free = np.ones(unknowns.size, dtype=bool) if held is None else ~held
+        reduced = self._reduced(values, damping, held)
+        lower, upper = unknowns.reach(values.theta, LARGEST)
+        step = np.zeros(unknowns.size)
+        lower, upper = lower - values.theta, upper - values.theta
+        step[free] = _bounded(reduced.shared, lower[free], upper[free])
+        m = equilibria.m
+        change = np.zeros((m, own))
+        for j, triangle in enumerate(reduced.own):
+            right = triangle[:, -1] - triangle[:, own:-1] @ step[free]
+            change[j] = np.linalg.solve(triangle[:, :own], right)
+        turned = change[:, :nodes]
+        turned *= min(1.0, LONGEST / max(float(np.abs(turned).max()), 1e-300))
+        x = turned.reshape((m, *values.shapes.x.shape[1:2], -1, 1))
+        deviation = values.shapes.deviation.copy()
+        deviation[:, equilibria.used_deviations] += change[:, border:]
+        forces = change[:, nodes:border] + self._forces(values) * (
+            self._growth(values)[own:] @ step
+        )
+        shapes = equilibria.moved(values.shapes, Vector(x, forces[:, :, None]))
+        shapes = replace(shapes, deviation=deviation)
+        moved = Values(values.theta + step, shapes, values.projections)
+        return replace(moved, projections=problem.located(moved, problem.observed(moved)))
+
+
+def _bounded(rows: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """Least squares of stacked rows, their target last, within bounds."""
+    step = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-12)[0]
+    if np.all(step >= lower) and np.all(step <= upper):
+        return np.asarray(step)
+    low = np.minimum(lower, 0.0)
+    high = np.maximum(np.maximum(upper, 0.0), low + 1e-12)
+    return np.asarray(lsq_linear(rows[:, :-1], rows[:, -1], (low, high), method="bvls").x)
+
+
+def relaxed(
+    problem: Problem,
+    values: Values,
+    softness: Sequence[float] = SOFTNESS,
+    held: BoolArray | None = None,
+) -> Values:
+    """Follow the minimum of a relaxed problem from some values through falling softness."""
+    for soft in softness:
+        values = Relaxation(problem, soft).solve(values, held)
+    return values
+
+
+def hung(problem: Problem, values: Values) -> Values:
+    """Values whose springs, which need not pull yet, are where they hang on the cable."""
+    model = problem.unknowns.model
+    loads = [effect for effect in model.effects if isinstance(effect, Load)]
+    springs = [effect for effect in loads for _ in range(effect.n_springs)]
+    if not springs:
+        return values
+    p, lam = problem.unknowns.p(values.theta), values.shapes.lam.copy()
+    seen = problem.observed(values)
+    for k, effect in enumerate(springs):
+        place = p[[model.names.index(f"{effect.label}.position")]]
+        names = [f"spring_{k}.place_{axis}" for axis in model.node.axes]
+        columns = [model.border_names.index(name) for name in names]
+        lam[:, columns] = [one.curve.at(place)[0] for one in seen]
+    return replace(values, shapes=replace(values.shapes, lam=lam))
+
+
+def begin(problem: Problem, theta: FloatArray) -> tuple[Problem, Values]:
+    """Relaxed shapes, forces and unknowns along the measured lines, and the problem weighed there.
+
+    In space no line shows how the cable is turned in its end clamp: rolls are tried in turn, then
+    poses twisted by more than a quarter of a turn the other way round.
+
+    Parameters
+    ----------
+    theta : (size,)
+        Where the unknowns start; any stiffness will do.
+    """
+    names, unknowns = problem.unknowns.names, problem.unknowns
+    own = names.index(END_ROLL) if END_ROLL in names else None
+    if problem.weights is None:
+        problem = _weighed(problem, theta)
+    begun: list[tuple[float, Values]] = []
+    relaxation = Relaxation(problem, SOFTNESS[0])
+    for roll in (0.0,) if own is None else FAR_ROLLS:
+        rolled = theta.copy()
+        if own is not None:
+            rolled[own] += roll / unknowns.scales[own]
+        values = hung(problem, Values(rolled, *measured_shapes(problem, roll)))
+        values = relaxation.solve(values, steps=FIRST_STEPS)
+        begun.append((relaxation.objective(values), values))
+    likely = sorted(begun, key=lambda start: start[0])[:FOLLOWED]
+    found = [relaxation.solve(values) for _, values in likely]
+    return problem, _relaxed_either_way(problem, min(found, key=relaxation.objective))
+
+
+def _weighed(problem: Problem, theta: FloatArray) -> Problem:
+    """The problem weighed; noise that is not declared at least as large as what shapes leave."""
+    values = hung(problem, Values(theta, *measured_shapes(problem)))
+    problem = problem.weighed(values)
+    if problem.noise.known:
+        return problem
+    values = Relaxation(problem, SHAPES_ALONE).solve(values, steps=FIRST_STEPS)
+    left = problem.evaluate(values).data / problem.n_residuals
+    noise = problem.noise.doubted(problem.noise.std * np.sqrt(left))
+    return replace(problem, noise=noise).weighed(values)
+
+
+def _relaxed_either_way(problem: Problem, values: Values) -> Values:
+    """Values whose poses are twisted the other way round where that leaves less of the balance.
+
+    Where the end clamp is rolled by nearly half a turn and the pose does not tell its turns, the
+    twist nearest to none may be either way round within what is known of the roll.
+    """
+    model, measured = problem.unknowns.model, problem.measured
+    twist = model.node.turning(values.shapes.x)
+    asked = [j for j in problem.used if abs(twist[j]) > EITHER_WAY and not measured[j].pose.turns]
+    if not asked:
+        return values
+    p, names = problem.unknowns.p(values.theta), model.names
+    roll = float(p[names.index(END_ROLL)]) if END_ROLL in names else 0.0
+    relaxation, held = Relaxation(problem, SOFTNESS[0]), np.ones(len(values.theta), dtype=bool)
+    shapes, projections = measured_shapes(problem, roll, -np.sign(twist) / 2)
+    other = relaxation.solve(Values(values.theta, shapes, projections), held)
+    lefts = [relaxation.objectives(one)[0] for one in (values, other)]
+    turned = [j for j in asked if lefts[1][j] < lefts[0][j]]
+    parts = [values.shapes.x.copy(), values.shapes.lam.copy(), values.shapes.deviation.copy()]
+    new = other.shapes.x, other.shapes.lam, other.shapes.deviation
+    for mine, theirs in zip(parts, new, strict=True):
+        mine[turned] = theirs[turned]
+    places = [
+        other.projections[k] if j in turned else s
+        for k, (j, s) in enumerate(zip(problem.used, values.projections, strict=True))
+    ]
+    return Values(values.theta, Shapes(*parts), places)

@@ -1,0 +1,107 @@
+"""A relaxed balance along the measured shapes: any stiffness, roll and twist."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.effects import Cable
+from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.problem import Priors, Problem
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, begin, relaxed
+from dlo_casadi.estimation.start import measured_shapes
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
+
+CABLE = Cable(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03)
+HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
+ROLL, OFF, TURNED = -2.3, 0.5, (3.4, 2.2, 1.2, 0.1, -1.1, -2.1)
+
+
+REST = (1.2, 0.5, 0.8, -0.3)
+MODEL = CableModel(CABLE, 8, "quadratic", n_rest=2, **HELD)
+
+
+def problem_of(roll: float, std: float = 5e-4) -> tuple[Problem, np.ndarray]:
+    """Poses of a cable with a roll, twisted by up to more than half a turn, and its parameters."""
+    p = MODEL.nominal.copy()
+    p[MODEL.names.index(END_ROLL)] = roll
+    rest = MODEL.rest_basis @ np.array(REST)
+    rng = np.random.default_rng(1)
+    s = np.linspace(0.02, 0.98, 12) * CABLE.length
+    measured = []
+    for turned in TURNED:
+        end = Rotation.from_rotvec([0.0, *rng.uniform(-0.3, 0.3, 2)])
+        end *= Rotation.from_rotvec([turned - roll, 0.0, 0.0])
+        place = (rng.uniform(0.8, 0.9) * CABLE.length, *rng.uniform(-0.1, 0.1, 2))
+        frames = {
+            "start_orientation": (0.0, 0.0, 0.0, 1.0),
+            "end_orientation": tuple(end.as_quat()),
+        }
+        pose = Pose((0.0, 0.0, 0.0), place, **frames)
+        (shape,) = predict_poses(MODEL, p, rest, [pose])
+        points = shape.curve.at(s) + rng.normal(scale=std, size=(len(s), 3))
+        measured.append(MeasuredPose.of_points(pose, points, s=s))
+    unknowns = Unknowns(MODEL, np.ones(len(p), dtype=bool), MODEL.nominal)
+    priors = Priors.of(Tolerances(), MODEL)
+    return Problem(unknowns, tuple(measured), NoiseModel(max(std, 1e-5)), priors), p
+
+
+@pytest.fixture(scope="module")
+def rolled():
+    """A cable rolled by 2.3 rad, seen by markers."""
+    return problem_of(ROLL)
+
+
+@pytest.mark.parametrize("factor", [0.05, 1.0, 20.0])
+def test_stiffness_roll_and_twists_are_found_from_any_stiffness(rolled, factor):
+    """Within their standard deviations, from a stiffness 20 times off and a roll of none."""
+    problem, true = rolled
+    values = MODEL.nominal.copy()
+    values[MODEL.stiffness_indices] *= factor
+    theta = problem.unknowns.pack(values, np.zeros(MODEL.n_coefficients))
+    weighed, found = begin(problem, theta)
+    p = problem.unknowns.p(relaxed(weighed, found, SOFTNESS[1:]).theta)
+
+    assert p[0] == pytest.approx(true[0], rel=0.05)
+    assert p[MODEL.names.index(END_ROLL)] == pytest.approx(ROLL, abs=0.1)
+    twist = MODEL.node.turning(measured_shapes(problem, ROLL)[0].x)
+    np.testing.assert_allclose(MODEL.node.turning(found.shapes.x), twist, atol=0.5)
+
+
+def test_without_softness_left_the_shapes_are_equilibria(rolled):
+    """Newton's method moves no node by more than a hundredth of a radian any more."""
+    problem, true = rolled
+    start = problem.unknowns.pack(true, np.zeros(MODEL.n_coefficients))
+    weighed, found = begin(problem, start)
+    found = relaxed(weighed, found)
+    point = weighed.balanced(found)
+    way = MODEL.node.difference(found.shapes.x, point.shapes.x)
+    assert np.abs(way).max() < 0.01
+
+
+def test_normal_equations_are_those_of_differences(rolled):
+    """The gradient by the unknowns, everything of the poses' own at its minimum (Danskin)."""
+    problem, true = rolled
+    start = problem.unknowns.pack(true, np.zeros(MODEL.n_coefficients))
+    weighed, values = begin(problem, start)
+    held = np.ones(len(start), dtype=bool)
+    relaxation = Relaxation(weighed, SOFTNESS[0])
+    values = replace(values, theta=values.theta + 0.02)
+    for _ in range(5):
+        values = relaxation.solve(values, held, steps=40)
+    gradient = relaxation.normal(values).gradient
+    step, differences = 1e-4, []
+    for k in range(len(start)):
+        sides = []
+        for sign in (1, -1):
+            theta = values.theta.copy()
+            theta[k] += sign * step
+            sides.append(relaxation.objective(replace(values, theta=theta)) / 2)
+        differences.append((sides[0] - sides[1]) / (2 * step))
+    scale = np.abs(gradient).max()
+    np.testing.assert_allclose(gradient / scale, np.array(differences) / scale, atol=0.02)
