@@ -1,14 +1,14 @@
 """From a candidate to a fit with it: where it starts, the refit, and how it compares.
 
-A refit starts from the candidate's one-step estimate at the minimum without it; or, where that
-model has gone far astray and no effect can be followed from its shapes, from one of two others.
+A refit starts from the candidate's one-step estimate at the minimum without it. Where the shapes
+there are too far from the measured ones to follow any effect, it starts in two other ways.
 
 An unknown force has found shapes that fit, and in every pose a force f_j at one place r_j of the
 cable; a load is its cause if its own law gives these forces. All are linear in their parameters
 once the place is known (a tether in k and k a: f = k a - k r): least squares tell where to start.
 
-Or the fit begins at the measured shapes: relaxed, see `estimation.relaxation`, it needs no
-equilibrium, and what is left over of its balance of forces tells which effect is missing.
+Or the fit begins at the measured shapes with the balance of forces relaxed, which needs no
+equilibrium, see `estimation.relaxation`. The imbalance tells which effect is missing.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ PROMISED = 0.5
 # Starts whose objectives end so near to one another have led to one place, and smaller shares begin
 # nearer to the base still. Reports of eighteen sessions were the same without that limit.
 ONE_PLACE = 1.0
-# Softness [rad] at which a relaxed model is scored, and the residual over the noise up to which its
-# shapes are those measured: what is left over of the balance tells what is missing there.
+# Softness [rad] at which candidates may be scored; largest sum of squares per residual at which the
+# relaxed shapes still count as the measured ones.
 SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
-# Residual over the noise at which a start has reached the noise.
+# Largest sum of squares per residual at which a start counts as having reached the noise.
 REACHED = 1.5
 # Gauss-Newton steps of one refit, and of one from forces that scatter from pose to pose.
 MOST_STEPS, STEPS_FROM_FORCES = 25, 60

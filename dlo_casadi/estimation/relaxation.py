@@ -35,25 +35,25 @@ from dlo_casadi.model.assembly import Inputs, Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL
 from dlo_casadi.rod.band import Vector
 
-# The balance of forces [rad]: twice the noise of the angles between 12 markers of 0.3 mm on 1 m at
-# first, at which any stiffness is found; nothing at last.
+# Softness of the balance [rad], from first to last. The first is twice the noise of the angles
+# between 12 markers of 0.3 mm on 1 m; the last leaves equilibria to Newton's method.
 SOFTNESS = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
-# Error of an end condition that counts as a unit of the balance, in lengths or [rad]: below the
-# noise of the shapes at first, so that no step is refused for the curvature of the constraint.
+# Error of an end condition that weighs as much as a unit of the balance, in lengths or [rad]. With
+# 1e-5 instead, whatever the softness, steps were refused because the conditions are curved.
 END = 1 / 30
-# Longest step of a node [rad], and of the logarithm of a stiffness.
+# Longest step of a node [rad]; largest change of the logarithm of a stiffness in one step.
 LONGEST, LARGEST = 0.7, 1.0
-# Damping [1/rad] of the nodes at first and at least; unknowns of the fit have a hundredth.
+# First and smallest damping of the nodes [1/rad]; share of it for the unknowns of the fit.
 FIRST_DAMPING, LEAST_DAMPING, OF_UNKNOWNS = 1.0, 0.1, 0.01
-# A step that is refused is tried with ten times the damping, so many times.
+# Maximum number of trials of a step, each with ten times the damping of the one before.
 REFUSED = 6
-# Iterations at each softness, and the relative decrease by which one has converged.
+# Maximum number of iterations at each softness; relative decrease below which they end.
 STEPS, CONVERGED = 20, 5e-3
-# Rolls of the end [rad] from which a relaxed start counts twists: each is found from 1.2 rad away.
+# Rolls of the end [rad] that are tried first. Rolls 1.2 rad away from a trial were found.
 FAR_ROLLS = (0.0, 1.2, -1.2, 2.4, -2.4)
 # Softness [rad] at which forces hardly move the measured shapes.
 SHAPES_ALONE = 0.1
-# Iterations that tell these rolls apart, and how many of them are followed.
+# Iterations for each of these rolls; number of rolls that are continued.
 FIRST_STEPS, FOLLOWED = 5, 2
 
 
