@@ -19,24 +19,24 @@ from dlo_casadi.sensing.noise import NoiseModel
 
 CABLE = Cable(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03)
 HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
-ROLL, OFF, TURNED = -2.3, 0.5, (3.4, 2.2, 1.2, 0.1, -1.1, -2.1)
+ROLL, NOISE, TURNED = -2.3, 5e-4, (3.4, 2.2, 1.2, 0.1, -1.1, -2.1)
 
 
 REST = (1.2, 0.5, 0.8, -0.3)
 MODEL = CableModel(CABLE, 8, "quadratic", n_rest=2, **HELD)
 
 
-def problem_of(roll: float, std: float = 5e-4) -> tuple[Problem, np.ndarray]:
-    """Poses of a cable with a roll, twisted by up to more than half a turn, and its parameters."""
+def problem_of(marked: bool = True) -> tuple[Problem, np.ndarray]:
+    """Poses of a rolled cable, twisted by up to more than half a turn, and its parameters."""
     p = MODEL.nominal.copy()
-    p[MODEL.names.index(END_ROLL)] = roll
+    p[MODEL.names.index(END_ROLL)] = ROLL
     rest = MODEL.rest_basis @ np.array(REST)
     rng = np.random.default_rng(1)
     s = np.linspace(0.02, 0.98, 12) * CABLE.length
     measured = []
     for turned in TURNED:
         end = Rotation.from_rotvec([0.0, *rng.uniform(-0.3, 0.3, 2)])
-        end *= Rotation.from_rotvec([turned - roll, 0.0, 0.0])
+        end *= Rotation.from_rotvec([turned - ROLL, 0.0, 0.0])
         place = (rng.uniform(0.8, 0.9) * CABLE.length, *rng.uniform(-0.1, 0.1, 2))
         frames = {
             "start_orientation": (0.0, 0.0, 0.0, 1.0),
@@ -44,17 +44,17 @@ def problem_of(roll: float, std: float = 5e-4) -> tuple[Problem, np.ndarray]:
         }
         pose = Pose((0.0, 0.0, 0.0), place, **frames)
         (shape,) = predict_poses(MODEL, p, rest, [pose])
-        points = shape.curve.at(s) + rng.normal(scale=std, size=(len(s), 3))
-        measured.append(MeasuredPose.of_points(pose, points, s=s))
+        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 3))
+        measured.append(MeasuredPose.of_points(pose, points, s=s if marked else None))
     unknowns = Unknowns(MODEL, np.ones(len(p), dtype=bool), MODEL.nominal)
     priors = Priors.of(Tolerances(), MODEL)
-    return Problem(unknowns, tuple(measured), NoiseModel(max(std, 1e-5)), priors), p
+    return Problem(unknowns, tuple(measured), NoiseModel(NOISE), priors), p
 
 
 @pytest.fixture(scope="module")
 def rolled():
     """A cable rolled by 2.3 rad, seen by markers."""
-    return problem_of(ROLL)
+    return problem_of()
 
 
 @pytest.mark.parametrize("factor", [0.05, 1.0, 20.0])

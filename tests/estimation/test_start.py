@@ -5,47 +5,21 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from test_relaxation import ROLL, problem_of
 
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
 from dlo_casadi.estimation import start as starting_points
-from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.start import Guess, measured_shapes, turned_either_way
-from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel, Tolerances
-from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES
 from dlo_casadi.sensing.noise import NoiseModel
 
-CABLE = Cable(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03)
-HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
-ROLL, OFF, TURNED = -2.3, 0.5, (3.4, 2.2, 1.2, 0.1, -1.1, -2.1)
+OFF = 0.5
 
 
 def test_twists_are_turned_the_way_that_fits():
     """Beside a roll that is off by 0.5 rad, that nearest to none of one pose is the wrong one."""
-    model = CableModel(CABLE, 8, "quadratic", n_rest=2, **HELD)
-    p = model.nominal.copy()
-    p[model.names.index(END_ROLL)] = ROLL
-    rest = model.rest_basis @ np.array([1.2, 0.5, 0.8, -0.3])
-    rng = np.random.default_rng(1)
-    s = np.linspace(0.02, 0.98, 12) * CABLE.length
-    measured = []
-    for turned in TURNED:
-        end = Rotation.from_rotvec([0.0, *rng.uniform(-0.3, 0.3, 2)])
-        end *= Rotation.from_rotvec([turned - ROLL, 0.0, 0.0])
-        place = (rng.uniform(0.8, 0.9) * CABLE.length, *rng.uniform(-0.1, 0.1, 2))
-        frames = {
-            "start_orientation": (0.0, 0.0, 0.0, 1.0),
-            "end_orientation": tuple(end.as_quat()),
-        }
-        pose = Pose((0.0, 0.0, 0.0), place, **frames)
-        (shape,) = predict_poses(model, p, rest, [pose])
-        points = shape.curve.at(s) + rng.normal(scale=5e-4, size=(len(s), 3))
-        measured.append(MeasuredPose.of_points(pose, points))
-    unknowns = Unknowns(model, np.ones(len(p), dtype=bool), model.nominal)
-    problem = Problem(unknowns, measured, NoiseModel(3e-3), Priors.of(Tolerances(), model))
+    problem, p = problem_of(marked=False)
+    problem = replace(problem, noise=NoiseModel(3e-3))
+    unknowns, model = problem.unknowns, problem.unknowns.model
 
     roll = ROLL + OFF
     theta = unknowns.pack(p, np.zeros(model.n_coefficients))
