@@ -1,4 +1,4 @@
-"""Draw the pictures of the README: python scripts/draw_docs.py (two minutes)."""
+"""Draw the pictures of the documentation: python scripts/draw_docs.py (two minutes)."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import dlo_casadi as dlo
 from dlo_casadi.session.measure import draw_steps
 
 ROOT = Path(__file__).parents[1]
-PICTURES = ROOT / ".readme"
+PICTURES = ROOT / "docs/pages/pictures"
 TITLES = {
     "1_workplane": "1 the board's plane, within reach of the cable",
     "2_contrast": "2 what stands out in the colour of the cable",

@@ -1,12 +1,10 @@
 """The README: its Python code runs word for word, its pictures and files are there."""
 
 import re
-import runpy
 from pathlib import Path
 
 import pytest
 
-import dlo_casadi
 from dlo_casadi.cli import COMMANDS
 from dlo_casadi.config import dump_yaml, read_yaml
 
@@ -62,15 +60,3 @@ def test_every_subcommand_that_is_named_exists():
     named = set(re.findall(r"(?:^|bin/|`)dlo ([a-z][a-z-]+)", README, re.MULTILINE))
     assert {"new", "check", "fit", "predict"} < named
     assert named < set(COMMANDS)
-
-
-def test_the_pages_of_the_api_are_built(tmp_path, monkeypatch, capsys):
-    """Without a warning, since pytest makes errors of them."""
-    script = runpy.run_path(str(ROOT / "scripts/build_api_pages.py"))
-    monkeypatch.setitem(script["main"].__globals__, "FOLDER", tmp_path)
-    for name in dlo_casadi.__all__:  # the script leaves them in the module
-        monkeypatch.setattr(dlo_casadi, name, getattr(dlo_casadi, name), raising=False)
-    script["main"]()
-    page = (tmp_path / "dlo_casadi.html").read_text()
-    assert "Fit a cable to its photographs or centre-lines." in page
-    assert all(f'id="{name}"' in page for name in dlo_casadi.__all__)

@@ -13,14 +13,14 @@ class LumpedMass(PointLoad):
 
         V = -m g . r(s)                                               [J]
 
+    Its own size and moment of inertia are neglected: good while it is shorter than L / 10.
+
     Parameters
     ----------
     mass : scalar [kg], >= 0
         Vanishes at 0; at most three times the cable's mass.
     position : scalar [m], in [0, L]
         Arc length s from the start fixture. r(s) is once differentiable in s.
-
-    Its own size and moment of inertia are neglected: good while it is shorter than L / 10.
 
     References
     ----------

@@ -80,15 +80,15 @@ def measure_views(
 ) -> Views:
     """Measure a cable in photographs from several places: the line in each, and in space.
 
+    Nothing is raised for a photograph that cannot be used: `problems` names it, and the others
+    are used. One photograph alone gives no line.
+
     Parameters
     ----------
     photographs : dict of str to (H, W, 3) uint8
         Pictures of one pose by their names: one `camera` took them all, each shows the `board`.
     cable : KnownCable
         Its fixtures, (3,) [m] each, and its size.
-
-    Nothing is raised for a photograph that cannot be used: `problems` names it, and the others
-    are used. One photograph alone gives no line.
     """
     problems: dict[str, str] = {}
     curves: dict[str, ImageCurve] = {}
