@@ -1,17 +1,166 @@
-"""The documentation: all that is public has its place in it."""
+"""The documentation: its code runs, its commands parse, its pictures and files are there."""
 
+import argparse
 import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
-import dlo_casadi
+import pytest
 
-PAGES = Path(__file__).parents[1] / "docs/pages"
+import dlo_casadi as dlo
+from dlo_casadi.cli import COMMANDS, main
+from dlo_casadi.config import dump_yaml, read_yaml
+from dlo_casadi.config.document import Document
+from dlo_casadi.config.sections import File
+
+ROOT = Path(__file__).parents[1]
+PAGES = ROOT / "docs/pages"
+TEXTS = {
+    str(page.relative_to(ROOT)): page.read_text()
+    for page in (ROOT / "README.md", *sorted(PAGES.rglob("*.md")))
+}
+SESSION = ROOT / "tests/data/bench/short_clean/session.yaml"
+
+
+def blocks(text, language):
+    """Code blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def having(language):
+    return [name for name, text in TEXTS.items() if blocks(text, language)]
+
+
+def commands(text):
+    """Command lines of a page, without comments and continuations."""
+    lines = "".join(blocks(text, "(?:shell|bash)")).replace("\\\n", "").splitlines()
+    return [shlex.split(part, comments=True) for line in lines for part in line.split("&&")]
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A folder in which configs/cable.yaml is a quick session that has been fitted once."""
+    folder = tmp_path_factory.mktemp("bench")
+    data = read_yaml(SESSION)
+    poses = data["experiment"]["poses"][:5]
+    for pose in poses:
+        pose["file"] = str(SESSION.parent / pose["file"])
+    data["experiment"]["poses"] = poses
+    data |= {"model": {"n": 12}, "estimation": {"algorithm1": False}}
+    data["diagnosis"] = {"enabled": False}
+    (folder / "configs").mkdir()
+    (folder / "configs/cable.yaml").write_text(dump_yaml(data))
+    result = dlo.fit(folder / "configs/cable.yaml")
+    result.write(folder / "results/cable")
+    return folder, result
+
+
+@pytest.mark.parametrize("page", having("python"))
+def test_python_runs_from_top_to_bottom(page, bench, monkeypatch):
+    folder, result = bench
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(dlo, "fit", lambda config: {"configs/cable.yaml": result}[config])
+    monkeypatch.setattr("dlo_casadi.effects.EFFECTS", dict(dlo.EFFECTS))
+    names = {"__name__": page}
+    sys.modules[page] = type(sys)(page)  # where dataclasses look up the names of their types
+    for block in blocks(TEXTS[page], "python"):
+        exec(block, names)
+    del sys.modules[page]
+
+
+@pytest.mark.parametrize("page", having("(?:shell|bash)"))
+def test_commands_are_understood(page, monkeypatch):
+    """By the parsers of the commands and scripts themselves, which then go no further."""
+    parse = argparse.ArgumentParser.parse_args
+
+    def parse_only(parser, *given, **options):
+        parse(parser, *given, **options)
+        raise SystemExit(0)
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
+    for words in commands(TEXTS[page]):
+        if not words:
+            continue
+        program = Path(words[0]).name
+        if program == "dlo":
+            assert words[1] in COMMANDS
+            arguments = words[1:]
+            with pytest.raises(SystemExit) as left:
+                main(arguments)
+            assert left.value.code == 0, words
+        elif program == "python" and words[1].startswith("scripts/"):
+            script = ROOT / words[1]
+            monkeypatch.setattr(sys, "argv", words[1:])
+            monkeypatch.syspath_prepend(script.parent)
+            with pytest.raises(SystemExit) as left:
+                runpy.run_path(str(script), run_name="__main__")
+            needs_a_package = "Try: pip install" in str(left.value.code)
+            assert left.value.code == 0 or needs_a_package, words
+
+
+@pytest.mark.parametrize("page", having("yaml"))
+def test_yaml_is_a_configuration_or_a_part_of_one(page, tmp_path):
+    whole = read_yaml(SESSION)
+    for block in blocks(TEXTS[page], "yaml"):
+        (tmp_path / "part.yaml").write_text(block)
+        part = read_yaml(tmp_path / "part.yaml")
+        experiment = whole["experiment"] | part.get("experiment", {})
+        (tmp_path / "whole.yaml").write_text(dump_yaml(whole | part | {"experiment": experiment}))
+        Document.read(tmp_path / "whole.yaml").checked(File)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_c_compiles_and_runs(bench, tmp_path, monkeypatch):
+    folder, _ = bench
+    monkeypatch.chdir(folder)
+    main(["generate-solver", "results/cable", "--output", str(tmp_path), "--quiet"])
+    (program,) = blocks(TEXTS["docs/pages/how-to/planner.md"], "c")
+    (tmp_path / "program.c").write_text(program)
+    command = [
+        "cc",
+        "-std=c99",
+        "-Wall",
+        "-Wextra",
+        "-pedantic",
+        "-Werror",
+        "program.c",
+        "dlo_solver.c",
+    ]
+    subprocess.run([*command, "-o", "program", "-lm"], cwd=tmp_path, check=True)
+    said = subprocess.run([tmp_path / "program"], check=True, capture_output=True, text=True)
+    force = dlo.predict("results/cable", end=(0.3, -0.1)).equilibrium.lam
+    assert said.stdout == f"end force {force[0]:.3f} {force[1]:.3f} N\n"
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_pictures_have_a_description_and_are_small(page):
+    for alt, target in re.findall(r"!\[([^\]]*)\]\(([^)]+)\)", TEXTS[page]):
+        assert len(alt) > 30, f"{target}: describe it for those who cannot see it"
+        assert (ROOT / page).parent.joinpath(target).stat().st_size <= 200_000
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_files_that_are_named_exist(page):
+    named = set(re.findall(r"`((?:scripts|configs|tests|dlo_casadi)/[\w/]+\.\w+)", TEXTS[page]))
+    assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
+
+
+def test_every_effect_has_its_section_and_picture():
+    sections = "\n".join(text for page, text in TEXTS.items() if "/effects/" in page)
+    for name, kind in dlo.EFFECTS.items():
+        assert re.search(rf"^## {name}$", sections, re.MULTILINE)
+        assert f"]({name}.svg)" in sections
+        assert f"::: {kind.__module__}.{kind.__name__}\n" in sections
 
 
 def test_every_public_name_has_its_entry():
-    entries = "\n".join(page.read_text() for page in (PAGES / "api").glob("*.md"))
+    entries = "\n".join(text for page, text in TEXTS.items() if "/api/" in page)
     objects = set(re.findall(r"^::: (\S+)$", entries, re.MULTILINE))
-    for name in dlo_casadi.__all__:
-        public = getattr(dlo_casadi, name)
+    for name in dlo.__all__:
+        public = getattr(dlo, name)
         home = getattr(public, "__module__", None)
         assert home is None or {f"{home}.{name}", home} & objects, f"::: {home}.{name}"

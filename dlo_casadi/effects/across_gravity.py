@@ -49,7 +49,8 @@ class SideLoad(LoadAcrossGravity):
 
     Parameters
     ----------
-    force_per_length; in space force_per_length_x, force_per_length_y : scalar [N/m]
+    force_per_length : scalar [N/m]
+        In space two, force_per_length_x and force_per_length_y.
         Vanish at 0; at most half the cable's weight on Earth.
     """
 
@@ -86,8 +87,9 @@ class GravityTilt(LoadAcrossGravity):
 
     Parameters
     ----------
-    angle; in space angle_x, angle_y (or x, z; y, z) : scalar [rad]
-        Counter-clockwise; vanish at 0; at most half a radian.
+    angle : scalar [rad]
+        In space two, angle_x and angle_y (or x, z; y, z). Counter-clockwise;
+        vanish at 0; at most half a radian.
     """
 
     name = "gravity_tilt"

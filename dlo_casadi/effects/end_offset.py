@@ -15,8 +15,8 @@ class EndOffset(BoundaryEffect):
 
     Parameters
     ----------
-    dx, dy (, dz) : scalar [m]
-        Vanish at 0.
+    dx, dy, dz : scalar [m]
+        Vanish at 0; dz in space alone.
     """
 
     name = "end_offset"

@@ -13,8 +13,9 @@ class PointForce(PointLoad):
 
     Parameters
     ----------
-    fx, fy (, fz) : scalar [N]
-        In the board frame; vanishes at 0; at most three times the cable's weight on Earth.
+    fx, fy, fz : scalar [N]
+        In the board frame, fz in space alone; vanishes at 0; at most
+        three times the cable's weight on Earth.
     position : scalar [m], in [0, L]
         Arc length from the start fixture.
     """
@@ -42,7 +43,7 @@ class UnknownPull(PointLoad):
 
     Parameters
     ----------
-    fx, fy (, fz) : scalar [N]
+    fx, fy, fz : scalar [N]
         Mean over the poses, at most ten weights; f_j is the deviation of pose j from it.
     position : scalar [m], in [0, L]
     """

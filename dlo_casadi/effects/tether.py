@@ -27,8 +27,9 @@ class Tether(PointLoad):
         Vanishes at 0; at most a thousand of the cable's weights on Earth per length.
     position : scalar [m], in [0, L]
         Arc length s from the start fixture. r(s) is once differentiable in s.
-    anchor_x, anchor_y (, anchor_z) : scalar [m]
-        The fixed point a in the board frame, at most ten lengths of the cable from its origin.
+    anchor_x, anchor_y, anchor_z : scalar [m]
+        The fixed point a in the board frame, anchor_z in space alone; at most
+        ten lengths of the cable from its origin.
     """
 
     name = "tether"
