@@ -8,6 +8,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.symbolic import pose_size
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import EndConditions
@@ -217,11 +218,6 @@ def _floats(shapes: dict[str, tuple[int, ...]]) -> list[Any]:
 
 def _record(*fields: list[Any]) -> np.dtype[Any]:
     return np.dtype([field for part in fields for field in part], align=True)
-
-
-def pose_size(model: CableModel) -> int:
-    """Size of dlo_pose: both ends and, in space, `turns`, which headings contain in a plane."""
-    return EndConditions.size(model.node) + int(model.in_space)
 
 
 def pose_table(

@@ -145,6 +145,31 @@ class Functions:
         return self._of_ends("at_ends", self.terms.ends_lagrangian, gradient, hessian)
 
     @cached_property
+    def end_slope(self) -> ca.Function:
+        """As `at_ends` -> its gradient alone."""
+        return self._of_ends("end_slope", ca.gradient(self.terms.ends_lagrangian, self._by))
+
+    @cached_property
+    def end_shape(self) -> ca.Function:
+        """As `at_ends` -> Lagrangian of the ends, forces on both holders and moments on clamps.
+
+        Forces (dimension, 2) [N] and moments (increment, 2) [N m] are those of `Equilibrium`.
+        """
+        node, rows = self.node, reaction_rows(self.node)
+        forces = [self._reactions[rows[f"{side}_force"]] for side in ("start", "end")]
+        lam = (self.terms.lam[k] for k in range(self.model.n_border))
+        known = dict(zip(self.model.border_names, lam, strict=True))
+        frames = zip(("start", "end"), ca.vertsplit(self.terms.x, node.coordinates), strict=True)
+        moments = [
+            node.to_world(
+                x, ca.vertcat(*(known.get(f"{side}_{turn}", ca.SX(0)) for turn in node.turns))
+            )
+            for side, x in frames
+        ]
+        value = self.terms.ends_lagrangian
+        return self._of_ends("end_shape", value, ca.horzcat(*forces), ca.horzcat(*moments))
+
+    @cached_property
     def segment_sensitivity(self) -> ca.Function:
         """As `segment` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
         if self.kind.framed:
@@ -227,6 +252,14 @@ class Functions:
         arguments, rows, moving = self._seen
         blocks = [ca.jacobian(rows, symbols) for symbols in (moving, self.terms.p)]
         return self._here("station_slopes", arguments, [rows, *blocks])
+
+    @cached_property
+    def segment_shape(self) -> ca.Function:
+        """As `segment` -> L_e, advance [m], mean strains of the cell [1/m]."""
+        terms = self.terms.segment_terms
+        return self._of_segment(
+            "segment_shape", terms.lagrangian, terms.advance, self.kind.strain(self._plain)
+        )
 
     @cached_property
     def segment_strain(self) -> ca.Function:

@@ -1,6 +1,11 @@
-"""CasADi expressions of a whole pose, for IPOPT: sums of the functions of segments."""
+"""CasADi expressions of a whole pose: sums of the functions of segments.
+
+Symbols are SX for one's own IPOPT, MX in functions for others' problems: an expression of MX calls
+the functions of segments, so that graphs and their derivatives stay small.
+"""
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,12 +23,12 @@ class PoseSymbols:
     `pose` (n_pose,), `deviation` (n_deviations,).
     """
 
-    x: ca.SX
-    lam: ca.SX
-    p: ca.SX
-    rest: ca.SX
-    pose: ca.SX
-    deviation: ca.SX
+    x: Any  # CasADi's stubs: SX and MX have no common type
+    lam: Any
+    p: Any
+    rest: Any
+    pose: Any
+    deviation: Any
 
     @classmethod
     def of(cls, model: CableModel) -> "PoseSymbols":
@@ -77,17 +82,69 @@ def potential(model: CableModel) -> Potential:
     return Potential(coordinates, parameters, energy, conditions)
 
 
-def balance(model: CableModel, s: PoseSymbols) -> ca.SX:
+def balance(model: CableModel, s: PoseSymbols) -> Any:
     """Gradient of the Lagrangian by increments and multipliers: force balance, then conditions."""
     b, functions = model.node.increment, functions_of(model)
-    _, ends, _ = functions.at_ends(*_end_arguments(model, s))
+    ends = functions.end_slope(*_end_arguments(model, s))
     gradient = functions.segment_slope(*_segment_arguments(model, s))
-    none = ca.SX.zeros(b)
+    none = ca.DM.zeros(b)
     rows = ca.horzcat(none, gradient[b : 2 * b, :]) + ca.horzcat(gradient[:b, :], none)
     rows = rows[:, : model.chain.n_nodes]
     rows[:, 0] += ends[:b]
     rows[:, -1] += ends[b : 2 * b]
     return ca.vertcat(ca.vec(rows), sum(ca.horzsplit(gradient[2 * b :, :]), start=ends[2 * b :]))
+
+
+def tangent(model: CableModel, s: PoseSymbols) -> Any:
+    """Hessian of the Lagrangian by increments and multipliers: the derivative of `balance`."""
+    b, count, functions = model.node.increment, model.chain.n_nodes, functions_of(model)
+    *_, segments = functions.segment(*_segment_arguments(model, s))
+    *_, ends = functions.at_ends(*_end_arguments(model, s))
+    # Unknowns of each block: of two nodes, and the border. There may be a segment after the last
+    # node; what it has of a next one is left out.
+    first = np.append(np.arange(model.chain.n_segments), 0)
+    last = np.append(first[:-1] + 1, count - 1)
+    border = b * (count + 1) + np.arange(model.n_border)
+    nodes = (b * np.stack([first, last], axis=1)[..., None] + np.arange(b)).reshape(len(first), -1)
+    own = np.hstack([nodes, np.tile(border, (len(first), 1))])
+    size, kept = b * (count + 1) + model.n_border, [*range(b * count), *border.tolist()]
+    places = (own[:, None] + size * own[..., None]).ravel()
+    entries = np.arange(len(places))
+    added = ca.DM.triplet(
+        places.tolist(), entries.tolist(), np.ones(len(places)), size**2, len(places)
+    )
+    total = added @ ca.vec(ca.horzcat(segments, ends))
+    return ca.reshape(total, size, size)[kept, kept]
+
+
+@dataclass(frozen=True)
+class PoseShape:
+    """Expressions of a pose that balances.
+
+    `energy` [J], `points` (dimension, n + 1) [m] from start to end, `forces` (dimension, 2) [N] and
+    `moments` (increment, 2) [N m] on both holders, `strains` (strains, n_cells) [1/m].
+    """
+
+    energy: Any
+    points: Any
+    forces: Any
+    moments: Any
+    strains: Any
+
+
+def shape(model: CableModel, s: PoseSymbols) -> PoseShape:
+    """True shape and reactions. The energy is the Lagrangian: equal where conditions hold."""
+    layout, count, functions = model.chain.layout, model.n + 1, functions_of(model)
+    energy, advance, strains = functions.segment_shape(*_segment_arguments(model, s))
+    ends, forces, moments = functions.end_shape(*_end_arguments(model, s))
+    steps = ca.horzcat(s.pose[: model.node.dimension], advance[:, layout.advancing.tolist()])
+    return PoseShape(
+        energy=ca.sum2(energy) + ends,
+        points=steps @ ca.sparsify(ca.DM(np.triu(np.ones((count, count))))),
+        forces=forces,
+        moments=moments,
+        strains=strains[:, layout.bends.tolist()],
+    )
 
 
 def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
@@ -114,13 +171,13 @@ def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
     return ca.vec(after[:, model.chain.layout.bends.tolist()].T)
 
 
-def _end_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX]:
+def _end_arguments(model: CableModel, s: PoseSymbols) -> list[Any]:
     c = model.node.coordinates
     both = ca.vertcat(s.x[:c], s.x[s.x.numel() - c :])
     return [both, s.lam, s.p, s.pose, s.deviation]
 
 
-def _segment_arguments(model: CableModel, s: PoseSymbols) -> list[ca.SX | ca.DM]:
+def _segment_arguments(model: CableModel, s: PoseSymbols) -> list[Any]:
     """A column for each segment, or a single column of what all segments share."""
     chain = model.chain
     x = ca.reshape(s.x, model.node.coordinates, chain.n_nodes)
