@@ -14,17 +14,12 @@ if TYPE_CHECKING:
     from dlo_casadi.config import Config as Config
     from dlo_casadi.config import load_config as load_config
     from dlo_casadi.effects import EFFECTS as EFFECTS
-    from dlo_casadi.effects import Cable as Cable
-    from dlo_casadi.equilibrium.equilibrium import Equilibrium as Equilibrium
-    from dlo_casadi.equilibrium.pose import Pose as Pose
-    from dlo_casadi.equilibrium.solve import solve_equilibrium as solve_equilibrium
     from dlo_casadi.errors import ConfigError as ConfigError
     from dlo_casadi.errors import DloError as DloError
     from dlo_casadi.errors import EquilibriumError as EquilibriumError
     from dlo_casadi.errors import EstimationError as EstimationError
     from dlo_casadi.errors import MeasurementError as MeasurementError
     from dlo_casadi.errors import VisionError as VisionError
-    from dlo_casadi.model.cable_model import CableModel as CableModel
     from dlo_casadi.session import Outcome as Outcome
     from dlo_casadi.session import run_session as run_session
 
@@ -34,12 +29,8 @@ _PUBLIC = {
     "api": "PredictedShape Result fit predict",
     "codegen": "CompiledSolver",
     "config": "Config load_config",
-    "effects": "EFFECTS Cable",
-    "equilibrium.equilibrium": "Equilibrium",
-    "equilibrium.pose": "Pose",
-    "equilibrium.solve": "solve_equilibrium",
+    "effects": "EFFECTS",
     "errors": "ConfigError DloError EquilibriumError EstimationError MeasurementError VisionError",
-    "model.cable_model": "CableModel",
     "session": "Outcome run_session",
 }
 _HOMES = {name: f"{__name__}.{home}" for home, names in _PUBLIC.items() for name in names.split()}

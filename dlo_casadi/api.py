@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.config.values import implausible_quaternion
 from dlo_casadi.equilibrium.fitted_cable import CableShape, FittedCable, shape_in
-from dlo_casadi.equilibrium.pose import Branch, Pose
+from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.report.documents import parameters_of
@@ -217,7 +217,7 @@ def _as(kind: type[Kind], found: Any) -> Kind:
     return kind(**{field.name: getattr(found, field.name) for field in fields(found)})
 
 
-def _pose(cable: FittedCable, asked: Mapping[str, Any]) -> Pose:
+def _pose(cable: FittedCable, asked: Mapping[str, Any]) -> HeldPose:
     """End conditions, checked against the boundary; what is not given is as in the session."""
     model, shared = cable.model, cable.metadata.fixtures
     name, size, spatial = model.cable.name, model.node.dimension, model.in_space
@@ -238,7 +238,7 @@ def _pose(cable: FittedCable, asked: Mapping[str, Any]) -> Pose:
         raise DloError(f"{name!r} has no turns: it is not in space and clamped at both ends")
     if start is None:
         start = shared.get("start") or (0.0,) * size
-    return Pose(
+    return HeldPose(
         start=_point(start, "start", size),
         end=None if end is None else _point(end, "end", size),
         turns=turns,

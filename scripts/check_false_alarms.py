@@ -38,7 +38,7 @@ from simulated import random_session
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.effects import EFFECTS
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import modes_in, tipping
 from dlo_casadi.estimation.constrained import profile_intervals
 from dlo_casadi.estimation.fit import SEARCH_MESH
@@ -96,7 +96,7 @@ def hanging(config, generator):
     for k, heading in enumerate(headings):
         each = modes @ (scatter.sizes * generator.standard_normal(modes.shape[1]))
         rest = mean[0] + mean[1] * (places - 0.5) + each
-        held = Pose((0.0, 0.0), start_heading=float(heading), name=f"pose_{k:02d}")
+        held = HeldPose((0.0, 0.0), start_heading=float(heading), name=f"pose_{k:02d}")
         turned = replace(held, start_heading=float(heading + offset))
         found = predict_poses(model, p, rest, [turned])[0]
         if found is None:
@@ -158,7 +158,7 @@ def spatial(config, generator, hidden=None):
         way = start * Rotation.from_rotvec(generator.uniform(-0.5, 0.5, 3))
         end = way.apply([generator.uniform(0.55, 0.85) * length, 0.0, 0.0])
         turned = start * Rotation.from_rotvec(generator.uniform(-0.7, 0.7, 3))
-        held = Pose(
+        held = HeldPose(
             (0.0, 0.0, 0.0),
             tuple(end),
             start_orientation=tuple(start.as_quat()),

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import MOST_SHED, solve_equilibria
 from dlo_casadi.errors import EquilibriumError
 
@@ -205,7 +205,7 @@ def check_sets(count: int) -> bool:
     return solved + shed - wound >= SHARE * total and judged >= SHARE * solved and not unstable
 
 
-def held_if_wound(problem: SpaceProblem, poses: Sequence[Pose]) -> int:
+def held_if_wound(problem: SpaceProblem, poses: Sequence[HeldPose]) -> int:
     """Number of poses whose turns a cable holds that is wound up in them from a turn less."""
     model, p, rest = problem.model, problem.p, problem.rest
     if not poses:
@@ -223,8 +223,8 @@ def held_if_wound(problem: SpaceProblem, poses: Sequence[Pose]) -> int:
 
 
 def finer(
-    problem: SpaceProblem, there: Sequence[tuple[Pose, Equilibrium]], chosen: NDArray[np.bool_]
-) -> tuple[SpaceProblem, tuple[Pose, ...], list[Equilibrium | EquilibriumError]]:
+    problem: SpaceProblem, there: Sequence[tuple[HeldPose, Equilibrium]], chosen: NDArray[np.bool_]
+) -> tuple[SpaceProblem, tuple[HeldPose, ...], list[Equilibrium | EquilibriumError]]:
     """The problem on a mesh four times as fine, and the chosen poses and shapes there."""
     model = space_problem(np.random.default_rng(0), 0, 4 * N).model
     rest = model.rest_basis @ np.linalg.lstsq(problem.model.rest_basis, problem.rest, rcond=None)[0]

@@ -10,7 +10,7 @@ from perturbed import any_rest, any_shapes, central, directions
 from dlo_casadi.effects import (
     AxialStretch,
     BendingSoftening,
-    Cable,
+    CableData,
     ClampAngle,
     EndOffset,
     EndSpring,
@@ -26,13 +26,13 @@ from dlo_casadi.effects import (
     UnknownPull,
 )
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import ELEMENTS
 
-CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
+CABLE = CableData(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
 ENDS = np.array(
     [[0.1, 0.2, 0.9, 0.1, 0.2, -0.3], [0.0, 0.0, 0.5, -0.4, 0.0, 0.4], [-0.1, 0.3, 0.4, 0.4, 1, 1]]
 )  # start, end [m], headings [rad] of three poses
@@ -203,7 +203,7 @@ def most_memory(n: int) -> int:
     """Largest memory [bytes] that NumPy holds during a linearisation of three poses."""
     tracemalloc.start()
     model = CableModel(CABLE, n, effects=(LumpedMass(), RestCurvatureDrift()))
-    equilibria = BatchEquilibrium(model, [Pose((0.0, 0.0), (0.5, 0.1 * j)) for j in range(M)])
+    equilibria = BatchEquilibrium(model, [HeldPose((0.0, 0.0), (0.5, 0.1 * j)) for j in range(M)])
     s = model.chain.places / CABLE.length
     shapes = equilibria.start_shapes(np.broadcast_to((1 - 2 * s)[:, None], (M, len(s), 1)))
     rest = np.full(model.chain.n_cells, 0.5)

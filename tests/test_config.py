@@ -17,7 +17,7 @@ from dlo_casadi.config import (
     read_yaml,
 )
 from dlo_casadi.config.sections import DENSITY
-from dlo_casadi.effects import EFFECTS, Cable
+from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.errors import ConfigError, counted
 
 ROOT = Path(__file__).parents[1]
@@ -393,7 +393,7 @@ def load_for_all(folder: Path, options: str) -> Config:
 
 @pytest.mark.parametrize("name", [name for name, kind in EFFECTS.items() if 2 in kind.dimensions])
 def test_no_parameter_of_an_effect_takes_any_number(tmp_path, name):
-    for q in EFFECTS[name]().parameters(Cable(0.8, 0.23, 0.0128, 0.6)):
+    for q in EFFECTS[name]().parameters(CableData(0.8, 0.23, 0.0128, 0.6)):
         options = f"model: {{effects: [{{name: {name}, parameters: {{{q.name}: 1e300}}}}]}}\n"
         with pytest.raises(ConfigError, match=rf"{name}.{q.name}: 1e\+300.* is possible"):
             load_for_all(tmp_path, options)

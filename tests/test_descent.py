@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dlo_casadi.effects import Cable, Tether
+from dlo_casadi.effects import CableData, Tether
 from dlo_casadi.equilibrium.minima import _convex, descend
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix
@@ -32,12 +32,14 @@ def test_shifts_end_where_the_nodes_part_is_definite():
 @pytest.mark.parametrize("stiffness", [1.0, 400.0])
 def test_a_soft_cable_on_a_strong_tether_is_brought_to_rest(element, stiffness):
     """From random first guesses; its springs outweigh its own stiffness a millionfold."""
-    cable = Cable(length=0.6, mass=0.06, diameter=0.006, bending_stiffness=2e-5)
+    cable = CableData(length=0.6, mass=0.06, diameter=0.006, bending_stiffness=2e-5)
     model = CableModel(cable, 10, element, "clamped", "clamped", effects=(Tether(),))
     p = np.array([2e-5, stiffness, 0.3, 0.25, 0.15])
     x = np.random.default_rng(0).normal(scale=0.5, size=(12, 11, 1)).cumsum(axis=1)
     shapes = Shapes.declared(x, np.zeros((12, model.n_border)))
-    given = Inputs.of(p, np.zeros(10), np.repeat(Pose((0.0, 0.0), (0.4, 0.1)).vector[None], 12, 0))
+    given = Inputs.of(
+        p, np.zeros(10), np.repeat(HeldPose((0.0, 0.0), (0.4, 0.1)).vector[None], 12, 0)
+    )
 
     found = descend(assembly_of(model), shapes, given)
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.effects import (
     EFFECTS,
     BendingSoftening,
-    Cable,
+    CableData,
     ClampAngle,
     ClampCompliance,
     EdgeBias,
@@ -33,7 +33,7 @@ from dlo_casadi.effects import (
     UnknownPull,
     Viewpoint,
 )
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
@@ -41,11 +41,11 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
 
-CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
+CABLE = CableData(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 # Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).
-POSE = Pose((0.1, 0.05), (0.5, -0.1), 0.4, -0.2, camera_center=(0.6, -0.4, 2.0)).vector
+POSE = HeldPose((0.1, 0.05), (0.5, -0.1), 0.4, -0.2, camera_center=(0.6, -0.4, 2.0)).vector
 IN_SPACE = replace(CABLE, torsional_stiffness=0.03)
-POSE_IN_SPACE = Pose(
+POSE_IN_SPACE = HeldPose(
     (0.1, 0.05, -0.2),
     (0.5, -0.1, 0.1),
     start_orientation=(0.1, -0.2, 0.3, 0.9),
@@ -311,7 +311,9 @@ def test_reactions_carry_the_weight_and_the_force_of_a_tether(element):
     model = CableModel(CABLE, n=20, element=element, effects=(Tether(),))
     anchor = np.array([0.3, 0.4])
     p = np.array([0.05, 5.0, 0.4, *anchor])
-    found = solve_equilibrium(model, p, np.zeros(model.chain.n_cells), Pose((0.1, 0.0), (0.6, 0.1)))
+    found = solve_equilibrium(
+        model, p, np.zeros(model.chain.n_cells), HeldPose((0.1, 0.0), (0.6, 0.1))
+    )
     loads = 5.0 * (anchor - found.points[10]) - [0.0, 9.81 * CABLE.mass]
     # Bubbles enter the spring's energy to second order: error k L b^4, with b of 0.01 rad.
     np.testing.assert_allclose(found.lam + found.lam_start, loads, atol=1e-6)
@@ -321,7 +323,7 @@ def test_reactions_carry_the_weight_and_the_force_of_a_tether(element):
 def test_a_tether_to_its_clamp_buckles_a_cable_at_eulers_load(element):
     """A force k L at the tip, always towards the clamp: pi^2 EI / L^2  [Timoshenko and Gere]."""
     model = CableModel(CABLE, 20, element, "clamped", "free", (0.0, 0.0), (Tether(),))
-    pose = Pose((0.0, 0.0), start_heading=0.0)
+    pose = HeldPose((0.0, 0.0), start_heading=0.0)
     critical = np.pi**2 * 0.05 / CABLE.length**3
     straight = np.zeros(model.chain.n_nodes)
     for share, stable in ((0.98, True), (1.02, False)):  # links: (pi / 20)^2 / 12 = 0.2 % off
@@ -337,7 +339,7 @@ def test_a_soft_tether_to_a_far_anchor_is_a_point_force():
     assert np.hypot(far["anchor_x"], far["anchor_y"]) == pytest.approx(10 * CABLE.length)
     near = effect.of_linear(CABLE, {"stiffness": 2.0, **force})
     assert (near["anchor_x"], near["anchor_y"]) == pytest.approx((-0.3, 0.4))
-    pose = Pose((0.0, 0.0), (0.5, 0.1))
+    pose = HeldPose((0.0, 0.0), (0.5, 0.1))
 
     def nodes(effect, values):
         model = CableModel(CABLE, n=10, effects=(effect,))
@@ -453,7 +455,7 @@ def test_a_clamp_that_gives_way_is_one_turned_by_the_moment_on_it(element):
     held = {"n": 8, "element": element, "start": "clamped", "end": "clamped"}
     giving = CableModel(CABLE, effects=(ClampCompliance(),), **held)
     turned = CableModel(CABLE, effects=(ClampAngle(),), **held)
-    rest, pose = np.zeros(giving.chain.n_cells), Pose((0.0, 0.0), (0.5, -0.1), 0.4, -0.2)
+    rest, pose = np.zeros(giving.chain.n_cells), HeldPose((0.0, 0.0), (0.5, -0.1), 0.4, -0.2)
     compliance = np.array([0.6, 0.2])
     p = np.array([0.05, *compliance])
     found = solve_equilibrium(giving, p, rest, pose)
@@ -479,7 +481,7 @@ def test_clamp_angles_of_one_end_only():
 
 
 def seen_from(camera_center, start=(0.0, 0.0)) -> Viewpoint:
-    vector = ca.SX(ca.DM(Pose(start, camera_center=camera_center).vector))
+    vector = ca.SX(ca.DM(HeldPose(start, camera_center=camera_center).vector))
     return Viewpoint(vector[:2], vector[6:8], vector[8])
 
 
@@ -505,7 +507,7 @@ def test_the_line_that_a_map_by_direction_shows_converges(element):
     s, lines = np.linspace(0.0, CABLE.length, 101), []
     for n in (10, 20, 40, 160):
         model = CableModel(CABLE, n, element, effects=(EdgeBias(),))
-        held, rest = Pose((0.0, 0.0), (0.5 * CABLE.length, 0.1)), np.zeros(model.chain.n_rests)
+        held, rest = HeldPose((0.0, 0.0), (0.5 * CABLE.length, 0.1)), np.zeros(model.chain.n_rests)
         (found,) = predict_poses(model, p, rest, [held])
         lines.append(found.curve.at(s))
     gaps = [np.abs(line - lines[-1]).max() for line in lines[:-1]]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.effects import (
     EFFECTS,
     BendingAnisotropy,
-    Cable,
+    CableData,
     CameraFrame,
     ClampCompliance,
     ClampRotation,
@@ -23,15 +23,15 @@ from dlo_casadi.effects import (
     SideLoad,
     Tether,
 )
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 
-FLAT = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
+FLAT = CableData(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 CABLE = replace(FLAT, torsional_stiffness=0.03)
 GRAVITY = (0.3, 0.5, -9.7)
-HELD = Pose(
+HELD = HeldPose(
     (0.1, 0.05, -0.2),
     (0.6, 0.0, -0.1),
     start_orientation=(0.05, -0.1, 0.2, 0.97),
@@ -103,9 +103,11 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
         models.append(model)
         ps.append(p)
         rests.append(np.repeat([rest] if len(g) == 2 else [0.0, 0.0, rest], model.chain.n_cells))
-    pose = Pose((0.0, 0.0), (0.5, -0.1), *headings)
+    pose = HeldPose((0.0, 0.0), (0.5, -0.1), *headings)
     first, last = (tuple(Rotation.from_rotvec([0, 0, a]).as_quat()) for a in headings)
-    same = Pose((0.0, 0.0, 0.0), (0.5, -0.1, 0.0), start_orientation=first, end_orientation=last)
+    same = HeldPose(
+        (0.0, 0.0, 0.0), (0.5, -0.1, 0.0), start_orientation=first, end_orientation=last
+    )
     flat = solve_equilibrium(models[0], ps[0], rests[0], pose)
     shapes = [Shapes.declared(flat.x[None], flat.multipliers[None]), in_space(models[1], flat)]
     given = [
@@ -139,7 +141,7 @@ def test_clamps_that_give_way_turn_by_the_moment_on_them(end):
         turned = tuple(Rotation.from_rotvec([0, 0, 0.3]).as_quat())
         flat = {"start_heading": 0.3, "end_heading": 0.0 if far else None}
         frames = {"start_orientation": turned, "end_orientation": (0.0, 0.0, 0.0, 1.0)}
-        pose = Pose((0.0, 0.0, 0.0)[: len(g)], far, **(flat if len(g) == 2 else frames))
+        pose = HeldPose((0.0, 0.0, 0.0)[: len(g)], far, **(flat if len(g) == 2 else frames))
         eq = solve_equilibrium(model, p, np.zeros(model.chain.n_rests), pose)
         sides = (0, -1)[: len(effect.sides)]
         gave = [model.node.difference(pose.frames[k], eq.x[k]) for k in sides]
@@ -236,7 +238,7 @@ def principal(ratio: float, angle: float) -> np.ndarray:
 def test_a_cantilever_of_two_stiffnesses(ratio, angle):
     """Small tip loads: u = (L^3 / 3) B^-1 F, with M_y = -F_z (L - s), M_z = F_y (L - s)."""
     force = np.array([2e-5, -1e-5])  # y, z [N]: deflections of 1e-4 L
-    pose = Pose((0.0, 0.0, 0.0), start_orientation=(0.0, 0.0, 0.0, 1.0))
+    pose = HeldPose((0.0, 0.0, 0.0), start_orientation=(0.0, 0.0, 0.0, 1.0))
     effects, values = (BendingAnisotropy(), PointForce()), (ratio, angle, 0.0, *force, CABLE.length)
     found = solved(effects, values, pose, (0.0, 0.0, 0.0), end="free")
     curvatures = np.linalg.inv(CABLE.bending_stiffness * principal(ratio, angle)) @ [

@@ -15,7 +15,7 @@ from scipy.special import ellipe, ellipk
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import (
     AxialStretch,
-    Cable,
+    CableData,
     EndOffset,
     EndSpring,
     LengthError,
@@ -25,7 +25,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.equilibrium import Equilibrium, Status
 from dlo_casadi.equilibrium.guesses import guesses
 from dlo_casadi.equilibrium.minima import by_ipopt
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
@@ -38,7 +38,7 @@ WEIGHTLESS = (0.0, 0.0)  # m/s^2
 MESHES = (10, 20, 40)
 
 
-def solve(model: CableModel, stiffness: float, pose: Pose, rest: float = 0.0, **extra):
+def solve(model: CableModel, stiffness: float, pose: HeldPose, rest: float = 0.0, **extra):
     """Equilibrium of a cable of constant rest curvature [1/m] without effects."""
     return solve_equilibrium(
         model, np.array([stiffness]), np.full(model.chain.n_cells, rest), pose, **extra
@@ -60,13 +60,13 @@ def test_energies_of_table_4():
     """
     length, n, k_theta = 0.8125, 10, 949.56
     stiffness = k_theta * length / n
-    model = CableModel(Cable(length, 0.23, 0.0128, stiffness), n=n, element="link")
+    model = CableModel(CableData(length, 0.23, 0.0128, stiffness), n=n, element="link")
     with (SCRIPTS / "paper" / "data" / "table4.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 12
     for row in rows:
         end = (0.0254 * float(row["grid_x"]), 0.0254 * float(row["grid_y"]))
-        found = solve(model, stiffness, Pose((0.0, 0.0), end, branch="ccw"))
+        found = solve(model, stiffness, HeldPose((0.0, 0.0), end, branch="ccw"))
         assert found.stable
         # The print gives 0.005 J, COBYLA's end point the rest: within 0.03 J on all twelve.
         assert found.energy == pytest.approx(float(row["V_theta0_alpha0_J"]), abs=0.04), end
@@ -85,8 +85,8 @@ def test_limp_cable_converges_to_the_catenary(element):
     errors = []
     # Finer arcs and quadratic elements, of fourth order here, would show the effect of EI.
     for n in {"link": (16, 32, 64), "arc": (8, 16, 32), "quadratic": (8, 16)}[element]:
-        model = CableModel(Cable(length, weight * length / 9.81, 0.005, stiffness), n, element)
-        hung = solve(model, stiffness, Pose((0.0, 0.0), (span, 0.0), branch="ccw"))
+        model = CableModel(CableData(length, weight * length / 9.81, 0.005, stiffness), n, element)
+        hung = solve(model, stiffness, HeldPose((0.0, 0.0), (span, 0.0), branch="ccw"))
         assert hung.stable
         found = np.array([-hung.points[:, 1].min(), -hung.lam[0]])
         errors.append(np.linalg.norm(found - exact))
@@ -123,9 +123,9 @@ def test_heavy_cantilever_against_an_integrator(element):
     exact = cantilever(stiffness, weight, length, heading)
     errors = []
     for n in MESHES:
-        cable = Cable(length, weight * length / 9.81, 0.01, stiffness)
+        cable = CableData(length, weight * length / 9.81, 0.01, stiffness)
         model = CableModel(cable, n, element, start="clamped", end="free")
-        bent = solve(model, stiffness, Pose((0.0, 0.0), start_heading=heading))
+        bent = solve(model, stiffness, HeldPose((0.0, 0.0), start_heading=heading))
         assert bent.stable
         np.testing.assert_allclose(bent.lam, 0.0)
         gaps = [np.hypot(*(bent.points[k] - exact(k * length / n)[2:])) for k in (n // 2, n)]
@@ -154,8 +154,8 @@ def test_pinned_elastica(element, slope):
     span, sag, thrust = elastica(slope, length, stiffness)
     errors = []
     for n in MESHES:
-        model = CableModel(Cable(length, 0.1, 0.01, stiffness), n, element, gravity=WEIGHTLESS)
-        bent = solve(model, stiffness, Pose((0.0, 0.0), (span, 0.0), branch="ccw"))
+        model = CableModel(CableData(length, 0.1, 0.01, stiffness), n, element, gravity=WEIGHTLESS)
+        bent = solve(model, stiffness, HeldPose((0.0, 0.0), (span, 0.0), branch="ccw"))
         assert bent.stable
         assert bent.lam[1] == pytest.approx(0.0, abs=1e-8)  # IPOPT's tol, times EI / L^2
         errors.append([abs(bent.lam[0] - thrust), abs(-bent.points[n // 2, 1] - sag)])
@@ -170,9 +170,9 @@ def test_rest_curvature_alone_is_a_circle():
     for element, gaps in errors.items():
         for n in MESHES:
             model = CableModel(
-                Cable(length, 0.1, 0.01, stiffness), n, element, "clamped", "free", WEIGHTLESS
+                CableData(length, 0.1, 0.01, stiffness), n, element, "clamped", "free", WEIGHTLESS
             )
-            bent = solve(model, stiffness, Pose((0.0, 0.0), start_heading=0.0), kappa)
+            bent = solve(model, stiffness, HeldPose((0.0, 0.0), start_heading=0.0), kappa)
             assert bent.energy == pytest.approx(0.0, abs=1e-12)
             assert bent.min_bend_radius == pytest.approx(1 / kappa, rel=1e-6)
             gaps.append(float(np.hypot(*(bent.points[-1] - tip))))
@@ -185,10 +185,10 @@ def test_end_moment_gives_constant_curvature():
     """M = k (heading - phi(L)) and kappa = M / EI:  kappa = k heading / (EI + k L)."""
     length, stiffness, spring, heading = 0.8, 0.05, 0.2, 1.5
     kappa = spring * heading / (stiffness + spring * length)
-    cable = Cable(length, 0.1, 0.01, stiffness)
+    cable = CableData(length, 0.1, 0.01, stiffness)
     model = CableModel(cable, 6, "arc", "clamped", "free", WEIGHTLESS, effects=(EndSpring(),))
     p = np.array([stiffness, spring, heading])
-    bent = solve_equilibrium(model, p, np.zeros(6), Pose((0.0, 0.0), start_heading=0.0))
+    bent = solve_equilibrium(model, p, np.zeros(6), HeldPose((0.0, 0.0), start_heading=0.0))
     np.testing.assert_allclose(bent.curvature, kappa, rtol=1e-9)
     moment = stiffness * kappa
     assert abs(bent.moments[0]) == pytest.approx(moment, rel=1e-9)
@@ -203,7 +203,7 @@ def bench(name: str, n: int, element: str, poses: int = 99) -> list[np.ndarray]:
     config = load_config(DATA / "bench" / name / "session.yaml")
     truth = yaml.safe_load((DATA / "bench_truth" / name / "truth.yaml").read_text())
     data, stiffness = config.cable, truth["bending_stiffness"]
-    cable = Cable(data.length, data.mass, data.diameter, stiffness)
+    cable = CableData(data.length, data.mass, data.diameter, stiffness)
     model = CableModel(cable, n, element, gravity=config.experiment.gravity)
     places, kappa = (np.array(truth["rest_curvature"][key]) for key in ("s", "kappa"))
     rest = []
@@ -211,7 +211,7 @@ def bench(name: str, n: int, element: str, poses: int = 99) -> list[np.ndarray]:
         s = np.linspace(low, high, 101)
         rest.append(np.trapezoid(np.interp(s, places, kappa), s) / (high - low))
     held = [
-        Pose(item.start, item.end, branch="ccw", name=item.name)
+        HeldPose(item.start, item.end, branch="ccw", name=item.name)
         for item in config.experiment.poses[:poses]
     ]
     found = solve_equilibria(model, np.array([stiffness]), np.array(rest), held)
@@ -255,7 +255,7 @@ def test_stiff_cable_on_a_fine_mesh():
 
 # ---- balances ----------------------------------------------------------------------------------
 
-HEAVY = Cable(length=0.8, mass=0.25, diameter=0.01, bending_stiffness=0.1)
+HEAVY = CableData(length=0.8, mass=0.25, diameter=0.01, bending_stiffness=0.1)
 
 
 def hold(element: str, start=(0.0, 0.0), end=(0.5, 0.1)) -> Equilibrium:
@@ -263,7 +263,7 @@ def hold(element: str, start=(0.0, 0.0), end=(0.5, 0.1)) -> Equilibrium:
     model = CableModel(HEAVY, 10, element, effects=effects)
     p = np.array([0.1, 0.05, 0.3, 0.2, 0.4, 0.55])
     rest = np.full(model.chain.n_cells, 0.7)
-    return solve_equilibrium(model, p, rest, Pose(start, end, branch="ccw"))
+    return solve_equilibrium(model, p, rest, HeldPose(start, end, branch="ccw"))
 
 
 @ALL
@@ -293,7 +293,7 @@ def test_weight_and_reactions_sum_to_zero(element):
 def test_moments_about_the_start_sum_to_zero(element):
     """Pins hold no moment: that of the weight is that of the end's reaction."""
     model = CableModel(HEAVY, 16, element)
-    held = solve(model, 0.1, Pose((0.0, 0.0), (0.6, -0.1)), rest=0.7)
+    held = solve(model, 0.1, HeldPose((0.0, 0.0), (0.6, -0.1)), rest=0.7)
     middles = (held.points[1:] + held.points[:-1]) / 2
     center = middles.mean(axis=0)
     if element != "link":  # Simpson's rule between neighbouring nodes
@@ -313,8 +313,10 @@ def test_a_turned_board_gives_a_turned_shape():
     gravity = turn @ np.array(model.gravity)
     turned = CableModel(HEAVY, 12, gravity=(float(gravity[0]), float(gravity[1])))
     end = turn @ np.array([0.5, 0.1])
-    one = solve(model, 0.1, Pose((0.0, 0.0), (0.5, 0.1), branch="ccw"), 0.7)
-    other = solve(turned, 0.1, Pose((0.0, 0.0), (float(end[0]), float(end[1])), branch="ccw"), 0.7)
+    one = solve(model, 0.1, HeldPose((0.0, 0.0), (0.5, 0.1), branch="ccw"), 0.7)
+    other = solve(
+        turned, 0.1, HeldPose((0.0, 0.0), (float(end[0]), float(end[1])), branch="ccw"), 0.7
+    )
     np.testing.assert_allclose(other.points, one.points @ turn.T, atol=1e-8)  # IPOPT's tol
     np.testing.assert_allclose(other.lam, turn @ one.lam, atol=1e-7)
     assert other.energy == pytest.approx(one.energy, abs=1e-9)
@@ -332,12 +334,12 @@ def test_straight_strut_about_the_euler_load(share, status):
     length, stiffness = 1.0, 0.2
     euler = np.pi**2 * stiffness / length**2
     model = CableModel(
-        Cable(length, 0.1, 0.01, stiffness), 20, gravity=WEIGHTLESS, effects=(AxialStretch(),)
+        CableData(length, 0.1, 0.01, stiffness), 20, gravity=WEIGHTLESS, effects=(AxialStretch(),)
     )
     p = np.array([stiffness, 1 / (1000 * euler)])
     end = (length * (1 - share / 1000), 0.0)
     straight = solve_equilibrium(
-        model, p, np.zeros(20), Pose((0.0, 0.0), end), x_init=np.zeros((21, 1))
+        model, p, np.zeros(20), HeldPose((0.0, 0.0), end), x_init=np.zeros((21, 1))
     )
     np.testing.assert_allclose(straight.phi, 0.0, atol=1e-8)
     assert straight.lam[0] == pytest.approx(share * euler, rel=1e-6)
@@ -349,14 +351,14 @@ def test_straight_strut_about_the_euler_load(share, status):
 def test_a_shape_that_nothing_turns_back_is_not_stable(element, rest):
     """Without weight, a cable on one pin turns about it at no cost."""
     model = CableModel(HEAVY, 8, element, end="free", gravity=WEIGHTLESS)
-    held = solve(model, 0.1, Pose((0.0, 0.0)), rest)
+    held = solve(model, 0.1, HeldPose((0.0, 0.0)), rest)
     assert held.status is Status.UNSTABLE
 
 
 def test_second_mode_is_flagged_and_avoided():
     """A strip bent to an S is in balance but not stable; on its own the solver bends it to a C."""
-    model = CableModel(Cable(1.0, 0.1, 0.01, 0.3), 16, gravity=WEIGHTLESS)
-    pose = Pose((0.0, 0.0), (0.8, 0.0))
+    model = CableModel(CableData(1.0, 0.1, 0.01, 0.3), 16, gravity=WEIGHTLESS)
+    pose = HeldPose((0.0, 0.0), (0.8, 0.0))
     s = model.chain.places
     bent = 0.9 * np.cos(2 * np.pi * s)
     double = by_ipopt(model, np.array([0.3]), np.zeros(len(model.chain.cells)), pose, bent)
@@ -373,19 +375,19 @@ def test_second_mode_is_flagged_and_avoided():
 
 def test_two_branches_of_a_stiff_curved_cable():
     """Bowed along its rest curvature or against it: both in balance, the first one lower."""
-    model = CableModel(Cable(0.8, 0.05, 0.01, 2.0), 16)
+    model = CableModel(CableData(0.8, 0.05, 0.01, 2.0), 16)
     ends = {"start": (0.0, 0.0), "end": (0.6, 0.1)}
-    along, against = (solve(model, 2.0, Pose(**ends, branch=b), 0.8) for b in ("ccw", "cw"))
+    along, against = (solve(model, 2.0, HeldPose(**ends, branch=b), 0.8) for b in ("ccw", "cw"))
     assert along.stable
     assert against.stable
     assert along.phi[-1] > along.phi[0]
     assert against.phi[-1] < against.phi[0]
     assert along.energy < against.energy
-    free = solve(model, 2.0, Pose(**ends), 0.8)
+    free = solve(model, 2.0, HeldPose(**ends), 0.8)
     assert free.energy == pytest.approx(along.energy, abs=1e-9)  # the lower of the two
 
 
-LIMP = Cable(0.8, 0.2, 0.01, 0.005)
+LIMP = CableData(0.8, 0.2, 0.01, 0.005)
 
 
 @pytest.mark.parametrize(("kind", "headings"), [("pinned", (None, None)), ("clamped", (-1.0, 1.0))])
@@ -393,7 +395,7 @@ def test_a_branch_without_an_equilibrium_is_refused_and_the_other_named(kind, he
     """A limp cable hangs: it turns counter-clockwise, and does not stand up."""
     model = CableModel(LIMP, 12, start=kind, end=kind)
     ends = {"start": (0.0, 0.0), "end": (0.5, 0.0), "name": "pose_03"}
-    pose = Pose(**ends, start_heading=headings[0], end_heading=headings[1])
+    pose = HeldPose(**ends, start_heading=headings[0], end_heading=headings[1])
     hung = solve(model, 0.005, pose)
     assert solve(model, 0.005, replace(pose, branch="ccw")).phi == pytest.approx(hung.phi)
     message = (
@@ -408,7 +410,7 @@ def test_a_branch_without_an_equilibrium_is_refused_and_the_other_named(kind, he
 def test_a_branch_beside_one_clamp_is_the_lowest_that_turns_so(branch, sign):
     """The pinned end may come round on either side; the cable itself takes the lower way."""
     model = CableModel(LIMP, 12, start="clamped", end="pinned")
-    pose = Pose((0.0, 0.0), (0.5, 0.0), start_heading=-1.0)
+    pose = HeldPose((0.0, 0.0), (0.5, 0.0), start_heading=-1.0)
     held = solve(model, 0.005, replace(pose, branch=branch))
     assert held.stable
     assert sign * held.turn > 0
@@ -417,8 +419,8 @@ def test_a_branch_beside_one_clamp_is_the_lowest_that_turns_so(branch, sign):
 
 def test_the_other_way_around_a_clamp_is_found():
     """A limp cable between clamps: 0.157 J folded up to a joint's bound, half of that unfolded."""
-    model = CableModel(Cable(1.0, 0.1, 0.005, 3e-3), 20, start="clamped", end="clamped")
-    held = solve(model, 3e-3, Pose((0.0, 0.0), (-0.695, -0.071), -1.74, 1.17))
+    model = CableModel(CableData(1.0, 0.1, 0.005, 3e-3), 20, start="clamped", end="clamped")
+    held = solve(model, 3e-3, HeldPose((0.0, 0.0), (-0.695, -0.071), -1.74, 1.17))
     assert held.stable
     assert not held.bound_multipliers.any()
     assert held.energy < 0.08
@@ -431,9 +433,9 @@ def test_clamped_loop_of_a_real_wire():
     """White electric wire: 1.5 m from clamp to clamp, turning once clockwise on its way."""
     stiffness = 1.2e-4
     model = CableModel(
-        Cable(1.5, 0.0261, 0.0027, stiffness), 40, "arc", start="clamped", end="clamped"
+        CableData(1.5, 0.0261, 0.0027, stiffness), 40, "arc", start="clamped", end="clamped"
     )
-    pose = Pose((0.0, 0.0), (-0.12, 0.0), start_heading=0.0, end_heading=-2 * np.pi)
+    pose = HeldPose((0.0, 0.0), (-0.12, 0.0), start_heading=0.0, end_heading=-2 * np.pi)
     loop = solve(model, stiffness, pose)
     assert loop.stable
     np.testing.assert_allclose(loop.phi[[0, -1]], [0.0, -2 * np.pi], atol=1e-8)
@@ -450,8 +452,8 @@ def test_clamped_loop_of_a_real_wire():
 @ALL
 def test_both_ends_at_one_place(element):
     """A loop that hangs from one nail, symmetric about the vertical through it."""
-    model = CableModel(Cable(0.8, 0.2, 0.01, 0.01), 20, element)
-    loop = solve(model, 0.01, Pose((0.2, 0.1), (0.2, 0.1)))
+    model = CableModel(CableData(0.8, 0.2, 0.01, 0.01), 20, element)
+    loop = solve(model, 0.01, HeldPose((0.2, 0.1), (0.2, 0.1)))
     assert loop.stable
     np.testing.assert_allclose(loop.points[-1], [0.2, 0.1], atol=1e-8)
     np.testing.assert_allclose(
@@ -463,7 +465,7 @@ def test_both_ends_at_one_place(element):
 @ALL
 def test_free_cable_hangs_straight_down(element):
     model = CableModel(HEAVY, 8, element, end="free")
-    hung = solve(model, 0.1, Pose((0.3, 0.5)))
+    hung = solve(model, 0.1, HeldPose((0.3, 0.5)))
     assert hung.stable
     np.testing.assert_allclose(hung.points[:, 0], 0.3, atol=1e-8)
     np.testing.assert_allclose(hung.points[-1], [0.3, 0.5 - HEAVY.length], atol=1e-8)
@@ -474,10 +476,10 @@ def test_free_cable_hangs_straight_down(element):
 def test_a_joint_at_its_bound_is_reported():
     """Five links whose rest shape folds up are stopped at a right angle, by a moment."""
     model = CableModel(HEAVY, 5, "link", "clamped", "free", WEIGHTLESS)
-    folded = solve(model, 0.1, Pose((0.0, 0.0), start_heading=0.0), rest=2.5 * np.pi / 2 / 0.16)
+    folded = solve(model, 0.1, HeldPose((0.0, 0.0), start_heading=0.0), rest=2.5 * np.pi / 2 / 0.16)
     np.testing.assert_allclose(np.abs(folded.theta[1:]), np.pi / 2, atol=1e-6)
     assert np.all(np.abs(folded.bound_multipliers) > 0.1)
-    relaxed = solve(model, 0.1, Pose((0.0, 0.0), start_heading=0.0), rest=1.0)
+    relaxed = solve(model, 0.1, HeldPose((0.0, 0.0), start_heading=0.0), rest=1.0)
     np.testing.assert_allclose(relaxed.bound_multipliers, 0.0, atol=1e-6)
 
 
@@ -490,8 +492,8 @@ def test_a_joint_at_its_bound_is_reported():
 )
 def test_a_joint_at_its_bound_beside_others_that_bow(end, headings):
     """A limp cable that folds between its clamps balances, and ends where it is held."""
-    model = CableModel(Cable(1.0, 0.1, 0.005, 3e-3), 20, start="clamped", end="clamped")
-    pose = Pose((0.0, 0.0), end, *headings)
+    model = CableModel(CableData(1.0, 0.1, 0.005, 3e-3), 20, start="clamped", end="clamped")
+    pose = HeldPose((0.0, 0.0), end, *headings)
     held = solve_equilibrium(model, model.nominal, np.zeros(20), pose)
     assert held.stable
     np.testing.assert_allclose(held.points[-1], end, atol=1e-9)
@@ -510,8 +512,8 @@ def test_the_smallest_radius_is_that_at_a_clamp(element):
     exact = 1 / abs(cantilever(stiffness, weight, length, heading)(0.0)[1])
     errors = []
     for n in (20, 40):
-        model = CableModel(Cable(length, 0.2, 0.01, stiffness), n, element, "clamped", "free")
-        held = solve(model, stiffness, Pose((0.0, 0.0), start_heading=heading))
+        model = CableModel(CableData(length, 0.2, 0.01, stiffness), n, element, "clamped", "free")
+        held = solve(model, stiffness, HeldPose((0.0, 0.0), start_heading=heading))
         errors.append(abs(held.min_bend_radius / exact - 1))
     assert errors[0] < 0.03
     assert errors[1] < errors[0] / 3
@@ -522,12 +524,12 @@ def test_the_smallest_radius_is_that_at_a_clamp(element):
 
 def test_a_pose_that_is_not_finite_is_named():
     with pytest.raises(EquilibriumError, match=r"pose_08: .*not finite: start \(0.0, 0.0\) m"):
-        solve(CableModel(HEAVY, 8), 0.1, Pose((0.0, 0.0), (0.6, np.nan), name="pose_08"))
+        solve(CableModel(HEAVY, 8), 0.1, HeldPose((0.0, 0.0), (0.6, np.nan), name="pose_08"))
 
 
 def test_a_held_end_that_a_pose_does_not_have_is_not_the_origin():
     with pytest.raises(EquilibriumError, match=r"the end of the cable is pinned, and the pose has"):
-        solve(CableModel(HEAVY, 8), 0.1, Pose((0.0, 0.0)))
+        solve(CableModel(HEAVY, 8), 0.1, HeldPose((0.0, 0.0)))
 
 
 @pytest.mark.parametrize("label", ["", "wrong_label", "spool"])
@@ -536,15 +538,15 @@ def test_a_longer_cable_reaches_farther_whatever_its_effect_is_called(label):
     effects = (LengthError(label), LengthError("other"), EndOffset())
     model = CableModel(HEAVY, 8, effects=effects)
     p = np.array([0.1, 0.04, 0.02, -0.01, 0.0])  # 0.8 m (1 + 0.04 / 0.8) (1 + 0.02 / 0.8)
-    held = solve_equilibrium(model, p, np.zeros(8), Pose((0.0, 0.0), (0.87, 0.0)))
+    held = solve_equilibrium(model, p, np.zeros(8), HeldPose((0.0, 0.0), (0.87, 0.0)))
     assert held.points[-1] == pytest.approx([0.86, 0.0], abs=1e-8)
     with pytest.raises(EquilibriumError, match=r"is 0.8620 m from the start.*is 0.8610 m long"):
-        solve_equilibrium(model, p, np.zeros(8), Pose((0.0, 0.0), (0.872, 0.0)))
+        solve_equilibrium(model, p, np.zeros(8), HeldPose((0.0, 0.0), (0.872, 0.0)))
 
 
 def test_unreachable_pose_is_named_with_numbers():
     model = CableModel(HEAVY, 8)
-    pose = Pose((0.0, 0.0), (0.6, 0.6), name="pose_07")
+    pose = HeldPose((0.0, 0.0), (0.6, 0.6), name="pose_07")
     with pytest.raises(EquilibriumError, match=r"pose_07: no equilibrium") as caught:
         solve(model, 0.1, pose)
     assert "(0.6000, 0.6000) m is 0.8485 m from the start" in str(caught.value)
@@ -556,10 +558,10 @@ def test_unreachable_pose_is_named_with_numbers():
 
 def test_poses_solved_together_are_those_solved_alone_and_ipopt_finds_nothing_lower():
     """One of them is out of reach, one names its branch."""
-    model = CableModel(Cable(1.0, 0.1, 0.01, 0.02), 12, start="clamped", end="clamped")
+    model = CableModel(CableData(1.0, 0.1, 0.01, 0.02), 12, start="clamped", end="clamped")
     p, rest = model.nominal, np.full(model.chain.n_cells, 0.8)
     ends = [((0.6, 0.1), None), ((0.2, -0.5), None), ((1.1, 0.0), None), ((0.5, 0.3), "cw")]
-    poses = [Pose((0.0, 0.0), end, 0.3, -0.4, branch=branch) for end, branch in ends]
+    poses = [HeldPose((0.0, 0.0), end, 0.3, -0.4, branch=branch) for end, branch in ends]
     together = solve_equilibria(model, p, rest, poses)
     assert isinstance(together[2], EquilibriumError)
     for pose, eq in zip(poses, together, strict=True):

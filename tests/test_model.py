@@ -9,7 +9,7 @@ from perturbed import any_rest, any_shapes, directions
 
 from dlo_casadi.effects import (
     AxialStretch,
-    Cable,
+    CableData,
     GravityTilt,
     LengthError,
     LumpedMass,
@@ -18,7 +18,7 @@ from dlo_casadi.effects import (
     StiffnessGradient,
     StiffSection,
 )
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
@@ -28,14 +28,14 @@ from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
 
-CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
+CABLE = CableData(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
 WEIGHT = 9.81 * CABLE.mass  # N
 STILL = np.zeros(len(deviation_names(Heading)))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 
 
 def given(model: CableModel, p: np.ndarray, rest: np.ndarray) -> Inputs:
-    return Inputs.of(p, rest, Pose((0.0, 0.0), (0.9, 0.1)).vector[None])
+    return Inputs.of(p, rest, HeldPose((0.0, 0.0), (0.9, 0.1)).vector[None])
 
 
 # ---- composition -------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ def test_condensed_stretch_equals_the_minimisation_over_axial_strains(element):
     model = CableModel(CABLE, n=6, element=element, effects=(AxialStretch(), LumpedMass()))
     p = np.array([0.02, 0.02, 0.4, 0.5])  # EA = 50 N: 3 % of strain
     rest = np.full(model.chain.n_cells, 0.8)
-    pose = Pose((0.0, 0.0), (1.1, -0.2))
+    pose = HeldPose((0.0, 0.0), (1.1, -0.2))
     found = solve_equilibrium(model, p, rest, pose)
     assert found.stable
     a, where = assembly_of(model), Inputs.of(p, rest, pose.vector[None])
@@ -187,7 +187,7 @@ def test_stretch_of_a_hanging_cable(element):
     model = CableModel(CABLE, n=5, element=element, end="free", effects=(AxialStretch(),))
     compliance = 0.01  # 1/EA [1/N]
     rest = np.zeros(model.chain.n_cells)
-    found = solve_equilibrium(model, np.array([0.02, compliance]), rest, Pose((0.1, 0.2)))
+    found = solve_equilibrium(model, np.array([0.02, compliance]), rest, HeldPose((0.1, 0.2)))
     longer = CABLE.length + compliance * WEIGHT * CABLE.length / 2
     # The tension of every element is that in its middle: exact for a linear one.
     np.testing.assert_allclose(found.points[-1], [0.1, 0.2 - longer], atol=1e-8)
@@ -203,7 +203,7 @@ def test_a_stiff_axis_is_an_inextensible_cable(element):
     model = CableModel(CABLE, n=6, element=element, effects=(AxialStretch(),))
     bare = CableModel(CABLE, n=6, element=element)
     rest = np.full(model.chain.n_cells, 0.5)
-    pose = Pose((0.0, 0.0), (0.8, 0.1))
+    pose = HeldPose((0.0, 0.0), (0.8, 0.1))
     stiff = solve_equilibrium(model, np.array([0.02, 0.0]), rest, pose)
     exact = solve_equilibrium(bare, np.array([0.02]), rest, pose)
     np.testing.assert_allclose(stiff.points, exact.points, atol=1e-8)  # IPOPT's tol
@@ -214,7 +214,7 @@ def test_a_longer_cable_of_the_same_mass():
     longer = replace(CABLE, length=CABLE.length + 0.03)
     model = CableModel(CABLE, n=8, effects=(LengthError(),))
     direct = CableModel(longer, n=8)
-    pose = Pose((0.0, 0.0), (0.9, 0.1), branch="ccw")
+    pose = HeldPose((0.0, 0.0), (0.9, 0.1), branch="ccw")
     rest = np.full(8, 0.6)
     one = solve_equilibrium(model, np.array([0.02, 0.03]), rest, pose)
     other = solve_equilibrium(direct, np.array([0.02]), rest, pose)

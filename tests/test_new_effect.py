@@ -14,10 +14,10 @@ import yaml
 import dlo_casadi as dlo
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import EFFECTS, Cable, Effect, Fitted, PointForce, PointLoad, Setup
+from dlo_casadi.effects import EFFECTS, CableData, Effect, Fitted, PointForce, PointLoad, Setup
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import Params, PointForceAt
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.prediction import predict_poses
@@ -39,7 +39,7 @@ class Balloon(PointLoad):
 
     up: tuple[float, float] = (0.0, 1.0)
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the lift, at most the cable's weight, and its place."""
         weight = 9.81 * cable.mass
         lift = Parameter("lift", "N", scale=0.1 * weight, lower=0.0, upper=weight)
@@ -80,8 +80,8 @@ def known():
 def write(folder, *, effects=(), tried=(Balloon.name,)):
     """Write a session of a straight cable with a balloon."""
     cable = {"name": "light", "length": 0.8, "mass": 0.2, "diameter": 0.01}
-    model = CableModel(Cable(0.8, 0.2, 0.01, 0.1), 40, effects=(Balloon(),), n_rest=0)
-    poses = [Pose((0.0, 0.0), end) for end in ENDS]
+    model = CableModel(CableData(0.8, 0.2, 0.01, 0.1), 40, effects=(Balloon(),), n_rest=0)
+    poses = [HeldPose((0.0, 0.0), end) for end in ENDS]
     rest = np.zeros(model.chain.n_cells)
     shapes = predict_poses(model, np.array([0.1, LIFT, PLACE]), rest, poses)
     rng, s = np.random.default_rng(0), np.linspace(0.02, 0.98, 30) * 0.8
@@ -140,7 +140,7 @@ def test_the_generated_solver_knows_it(result):
     model, p, rest, _ = parameters_of(result)
     solver = CompiledSolver(model, p, rest, flags=("-O0",))  # compiles quickly
     for end in ENDS:
-        pose = Pose((0.0, 0.0), end)
+        pose = HeldPose((0.0, 0.0), end)
         expected = solve_equilibrium(model, p, rest, pose)
         assert solver.solve(pose).points == pytest.approx(expected.points, abs=1e-8)
 
@@ -161,12 +161,12 @@ def test_it_can_be_declared(known, tmp_path):
 
 
 def test_what_an_effect_does_not_declare_has_a_default():
-    setup = Setup(Cable(0.8, 0.2, 0.01, 0.1), tolerances={"length": 1e-3})
+    setup = Setup(CableData(0.8, 0.2, 0.01, 0.1), tolerances={"length": 1e-3})
 
     class Plain(Effect):
         name = "plain"
 
-        def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+        def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
             return (Parameter("size"),)
 
     effect = Plain.made_for(setup)

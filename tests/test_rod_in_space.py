@@ -9,11 +9,11 @@ from scipy.linalg import null_space
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.effects import EFFECTS, Cable
+from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.guesses import same_sign
 from dlo_casadi.equilibrium.minima import descend
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
@@ -26,13 +26,15 @@ DOWN = (0.0, 0.0, -9.81)
 
 
 def model(n=20, element="quadratic", gravity=DOWN, torsion=GJ, mass=0.12, end="clamped"):
-    cable = Cable(LENGTH, mass, 0.006, EI, torsional_stiffness=torsion)
+    cable = CableData(LENGTH, mass, 0.006, EI, torsional_stiffness=torsion)
     return CableModel(cable, n=n, element=element, start="clamped", end=end, gravity=gravity)
 
 
 def pose(end, start_turn=(0.0, 0.0, 0.0), end_turn=(0.0, 0.0, 0.0), turns=0.0, start=(0, 0, 0)):
     frames = [tuple(Rotation.from_rotvec(turn).as_quat()) for turn in (start_turn, end_turn)]
-    return Pose(tuple(map(float, start)), tuple(map(float, end)), None, None, *frames, turns=turns)
+    return HeldPose(
+        tuple(map(float, start)), tuple(map(float, end)), None, None, *frames, turns=turns
+    )
 
 
 OUT_OF_PLANE = pose((0.5, 0.1, 0.2), (0.3, -0.2, 0.4), (1.0, 0.3, -0.5))
@@ -71,7 +73,7 @@ def test_a_turned_world_gives_the_same_shape(element):
         tuple((turn * Rotation.from_quat(q)).as_quat())
         for q in (OUT_OF_PLANE.start_orientation, OUT_OF_PLANE.end_orientation)
     ]
-    turned = Pose(
+    turned = HeldPose(
         OUT_OF_PLANE.start, tuple(turn.apply(OUT_OF_PLANE.end)), None, None, frames[0], frames[1]
     )
     mine, other = solved(here, OUT_OF_PLANE, curved(here)), solved(there, turned, curved(there))
@@ -83,10 +85,13 @@ def test_a_turned_world_gives_the_same_shape(element):
 
 def test_a_planar_load_gives_the_numbers_of_the_plane():
     plane = CableModel(
-        Cable(LENGTH, 0.12, 0.006, EI), n=16, element="arc", start="clamped", end="clamped"
+        CableData(LENGTH, 0.12, 0.006, EI), n=16, element="arc", start="clamped", end="clamped"
     )
     flat = solve_equilibrium(
-        plane, plane.nominal, np.zeros(plane.chain.n_rests), Pose((0.0, 0.0), (0.5, 0.1), -0.9, 1.2)
+        plane,
+        plane.nominal,
+        np.zeros(plane.chain.n_rests),
+        HeldPose((0.0, 0.0), (0.5, 0.1), -0.9, 1.2),
     )
     m = model(16, "arc", gravity=(0.0, -9.81, 0.0))
     found = solved(m, pose((0.5, 0.1, 0.0), (0.0, 0.0, -0.9), (0.0, 0.0, 1.2)))
@@ -100,10 +105,12 @@ def test_a_planar_load_gives_the_numbers_of_the_plane():
 def test_a_cable_that_may_leave_its_plane_falls_out_of_it():
     """An arch held in a plane is an equilibrium in space, too, but not the lowest."""
     plane = CableModel(
-        Cable(LENGTH, 0.12, 0.006, EI), n=16, element="arc", start="clamped", end="clamped"
+        CableData(LENGTH, 0.12, 0.006, EI), n=16, element="arc", start="clamped", end="clamped"
     )
     none = np.zeros(plane.chain.n_rests)
-    flat = solve_equilibrium(plane, plane.nominal, none, Pose((0.0, 0.0), (0.5, 0.1), 0.4, -0.3))
+    flat = solve_equilibrium(
+        plane, plane.nominal, none, HeldPose((0.0, 0.0), (0.5, 0.1), 0.4, -0.3)
+    )
     m = model(16, "arc", gravity=(0.0, -9.81, 0.0))
     place = pose((0.5, 0.1, 0.0), (0.0, 0.0, 0.4), (0.0, 0.0, -0.3))
     frames = Rotation.from_rotvec(np.outer(flat.phi, [0.0, 0.0, 1.0])).as_quat()
@@ -124,7 +131,7 @@ def test_a_helix_under_moments_alone():
     tangents = Rotation.from_rotvec(np.outer(s, [twist, bend, 0.0])).apply([1.0, 0.0, 0.0])
     end = np.trapezoid(tangents, s, axis=0)
     m = model(10, "arc", gravity=(0.0, 0.0, 0.0), torsion=EI)
-    place = Pose((0.0, 0.0, 0.0), tuple(end), None, None, *(tuple(q.as_quat()) for q in steps))
+    place = HeldPose((0.0, 0.0, 0.0), tuple(end), None, None, *(tuple(q.as_quat()) for q in steps))
     found = solved(m, place)
     np.testing.assert_allclose(found.curvature.reshape((2, -1))[0], bend, rtol=1e-6)
     np.testing.assert_allclose(found.energy, EI / 2 * (twist**2 + bend**2) * LENGTH, rtol=1e-7)
@@ -154,7 +161,7 @@ def test_the_twist_at_which_a_ring_leaves_its_plane():
         ring = Rotation.from_rotvec(np.outer(2 * np.pi * s / LENGTH, [0.0, 0.0, 1.0]))
         roll = Rotation.from_rotvec(np.outer(twist * s / LENGTH, [1.0, 0.0, 0.0]))
         x = same_sign((ring * roll).as_quat())
-        place = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
+        place = HeldPose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
         lam = np.zeros((1, m.n_border))
         given = Inputs.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
         # The exact ring is an equilibrium, stable or not: Newton's method stays there.
@@ -184,7 +191,7 @@ def test_the_twist_at_which_a_straight_cable_between_clamps_buckles():
     def lowest(twist):
         rolls = np.outer(twist * m.chain.places / LENGTH, [1.0, 0.0, 0.0])
         x = same_sign(Rotation.from_rotvec(rolls).as_quat())
-        place = Pose((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
+        place = HeldPose((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
         given = Inputs.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
         free = Shapes.declared(x[None], np.zeros((1, m.n_border)))
         _, force, matrix = assembly_of(m).balance(free, given)
@@ -204,7 +211,7 @@ def test_a_cantilever_bends_out_of_its_plane_as_within():
     weightless = model(12, gravity=(0.0, 0.0, 0.0), end="free")
     within = model(12, gravity=(0.0, -0.5, 0.0), end="free")
     across = model(12, gravity=(0.0, 0.0, -0.5), end="free")
-    held = Pose((0.0, 0.0, 0.0), None, start_orientation=(0.0, 0.0, 0.0, 1.0))
+    held = HeldPose((0.0, 0.0, 0.0), None, start_orientation=(0.0, 0.0, 0.0, 1.0))
     straight, down, aside = (solved(m, held).points[-1] for m in (weightless, within, across))
     np.testing.assert_allclose(straight, [LENGTH, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(down[1], aside[2], atol=1e-12)
@@ -246,7 +253,7 @@ def test_derivatives_by_increments():
 
 def test_gravity_and_torsion_belong_together():
     with pytest.raises(DloError, match="gravity has 3 numbers"):
-        CableModel(Cable(LENGTH, 0.1, 0.005, EI), gravity=DOWN)
+        CableModel(CableData(LENGTH, 0.1, 0.005, EI), gravity=DOWN)
     with pytest.raises(DloError, match="'link' is not known in space"):
         _ = model(element="link").chain
 
@@ -282,7 +289,7 @@ def test_descents_from_far_away_are_minima():
 def test_a_segment_is_differentiated_as_by_casadi_in_one_go(element, end):
     """Loads, a spring to a fixed point, a stretching cable and a softening section at once."""
     effects = [EFFECTS[name]() for name in ("tether", "axial_stretch", "bending_softening")]
-    cable = Cable(LENGTH, 0.12, 0.006, EI, torsional_stiffness=GJ)
+    cable = CableData(LENGTH, 0.12, 0.006, EI, torsional_stiffness=GJ)
     m = CableModel(cable, 12, element, "clamped", end, DOWN, (*effects, EFFECTS["point_force"]()))
     node = m.node
     x, lam, p = (
@@ -325,9 +332,9 @@ def test_a_segment_is_differentiated_as_by_casadi_in_one_go(element, end):
 @pytest.mark.parametrize("element", ["arc", "quadratic"])
 def test_a_straight_cable_between_ball_joints_is_stable_though_it_may_spin(element):
     """Its turn about itself costs nothing and moves nothing: the shape is that in a plane."""
-    cable = Cable(LENGTH, 0.06, 0.008, EI, torsional_stiffness=GJ)
+    cable = CableData(LENGTH, 0.06, 0.008, EI, torsional_stiffness=GJ)
     model = CableModel(cable, 12, element, gravity=DOWN)
-    pose = Pose((0.0, 0.0, 0.0), (0.5 * LENGTH, 0.1 * LENGTH, 0.05))
+    pose = HeldPose((0.0, 0.0, 0.0), (0.5 * LENGTH, 0.1 * LENGTH, 0.05))
     found = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
     planar = CableModel(replace(cable, torsional_stiffness=None), 12, element)
     level = np.hypot(*pose.end[:2])
@@ -335,7 +342,7 @@ def test_a_straight_cable_between_ball_joints_is_stable_though_it_may_spin(eleme
         planar,
         planar.nominal,
         np.zeros(planar.chain.n_rests),
-        Pose((0.0, 0.0), (level, pose.end[2])),
+        HeldPose((0.0, 0.0), (level, pose.end[2])),
     )
     # Arcs are the same in both; the bubbles inside elements differ by the fifth order in h.
     close = 1e-10 if element == "arc" else 1e-3
@@ -347,9 +354,9 @@ def test_a_straight_cable_between_ball_joints_is_stable_though_it_may_spin(eleme
 
 def test_a_cable_bent_against_its_rest_shape_is_no_minimum():
     """Between ball joints it would turn about itself, to the side to which it is bent at rest."""
-    cable = Cable(LENGTH, 1e-6, 0.008, EI, torsional_stiffness=GJ)
+    cable = CableData(LENGTH, 1e-6, 0.008, EI, torsional_stiffness=GJ)
     model = CableModel(cable, 12, "arc", gravity=DOWN)
-    pose = Pose((0.0, 0.0, 0.0), (0.7 * LENGTH, 0.0, 0.0))
+    pose = HeldPose((0.0, 0.0, 0.0), (0.7 * LENGTH, 0.0, 0.0))
     rest = np.zeros(model.chain.n_rests)
     rest[model.chain.n_cells : 2 * model.chain.n_cells] = 2.0
     found = solve_equilibrium(model, model.nominal, rest, pose)

@@ -7,7 +7,7 @@ from perturbed import any_rest, any_shapes
 
 from dlo_casadi.effects import (
     AxialStretch,
-    Cable,
+    CableData,
     ClampAngle,
     EdgeBias,
     EndSpring,
@@ -20,7 +20,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, potential, rest_after
 from dlo_casadi.rod.chain import ELEMENTS
 
-CABLE = Cable(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
+CABLE = CableData(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
 # Start, end [m], headings [rad], no camera.
 ENDS = np.array([0.1, 0.2, 0.9, 0.1, 0.2, -0.3, 0.0, 0.0, 0.0])
 EFFECTS = (AxialStretch(), LumpedMass(), RestCurvatureDrift(), ImageScale(), EdgeBias())

@@ -27,12 +27,12 @@ from dlo_casadi.codegen.shapes import (
     pose_table,
     records_of,
 )
-from dlo_casadi.equilibrium.pose import Branch, Pose
+from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
 
 # Poses, or rows of numbers laid out as dlo_pose in the C header.
-Poses = Sequence[Pose] | FloatArray
+Poses = Sequence[HeldPose] | FloatArray
 
 # Types of the arguments of functions in the header: a pointer, an int, a count (size_t).
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "n": ctypes.c_size_t}
@@ -113,12 +113,12 @@ class CompiledSolver:
             getattr(self._c, name).argtypes = [_TYPES[kind] for kind in kinds]
         self._records, self.workspace = records_of(model), self.source.workspace
 
-    def solve(self, pose: Pose, *, warm: Shape | None = None, throw: bool = True) -> Shape:
+    def solve(self, pose: HeldPose, *, warm: Shape | None = None, throw: bool = True) -> Shape:
         """Shape of the cable in one pose.
 
         Parameters
         ----------
-        pose : Pose
+        pose : HeldPose
             Its branch selects which way a cable in a plane turns; without one the result is the
             stable equilibrium of lowest energy. If none turns so, the status is "other_branch".
         warm : Shape, optional
@@ -143,7 +143,7 @@ class CompiledSolver:
             )
         return _shape(out[0], status)
 
-    def step(self, shape: Shape, pose: Pose, *, steps: int = 4) -> Shape:
+    def step(self, shape: Shape, pose: HeldPose, *, steps: int = 4) -> Shape:
         """Shape in a nearby pose after at most `steps` Newton steps; see its `status`.
 
         Raises
@@ -210,7 +210,7 @@ class CompiledSolver:
         shapes = tuple(_shape(record, int(k)) for record, k in zip(out, statuses, strict=True))
         return ShapePath(shapes, int(jump[0]) if jump[0] < len(table) else None)
 
-    def sensitivity(self, shape: Shape, pose: Pose) -> Slope:
+    def sensitivity(self, shape: Shape, pose: HeldPose) -> Slope:
         """Derivatives of a shape by the pose it was solved for.
 
         Raises

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.symbolic import pose_size
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
@@ -221,7 +221,7 @@ def _record(*fields: list[Any]) -> np.dtype[Any]:
 
 
 def pose_table(
-    model: CableModel, poses: Sequence[Pose] | FloatArray, branch: object = None
+    model: CableModel, poses: Sequence[HeldPose] | FloatArray, branch: object = None
 ) -> tuple[FloatArray, int]:
     """Poses (m, k) laid out as dlo_pose, and the C solver's number of their branch.
 
@@ -255,7 +255,7 @@ def _branch_number(branch: object) -> int:
 
 
 def _row(model: CableModel, pose: object) -> FloatArray:
-    if not isinstance(pose, Pose):
+    if not isinstance(pose, HeldPose):
         raise DloError(f"a Pose belongs here, found {pose!r}\n  Try: dlo_casadi.Pose(start, end)")
     if pose.end is None and model.end != "free":
         raise DloError(
@@ -274,7 +274,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     return numbers[: pose_size(model)]
 
 
-def no_equilibrium(status: str, pose: Pose, length: float) -> str:
+def no_equilibrium(status: str, pose: HeldPose, length: float) -> str:
     """Message for a status other than ok."""
     start, end = (", ".join(f"{x:.4f}" for x in place or ()) for place in (pose.start, pose.end))
     hint = _HINTS.get(status)

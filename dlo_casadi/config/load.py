@@ -19,8 +19,7 @@ from dlo_casadi.config.sections import (
     SkippedPose,
 )
 from dlo_casadi.config.values import Range, Tolerances
-from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, Setup
-from dlo_casadi.effects import Cable as EffectsCable
+from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS
 
@@ -303,7 +302,7 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Proble
         yield Problem(("experiment", "measurement", "std"), text)
     # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
     torsional_stiffness = 1.0 if experiment.in_space else None
-    cable = EffectsCable(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
+    cable = CableData(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
     declared = experiment.tolerances.model_dump()
     taken_up = {
         kind.tolerances[q.name]: q
@@ -325,7 +324,7 @@ def declared_setup(config: Config) -> Setup:
     cable, experiment = config.cable, config.experiment
     measurement = experiment.measurement
     return Setup(
-        cable=EffectsCable(
+        cable=CableData(
             length=cable.length,
             mass=cable.prior_mass,
             diameter=cable.diameter,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.effects import EFFECTS, Effect, Fitted, Load, PointLoad, Setup
-from dlo_casadi.effects.effect import Cable
+from dlo_casadi.effects.cable import CableData
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.thresholds import ALIKE
@@ -56,7 +56,7 @@ class Candidate:
         """Return the model with this effect in the parameters that it is screened in."""
         return self.add_to(model) if self.nuisance else model.with_effect(self.effect.linear())
 
-    def contains(self, other: Candidate, cable: Cable) -> bool:
+    def contains(self, other: Candidate, cable: CableData) -> bool:
         """Whether this is a load at one place that may be the other one."""
         loads = isinstance(self.effect, PointLoad) and isinstance(other.effect, PointLoad)
         own, others = (
@@ -64,7 +64,7 @@ class Candidate:
         )
         return loads and own > others
 
-    def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
+    def of_linear(self, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
         """Qualified parameters, within their bounds, from those that it is screened in."""
         prefix = f"{self.effect.label}."
         own = self.effect.of_linear(

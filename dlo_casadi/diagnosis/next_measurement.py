@@ -13,7 +13,7 @@ from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import student_95
 from dlo_casadi.estimation.descent import refit
@@ -211,7 +211,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     margin = 0.1 * np.maximum(high - low, 0.1 * first.model.cable.length)
     generator = np.random.default_rng(SEED)
     places = np.linspace(0.0, first.model.cable.length, 101)
-    tried: list[Pose] = []
+    tried: list[HeldPose] = []
     for _ in range(TRIED):
         end = generator.uniform(low - margin, high + margin)
         nearest = poses[int(((ends - end) ** 2).sum(axis=1).argmin())]
@@ -219,7 +219,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
         if 0.03 < reach / first.model.cable.length < 0.97:
             tried.append(replace(nearest, end=tuple(map(float, end)), name="next"))
     rivals = [predict_each(fit.model, fit.p, _rest_now(fit), tried) for fit in (first, second)]
-    best: tuple[float, Pose, Prediction, Prediction] | None = None
+    best: tuple[float, HeldPose, Prediction, Prediction] | None = None
     for pose, one, other in zip(tried, *rivals, strict=True):
         if one is None or other is None:
             continue

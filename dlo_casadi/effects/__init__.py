@@ -4,7 +4,7 @@ from dlo_casadi.effects.across_gravity import GravityTilt as GravityTilt
 from dlo_casadi.effects.across_gravity import SideLoad as SideLoad
 from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy as BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening as BendingSoftening
-from dlo_casadi.effects.cable import Cable as Cable
+from dlo_casadi.effects.cable import CableData as CableData
 from dlo_casadi.effects.camera_frame import CameraFrame as CameraFrame
 from dlo_casadi.effects.clamps import ClampAngle as ClampAngle
 from dlo_casadi.effects.clamps import ClampCompliance as ClampCompliance

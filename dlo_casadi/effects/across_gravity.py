@@ -6,7 +6,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Load, Params
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.node import rotated, rotation
@@ -32,7 +32,7 @@ class LoadAcrossGravity(Load):
             return cls()
         return cls(vertical="xyz"[int(np.argmax(np.abs(setup.gravity)))])
 
-    def components(self, name: str, cable: Cable) -> tuple[str, ...]:
+    def components(self, name: str, cable: CableData) -> tuple[str, ...]:
         """Names of a parameter's components: in a plane it is a single number."""
         if len(cable.axes) == 2:
             return (name,)
@@ -56,13 +56,13 @@ class SideLoad(LoadAcrossGravity):
 
     name = "side_load"
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the force per length."""
         weight = 9.81 * cable.mass / cable.length
         names = self.components("force_per_length", cable)
         return Parameter.symmetric(names, "N/m", 0.1 * weight, 0.5 * weight)
 
-    def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def resultant(self, s: ca.SX, gravity: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Force on the part beyond s."""
         names = self.components("force_per_length", cable)
         if len(names) == 1:
@@ -94,7 +94,7 @@ class GravityTilt(LoadAcrossGravity):
 
     name = "gravity_tilt"
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the angles."""
         return Parameter.symmetric(self.components("angle", cable), "rad", 0.05, 0.5)
 

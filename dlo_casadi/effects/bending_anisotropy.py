@@ -5,7 +5,7 @@ from math import atan2, copysign, hypot, pi
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Effect, Params, SectionLaw
 from dlo_casadi.effects.setup import Setup
 
@@ -58,7 +58,7 @@ class BendingAnisotropy(SectionLaw):
         """Return the same section, in terms of its deviation from the mean stiffness."""
         return _LinearAnisotropy(label=self.label)
 
-    def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
+    def of_linear(self, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
         """Ratio and angle of the axis nearer to y; the ratio is at most LARGEST."""
         a, b = values["difference"], values["coupling"]
         size = min(hypot(a, b), (LARGEST - 1) / (LARGEST + 1))

@@ -5,7 +5,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Params, SectionLaw
 
 # Gauss-Legendre on [0, 1]; ten points integrate the law to 1e-9 for |k|/c up to 5.
@@ -42,22 +42,22 @@ class BendingSoftening(SectionLaw):
     name = "bending_softening"
     inverses: ClassVar = {"softness": ("curvature_scale", "1/m")}
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the softness."""
         return (Parameter("softness", "m", scale=0.1 * cable.length, lower=0.0, upper=1e3),)
 
-    def of_bend(self, square: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def of_bend(self, square: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Energy over EI k^2 / 2: 2 int_0^1 t / (1 + t |k|/c) dt, by quadrature in t."""
         ratio = self._ratio(square, cable, params)
         terms = [2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)]
         return sum(terms, start=ca.SX(0))
 
-    def tangent(self, square: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def tangent(self, square: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """dM/dk over EI: (1 + |k|/c)^-2."""
         return 1 / (1 + self._ratio(square, cable, params)) ** 2
 
     @staticmethod
-    def _ratio(square: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def _ratio(square: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """|k|/c, rounded."""
         delta = _ROUNDING * cable.curvature_scale
         return params["softness"] * (ca.sqrt(square + delta**2) - delta)

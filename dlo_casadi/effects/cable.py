@@ -14,7 +14,7 @@ _FARTHEST = 1e6
 
 
 @dataclass(frozen=True)
-class Cable:
+class CableData:
     """The declared data of a cable.
 
     Parameters

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint, vector
 from dlo_casadi.rod.node import rotated, rotation
 
@@ -37,7 +37,7 @@ class CameraFrame(MeasurementEffect):
         **dict.fromkeys(_TRANSLATIONS, "camera_translation"),
     }
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the rotation and the translation."""
         bound, scale = 0.3 * cable.length, 0.002 * cable.length
         return (

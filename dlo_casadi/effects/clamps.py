@@ -6,7 +6,7 @@ from typing import ClassVar, Self
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Fitted, Params
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.node import quaternion_product, rotation
@@ -60,7 +60,7 @@ class ClampTurn(ClampEffect):
     # Parameters of one clamp, behind the name of its end.
     errors: ClassVar[tuple[str, ...]]
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the errors of the clamped ends."""
         names = (f"{side}_{error}" for side in self.sides for error in self.errors)
         return Parameter.symmetric(names, "rad", 0.05, 0.9)
@@ -132,7 +132,7 @@ class ClampCompliance(ClampEffect):
 
     name = "clamp_compliance"
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the compliances of the clamped ends."""
         # A tenth of what the whole cable turns by under an even moment.
         scale = 0.1 * cable.length / cable.bending_stiffness

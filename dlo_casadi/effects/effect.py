@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.errors import counted
 from dlo_casadi.rod.element import Cell
@@ -114,13 +114,13 @@ class Effect:
         if not self.label:
             object.__setattr__(self, "label", self.name)
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Parameters with units, bounds and the nominal value at which the effect vanishes."""
         if not self.declared:
             raise TypeError(f"{type(self).__name__} declares no parameters")
         return self.declared
 
-    def per_pose(self, cable: Cable) -> tuple[str, ...]:
+    def per_pose(self, cable: CableData) -> tuple[str, ...]:
         """Names of its unknowns in each pose, out of `deviation_names`."""
         return ()
 
@@ -173,7 +173,7 @@ class Effect:
         """
         return self
 
-    def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
+    def of_linear(self, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
         """Convert parameters of `linear` to those of this effect."""
         return dict(values)
 
@@ -191,11 +191,11 @@ class SectionLaw(Effect):
     # Whether the bending stiffness is the same about all axes.
     isotropic: ClassVar[bool] = True
 
-    def along(self, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+    def along(self, cell: Cell, cable: CableData, params: Params) -> ca.SX:
         """Factor on the stiffnesses against bending and torsion of a cell."""
         return ca.SX(1)
 
-    def of_bend(self, square: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def of_bend(self, square: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Factor on the bending energy.
 
         Parameters
@@ -205,7 +205,7 @@ class SectionLaw(Effect):
         """
         return ca.SX(1)
 
-    def tangent(self, square: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def tangent(self, square: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Factor on the stiffness against a small change of the bend k.
 
         d^2/dk^2 (of_bend k^2 / 2) = m + 2 k^2 m',   m = d(of_bend k^2)/d(k^2)
@@ -225,7 +225,7 @@ class Kinematics(Effect):
     kind: ClassVar[str] = "kinematics"
     extensible: ClassVar[bool] = False
 
-    def stretch(self, cable: Cable, params: Params) -> ca.SX | float:
+    def stretch(self, cable: CableData, params: Params) -> ca.SX | float:
         """Uniform factor on the declared length. Factors multiply."""
         return 1.0
 
@@ -252,7 +252,9 @@ class Load(Effect):
         """Return the direction and size of gravity (dimension,) [m/s^2] that every weight feels."""
         return gravity
 
-    def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX | float:
+    def resultant(
+        self, s: ca.SX, gravity: ca.SX, cable: CableData, params: Params
+    ) -> ca.SX | float:
         """Force (dimension,) [N] of a distributed load on the part of the cable beyond s [m].
 
         A dead load has the energy V = - int resultant . dr/ds ds, a sum over elements, plus a term
@@ -272,7 +274,7 @@ class Load(Effect):
 class PointLoad(Load):
     """A load at one place of the cable, its parameter `position` [m]."""
 
-    def position(self, cable: Cable) -> Parameter:
+    def position(self, cable: CableData) -> Parameter:
         """Arc length of the place from the start fixture."""
         length = cable.length
         return Parameter("position", "m", length / 2, 0.1 * length, 0.0, length)
@@ -336,7 +338,7 @@ class StateEffect(Effect):
 
     kind: ClassVar[str] = "state"
 
-    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Rest strain [1/m] of a cell after a pose of this strain has been held.
 
         The curvature in a plane; in space the twist, then curvatures about the axes y and z.

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import ClassVar
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vector
 from dlo_casadi.effects.setup import Setup
 
@@ -22,7 +22,7 @@ class EndOffset(BoundaryEffect):
     name = "end_offset"
     tolerances: ClassVar = {"dx": "end", "dy": "end", "dz": "end"}
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the offset."""
         names = (f"d{axis}" for axis in cable.axes)
         return Parameter.symmetric(names, "m", 0.002 * cable.length, 0.3 * cable.length)

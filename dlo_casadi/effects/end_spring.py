@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import BoundaryEffect, Fitted, Params, Scan
 from dlo_casadi.effects.setup import Setup
 
@@ -29,7 +29,7 @@ class _PinSpring(BoundaryEffect):
     # The end that the pin holds.
     side: ClassVar[str]
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare stiffness and relaxed heading."""
         scale = cable.bending_stiffness / cable.length
         return (

@@ -5,7 +5,7 @@ from typing import Self
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 from dlo_casadi.effects.setup import Setup
 
@@ -36,7 +36,7 @@ class ImageDistortion(MeasurementEffect):
 
     center: tuple[float, float] = (0.0, 0.0)
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the coefficient."""
         return (Parameter("coefficient", "1/m^2", scale=0.005 / cable.length**2),)
 

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 
 
@@ -23,7 +23,7 @@ class ImageScale(MeasurementEffect):
     dimensions = (2,)
     tolerances: ClassVar = {"factor": "scale"}
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the factor."""
         return (Parameter("factor", nominal=1.0, scale=0.002, lower=0.7, upper=1.4),)
 

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Kinematics, Params
 
 
@@ -22,12 +22,12 @@ class LengthError(Kinematics):
     name = "length_error"
     tolerances: ClassVar = {"length_difference": "length"}
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the difference."""
         length = cable.length
         return Parameter.symmetric(("length_difference",), "m", 0.002 * length, 0.3 * length)
 
-    def stretch(self, cable: Cable, params: Params) -> ca.SX:
+    def stretch(self, cable: CableData, params: Params) -> ca.SX:
         """Return true over declared length."""
         return 1 + params["length_difference"] / cable.length
 

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Fitted, Params, PointForceAt, PointLoad
 from dlo_casadi.thresholds import ALONG_GRAVITY
 
@@ -30,7 +30,7 @@ class LumpedMass(PointLoad):
     name = "lumped_mass"
     carried = True
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare mass and position."""
         return (
             Parameter("mass", "kg", lower=0.0, scale=0.1 * cable.mass, upper=3 * cable.mass),

@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Load, Params
 from dlo_casadi.effects.setup import Setup
 
@@ -32,6 +32,6 @@ class MassError(Load):
         """Where forces are measured, and the cable has weight."""
         return super().applies(setup) and bool(setup.readings) and any(setup.gravity)
 
-    def resultant(self, s: ca.SX, gravity: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def resultant(self, s: ca.SX, gravity: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Weight of the part beyond s, over the declared one."""
         return (params["factor"] - 1) * cable.mass * gravity * (1 - s / cable.length)

@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Params, PointForceAt, PointLoad, vector
 
 
@@ -22,7 +22,7 @@ class PointForce(PointLoad):
 
     name = "point_force"
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the force and its place."""
         names, scale = (f"f{axis}" for axis in cable.axes), 0.1 * 9.81 * cable.mass
         return (*Parameter.symmetric(names, "N", scale, 30 * scale), self.position(cable))
@@ -50,12 +50,12 @@ class UnknownPull(PointLoad):
 
     name = "unknown_pull"
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the mean force and its place."""
         names, scale = (f"f{axis}" for axis in cable.axes), 9.81 * cable.mass
         return (*Parameter.symmetric(names, "N", scale, 10 * scale), self.position(cable))
 
-    def per_pose(self, cable: Cable) -> tuple[str, ...]:
+    def per_pose(self, cable: CableData) -> tuple[str, ...]:
         """f_j."""
         return tuple(f"unknown_force_{axis}" for axis in cable.axes)
 

@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Params, Scan, StateEffect
 from dlo_casadi.effects.setup import Setup
 
@@ -29,7 +29,7 @@ class RestCurvatureDrift(StateEffect):
     name = "rest_curvature_drift"
     declared = (Parameter("rate", scale=0.05, lower=0.0, upper=0.95),)
 
-    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Rest strain after the pose [1/m]."""
         return rest + params["rate"] * (strain - rest)
 
@@ -59,7 +59,7 @@ class PlasticSet(StateEffect):
 
     name = "plastic_set"
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare yield curvature and share."""
         turn = cable.curvature_scale
         return (
@@ -72,7 +72,7 @@ class PlasticSet(StateEffect):
         bend = setup.largest_bend or setup.cable.curvature_scale
         return tuple({"yield_curvature": share * bend} for share in YIELDS)
 
-    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: Cable, params: Params) -> ca.SX:
+    def next_rest(self, rest: ca.SX, strain: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Rest strain after the pose [1/m].
 
         With the kinks rounded, (ramp(|b| - y) - ramp(-|b| - y)) / |b| is 1 - 2 y / (S_- + S_+),

@@ -6,7 +6,7 @@ from typing import Self
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.ends import REACTIONS
@@ -36,7 +36,7 @@ class SensorBias(MeasurementEffect):
     end_force: bool = True
     end_moment: bool = True
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the components of what is measured."""
         force = 0.01 * 9.81 * cable.mass
         turns = ("_x", "_y", "_z") if len(cable.axes) == 3 else ("",)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from dlo_casadi.effects.cable import Cable
+from dlo_casadi.effects.cable import CableData
 
 
 @dataclass(frozen=True)
@@ -12,7 +12,7 @@ class Setup:
 
     Parameters
     ----------
-    cable : Cable
+    cable : CableData
     start : "pinned" or "clamped"
     end : "pinned", "clamped" or "free"
     gravity : (dimension,) [m/s^2]
@@ -37,7 +37,7 @@ class Setup:
         Largest |curvature - rest curvature| of all poses.
     """
 
-    cable: Cable
+    cable: CableData
     start: str = "pinned"
     end: str = "pinned"
     gravity: tuple[float, ...] = (0.0, -9.81)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import PLACES, Params, Scan, SectionLaw
 from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.element import Cell
@@ -27,7 +27,7 @@ class StiffnessGradient(SectionLaw):
     name = "stiffness_gradient"
     declared = Parameter.symmetric(("slope",), "", 0.2, 0.95)
 
-    def along(self, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+    def along(self, cell: Cell, cable: CableData, params: Params) -> ca.SX:
         """Mean of the linear stiffness over the cell."""
         return 1 + params["slope"] * (cell.middle * 2 / cable.length - 1)
 
@@ -51,7 +51,7 @@ class StiffSection(SectionLaw):
 
     name = "stiff_section"
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the section's ends and its factor."""
         length = cable.length
         return (
@@ -86,7 +86,7 @@ class StiffSection(SectionLaw):
         """Its middle."""
         return (values["start"] + values["end"]) / 2
 
-    def along(self, cell: Cell, cable: Cable, params: Params) -> ca.SX:
+    def along(self, cell: Cell, cable: CableData, params: Params) -> ca.SX:
         """Harmonic mean of the stiffness over the cell."""
         low, high, rounding = cell.low, cell.high, 0.25 * cell.mesh
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Cable, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Effect, Params, PointLoad, SpringAt, vector
 from dlo_casadi.effects.setup import Setup
 
@@ -35,7 +35,7 @@ class Tether(PointLoad):
     name = "tether"
     n_springs = 1
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare stiffness, place and anchor."""
         names, length = (f"anchor_{axis}" for axis in cable.axes), cable.length
         anchor = Parameter.symmetric(names, "m", 0.1 * length, FARTHEST * length)
@@ -55,7 +55,7 @@ class Tether(PointLoad):
         """Return the same spring by its stiffness and its force at the origin."""
         return _LinearTether(label=self.label)
 
-    def of_linear(self, cable: Cable, values: Mapping[str, float]) -> dict[str, float]:
+    def of_linear(self, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
         """Stiffness, place and anchor a = f / k; k is raised where a would lie too far away."""
         force = {axis: values[f"f{axis}"] for axis in cable.axes}
         least = math.hypot(*force.values()) / (FARTHEST * cable.length)
@@ -74,7 +74,7 @@ class _LinearTether(PointLoad):
     name = "linear_tether"
     n_springs = 1
 
-    def parameters(self, cable: Cable) -> tuple[Parameter, ...]:
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare stiffness, place and the force on the place when it is at the origin."""
         names = (f"f{axis}" for axis in cable.axes)
         force = Parameter.symmetric(names, "N", 0.1 * 9.81 * cable.mass)
@@ -86,6 +86,6 @@ class _LinearTether(PointLoad):
         return (spring,)
 
 
-def _stiffness(cable: Cable) -> Parameter:
+def _stiffness(cable: CableData) -> Parameter:
     scale = 9.81 * cable.mass / cable.length
     return Parameter("stiffness", "N/m", scale=scale, lower=0.0, upper=1e3 * scale)

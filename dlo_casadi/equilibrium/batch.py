@@ -15,7 +15,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.minima import TOLERANCE, descend, stepped
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -36,11 +36,11 @@ class BatchEquilibrium:
     Parameters
     ----------
     model : CableModel
-    poses : sequence of Pose
+    poses : sequence of HeldPose
         In the order in which they were taken.
     """
 
-    def __init__(self, model: CableModel, poses: Sequence[Pose]) -> None:
+    def __init__(self, model: CableModel, poses: Sequence[HeldPose]) -> None:
         self.model = model
         self.poses = tuple(poses)
         self.m = len(self.poses)

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 
 _NEWTON_STEPS = 12
 # Polynomial coefficients (powers of u, weights) of the interpolants' derivatives by u.
@@ -187,7 +187,7 @@ class NodeCurve:
         return np.linalg.norm(points - self.at(self.nearest(points)), axis=1)
 
 
-def chord_places(points: FloatArray, pose: Pose, length: float) -> FloatArray:
+def chord_places(points: FloatArray, pose: HeldPose, length: float) -> FloatArray:
     """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L.
 
     Chords across gaps are shorter than the cable: with two fixtures, lengths are scaled to L.

@@ -11,7 +11,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import (
     EDGE,
@@ -146,7 +146,7 @@ class CableShape:
     ----------
     cable : FittedCable
         The fitted cable.
-    pose : Pose
+    pose : HeldPose
         How its ends are held; with the `turns` or the `branch` of this shape where the cable may
         hang on either of two sides.
     equilibrium : Equilibrium
@@ -164,7 +164,7 @@ class CableShape:
     """
 
     cable: FittedCable
-    pose: Pose
+    pose: HeldPose
     equilibrium: Equilibrium
     curve: CableCurve
     seen: CableCurve
@@ -234,7 +234,7 @@ class CableShape:
         }
 
 
-def shape_in(cable: FittedCable, pose: Pose) -> CableShape:
+def shape_in(cable: FittedCable, pose: HeldPose) -> CableShape:
     """Solve a pose of a fitted cable, for both sides where it may hang on either.
 
     Raises
@@ -259,7 +259,7 @@ def shape_in(cable: FittedCable, pose: Pose) -> CableShape:
     plain = replace(model, effects=effects, priors={}) if effects != model.effects else model
     kept = [name in plain.names for name in model.names]
 
-    def shape(pose: Pose, eq: Equilibrium) -> CableShape:
+    def shape(pose: HeldPose, eq: Equilibrium) -> CableShape:
         given = [Inputs.of(known, rest, pose.vector[None]) for known in (p[kept], p)]
         true, seen = (
             CableCurve.of(model.cable.length, assembly_of(one).curve(eq.shapes, known)[0])

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import Chain
@@ -40,7 +40,9 @@ _HALF_ANGLE = (
 _FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def first_nodes(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> list[FloatArray]:
+def first_nodes(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose
+) -> list[FloatArray]:
     """First guesses of the nodes (n_nodes, coordinates): `guesses`, or `guessed_frames`."""
     if model.node is Frame:
         return guessed_frames(model, p, rest, pose)
@@ -48,7 +50,7 @@ def first_nodes(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) 
 
 
 def _held(
-    model: CableModel, p: FloatArray, pose: Pose
+    model: CableModel, p: FloatArray, pose: HeldPose
 ) -> tuple[FloatArray, FloatArray | None, Clamps]:
     """Inputs of guesses: arc lengths of the nodes, end minus start, and frames of clamps.
 
@@ -68,7 +70,7 @@ def _held(
 # ---- in a plane ----------------------------------------------------------------------------------
 
 
-def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose) -> list[FloatArray]:
+def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> list[FloatArray]:
     """First guesses of the headings, in the order in which they are tried.
 
     Pinned at both ends:
@@ -246,7 +248,7 @@ def _curved(n: int, u: FloatArray, bent: FloatArray, chord: FloatArray) -> list[
 
 
 def guessed_frames(
-    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose
 ) -> list[FloatArray]:
     """First guesses of the frames (n_nodes, 4) of a cable in space.
 
@@ -370,7 +372,7 @@ def same_sign(quaternions: FloatArray) -> FloatArray:
 # ---- along a measured line -----------------------------------------------------------------------
 
 
-def line_nodes(points: FloatArray, pose: Pose, chain: Chain, places: FloatArray) -> FloatArray:
+def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatArray) -> FloatArray:
     """Nodes (n_nodes, coordinates) along a measured line, from its chords.
 
     The chords are some hundredths of the length; `places` (K,) [m] are the points' arc lengths. In

@@ -31,7 +31,7 @@ from dlo_casadi.equilibrium.equilibrium import (
     Equilibrium,
     equilibria_of,
 )
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential
@@ -205,7 +205,7 @@ def run_ipopt(solver: ca.Function, **given: Any) -> tuple[dict[str, ca.DM], dict
 
 
 def by_ipopt(
-    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, phi: FloatArray
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, phi: FloatArray
 ) -> Equilibrium | None:
     """Equilibrium of a planar cable that IPOPT reaches from one first guess; None if it does not.
 
@@ -217,7 +217,7 @@ def by_ipopt(
     ----------
     p, rest
         As in `solve.solve_equilibrium`.
-    pose : Pose
+    pose : HeldPose
     phi : (n_nodes,) [rad]
     """
     count, conditions = model.chain.n_nodes, model.n_multipliers

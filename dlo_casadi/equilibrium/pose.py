@@ -19,7 +19,7 @@ SIGNS: dict[Branch, int] = {"ccw": 1, "cw": -1}
 
 
 @dataclass(frozen=True)
-class Pose:
+class HeldPose:
     """End conditions of one pose as declared.
 
     Parameters

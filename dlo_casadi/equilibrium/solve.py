@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.equilibrium import (
 )
 from dlo_casadi.equilibrium.guesses import first_nodes
 from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend
-from dlo_casadi.equilibrium.pose import SIGNS, Pose
+from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import COARSE_MESH, CableModel
@@ -27,18 +27,18 @@ MOST_MOVED, MOST_TURNED = 0.05, 0.2
 # Number of lowest minima of the coarse mesh, in space, that are solved on the model's own mesh,
 # beside the lowest on the other side.
 FEW = 2
-# Values of `Pose.turns` for the two ways round of half a turn.
+# Values of `HeldPose.turns` for the two ways round of half a turn.
 WAYS_ROUND = (0.5, -0.5)
 # Largest difference [turns] of a twist from the one asked for before turns count as shed. Of 7,500
 # random problems with up to four turns 1,369 differ by more than 1.35, 7 by 1.15 to 1.35.
 MOST_SHED = 1.3
 
 
-def _no_equilibrium(pose: Pose, what: str, hint: str) -> EquilibriumError:
+def _no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
     return EquilibriumError(f"{what}.\n  Try: {hint}", pose.name, pose.end)
 
 
-def out_of_reach(model: CableModel, p: FloatArray, pose: Pose) -> EquilibriumError | None:
+def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
     """Why a pose has no equilibrium: its end is missing or too far, or a number is not finite."""
     if pose.end is None and model.end != "free":
         what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
@@ -68,7 +68,7 @@ def solve_equilibrium(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
-    pose: Pose,
+    pose: HeldPose,
     *,
     x_init: FloatArray | None = None,
 ) -> Equilibrium:
@@ -88,7 +88,7 @@ def solve_equilibrium(
         In the order of `model.names`, SI units.
     rest : (n_rests,) [1/m]
         Rest curvature of the bending cells: `model.rest_basis @ coefficients`.
-    pose : Pose
+    pose : HeldPose
     x_init : (n_nodes, coordinates), optional
 
     Raises
@@ -112,7 +112,7 @@ def solve_equilibria(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
-    poses: Sequence[Pose],
+    poses: Sequence[HeldPose],
     starts: Sequence[FloatArray | None] | None = None,
 ) -> list[Equilibrium | EquilibriumError]:
     """`solve_equilibrium` for many poses at once: for each its shape, or why there is none.
@@ -124,7 +124,7 @@ def solve_equilibria(
     ----------
     p, rest
         As in `solve_equilibrium`.
-    poses : sequence of Pose
+    poses : sequence of HeldPose
     starts : sequence of (n_nodes, coordinates) or None, optional
         `x_init` of each pose.
     """
@@ -157,7 +157,7 @@ def solve_equilibria(
     return [one for j, error in errors.items() if (one := found.get(j) or error)]
 
 
-def ways_of(model: CableModel, pose: Pose) -> list[Pose]:
+def ways_of(model: CableModel, pose: HeldPose) -> list[HeldPose]:
     """Copies of a pose with each branch, or way round, that it may name; ccw first."""
     if pose.node is Heading:
         return [replace(pose, branch=name) for name in SIGNS]
@@ -165,7 +165,7 @@ def ways_of(model: CableModel, pose: Pose) -> list[Pose]:
 
 
 def _chosen(
-    model: CableModel, pose: Pose, start: FloatArray | None, found: list[Equilibrium]
+    model: CableModel, pose: HeldPose, start: FloatArray | None, found: list[Equilibrium]
 ) -> Equilibrium | EquilibriumError:
     """The equilibrium chosen among those found from a pose's first guesses, or the error.
 
@@ -222,7 +222,7 @@ class _Search:
     rest: FloatArray
 
     def reached(
-        self, poses: Sequence[Pose], starts: Sequence[FloatArray | None]
+        self, poses: Sequence[HeldPose], starts: Sequence[FloatArray | None]
     ) -> list[list[Equilibrium]]:
         """Equilibria of each pose, in the order of the first guesses that lead to them."""
         found: list[list[Equilibrium]] = [[] for _ in poses]
@@ -240,7 +240,7 @@ class _Search:
         return found
 
     def _first(
-        self, poses: Sequence[Pose], starts: Sequence[FloatArray | None]
+        self, poses: Sequence[HeldPose], starts: Sequence[FloatArray | None]
     ) -> tuple[IntArray, Shapes]:
         """First guesses of all poses, or the given starts, and the pose of each."""
         rows = [
@@ -252,13 +252,13 @@ class _Search:
         return of, Shapes.declared(x, np.zeros((len(x), self.model.n_border)))
 
     def _descend(
-        self, poses: Sequence[Pose], of: IntArray, shapes: Shapes
+        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes
     ) -> tuple[Inputs, Minima]:
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
         return given, descend(assembly_of(self.model), shapes, given)
 
     def _descended(
-        self, poses: Sequence[Pose], of: IntArray, shapes: Shapes
+        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes
     ) -> list[list[Equilibrium]]:
         """Equilibria of each pose to which the energy descends from shapes `of` these poses."""
         given, minima = self._descend(poses, of, shapes)
@@ -282,7 +282,7 @@ class _Search:
                 out[j].append(eq)
         return out
 
-    def _likely(self, poses: Sequence[Pose]) -> tuple[IntArray, Shapes]:
+    def _likely(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
         """The lowest distinct minima of a coarse mesh on the model's mesh, and the pose of each."""
         model, coarse = self.model, self.model.coarse
         search = _Search(coarse, self.p, coarse_rest(model, coarse, self.rest))
@@ -325,7 +325,9 @@ def _holds(twist: FloatArray, turns: FloatArray | float) -> BoolArray:
     return (np.abs(twist - turns) <= MOST_SHED) | (turns == 0)
 
 
-def on_other_side(model: CableModel, pose: Pose, x: FloatArray, others: FloatArray) -> BoolArray:
+def on_other_side(
+    model: CableModel, pose: HeldPose, x: FloatArray, others: FloatArray
+) -> BoolArray:
     """Whether other shapes (m, n_nodes, coordinates) hang on the other side of a shape.
 
     With a free end these turn the other way; between two clamps, where twists differ by full
@@ -338,7 +340,12 @@ def on_other_side(model: CableModel, pose: Pose, x: FloatArray, others: FloatArr
 
 
 def continued(
-    model: CableModel, p: FloatArray, rest: FloatArray, pose: Pose, before: Pose, x: FloatArray
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    pose: HeldPose,
+    before: HeldPose,
+    x: FloatArray,
 ) -> Equilibrium:
     """Shape of a cable whose ends are moved quasi-statically from another pose.
 
@@ -349,8 +356,8 @@ def continued(
     ----------
     p, rest
         As in `solve_equilibrium`.
-    pose : Pose
-    before : Pose
+    pose : HeldPose
+    before : HeldPose
     x : (n_nodes, coordinates)
         Nodes of the cable in the pose `before`.
 

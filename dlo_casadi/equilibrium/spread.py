@@ -10,7 +10,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import ways_of
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -97,7 +97,7 @@ def displacements(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
-    pose: Pose,
+    pose: HeldPose,
     found: Equilibrium,
     uncertainty: Uncertainty,
     s: FloatArray,
@@ -166,7 +166,7 @@ def tipping_of(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
-    pose: Pose,
+    pose: HeldPose,
     eq: Equilibrium,
     other: Equilibrium,
     uncertainty: Uncertainty,
@@ -190,7 +190,7 @@ def tipping_of(
     return Tipping(tipping(model, eq, other), std / _lever(model, eq, other))
 
 
-def sides_of(model: CableModel, pose: Pose, *pair: Equilibrium) -> list[Pose]:
+def sides_of(model: CableModel, pose: HeldPose, *pair: Equilibrium) -> list[HeldPose]:
     """Copies of a pose that name the side of each of two equilibria."""
     ways = ways_of(model, pose)
     turned = [float(model.node.turning(eq.x)) for eq in pair]

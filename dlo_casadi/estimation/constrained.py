@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
@@ -252,7 +252,7 @@ class EnergyGap:
     def between(
         cls,
         model: CableModel,
-        pose: Pose,
+        pose: HeldPose,
         pair: tuple[Equilibrium, Equilibrium],
         given: tuple[FloatArray, FloatArray],
         along: tuple[FloatArray, FloatArray],
@@ -279,7 +279,7 @@ class EnergyGap:
 
 def _slope(
     model: CableModel,
-    pose: Pose,
+    pose: HeldPose,
     eq: Equilibrium,
     given: tuple[FloatArray, FloatArray],
     along: tuple[FloatArray, FloatArray],

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.equilibrium.guesses import line_nodes
-from dlo_casadi.equilibrium.pose import Pose, PoseBranch
+from dlo_casadi.equilibrium.pose import HeldPose, PoseBranch
 from dlo_casadi.equilibrium.solve import continued, solve_equilibria, ways_of
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.problem import Problem, Values
@@ -58,7 +58,7 @@ class MeasuredBranch:
     branch : "ccw", "cw", "previous" or None
         What the pose has to name for this equilibrium to be predicted; None if no name does.
     turns : 0.5, -0.5 or None
-        The same of a cable in space that is twisted the other way round, see `Pose`.
+        The same of a cable in space that is twisted the other way round, see `HeldPose`.
     other_side : bool
         Whether it is a side of the cable, see `CableModel.tipped_by`, and the pose tells none.
     """
@@ -73,7 +73,7 @@ def predict_each(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
-    poses: Sequence[Pose],
+    poses: Sequence[HeldPose],
     starts: Sequence[FloatArray | None] | None = None,
 ) -> list[Prediction | None]:
     """Predict poses each of which is the first one; see `predict_poses`."""
@@ -88,7 +88,7 @@ def predict_poses(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
-    poses: Sequence[Pose],
+    poses: Sequence[HeldPose],
     starts: Sequence[FloatArray | None] | None = None,
 ) -> list[Prediction | None]:
     """Predict poses in the order in which they are taken; None where there is no equilibrium.
@@ -113,7 +113,7 @@ def predict_poses(
     apart = predict_each(model, p, rest, [poses[j] for j in alone], [given[j] for j in alone])
     known = dict(zip(alone, apart, strict=True))
     out: list[Prediction | None] = []
-    last: tuple[Pose, FloatArray] | None = None
+    last: tuple[HeldPose, FloatArray] | None = None
     for j, (pose, start) in enumerate(zip(poses, given, strict=True)):
         if j in known:
             found = known[j]
@@ -138,7 +138,7 @@ def _seen(
     model: CableModel,
     p: FloatArray,
     rest: FloatArray,
-    poses: Sequence[Pose],
+    poses: Sequence[HeldPose],
     equilibria: Sequence[Equilibrium],
 ) -> list[Prediction]:
     """Equilibria of poses as camera and sensors would see them."""
@@ -187,13 +187,13 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
     return Shapes.declared(x, lam)
 
 
-def _tells_no_side(model: CableModel, pose: Pose) -> bool:
+def _tells_no_side(model: CableModel, pose: HeldPose) -> bool:
     """Whether a cable has sides, see `CableModel.tipped_by`, of which the pose tells none."""
     return model.tipped_by is not None and not pose.branch and not pose.turns
 
 
 def predict_other_side(
-    model: CableModel, p: FloatArray, pose: Pose, known: Prediction
+    model: CableModel, p: FloatArray, pose: HeldPose, known: Prediction
 ) -> Prediction | None:
     """What a prediction would be on the other side, see `Equilibrium`; None where there is none."""
     other = known.equilibrium.other_side
@@ -265,7 +265,7 @@ def measured_branches(
     others = measured_elsewhere(model, p, rest, measured, predictions, fitted)
     told = _told(model, p, [item.pose for item in measured], others)
     out: list[MeasuredBranch | None] = []
-    last: tuple[Pose, FloatArray] | None = None
+    last: tuple[HeldPose, FloatArray] | None = None
     for item, known, found, way in zip(measured, predictions, others, told, strict=True):
         branch = None
         if found is not None:
@@ -287,14 +287,14 @@ def _square(prediction: Prediction, item: MeasuredPose) -> float:
 
 
 def _told(
-    model: CableModel, p: FloatArray, poses: Sequence[Pose], others: Sequence[Prediction | None]
-) -> list[Pose | None]:
+    model: CableModel, p: FloatArray, poses: Sequence[HeldPose], others: Sequence[Prediction | None]
+) -> list[HeldPose | None]:
     """Poses that tell the branch or the turns for which others are predicted, where one does."""
     ways = [
         [] if found is None or pose.turns else ways_of(model, pose)
         for pose, found in zip(poses, others, strict=True)
     ]
-    out: list[Pose | None] = [None] * len(poses)
+    out: list[HeldPose | None] = [None] * len(poses)
     asked = [j for j, own in enumerate(ways) if own]
     for group in [[j] for j in asked] if model.has_state else [asked]:
         of = [(j, way) for j in group for way in ways[j]]
@@ -311,9 +311,9 @@ def _told(
 def _continues(
     model: CableModel,
     p: FloatArray,
-    pose: Pose,
+    pose: HeldPose,
     found: Prediction,
-    last: tuple[Pose, FloatArray] | None,
+    last: tuple[HeldPose, FloatArray] | None,
 ) -> bool:
     """Whether an equilibrium is that to which the pose before it, as measured, leads."""
     if last is not None:

@@ -34,7 +34,7 @@ from scipy.optimize import minimize
 from scipy.special import chdtrc, chdtri
 
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.rest_curvature import MODES, SMOOTHNESS, RestScatter
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -170,7 +170,7 @@ def _held_alike(measured: Sequence[MeasuredPose], length: float) -> list[list[Me
     return groups
 
 
-def _alike(pose: Pose, other: Pose, length: float) -> bool:
+def _alike(pose: HeldPose, other: HeldPose, length: float) -> bool:
     """Whether two poses hold a cable in the same way, up to where they stand."""
     chords = [np.subtract(one.end or one.start, one.start) / length for one in (pose, other)]
     node = Heading if len(pose.start) == 2 else Frame

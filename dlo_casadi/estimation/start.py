@@ -56,7 +56,7 @@ def measured_shapes(
         Of the cable in its end clamp, in space: it decides which of the twists that reach the
         clamp is the one nearest to none.
     turns : (m,), optional
-        Turns of twist, see `Pose`, to which each is the nearest; by default as the poses tell.
+        Turns of twist, see `HeldPose`, to which each is the nearest; by default as the poses tell.
 
     Returns
     -------

@@ -33,7 +33,7 @@ from dlo_casadi.config.values import (
     stacked,
     within,
 )
-from dlo_casadi.effects import EFFECTS, NUISANCES, Cable, Effect, known_effect
+from dlo_casadi.effects import EFFECTS, NUISANCES, CableData, Effect, known_effect
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.equilibrium.fitted_cable import FittedCable, Metadata
 from dlo_casadi.equilibrium.spread import Uncertainty
@@ -213,7 +213,7 @@ def _model(file: ParametersFile) -> CableModel:
     cable = file.cable.model_dump(exclude={"rest_shape"})
     tolerances = {name: row.tolerance for name, row in file.parameters.items()}
     return CableModel(
-        cable=Cable(**cable, straight=file.cable.rest_shape == "straight"),
+        cable=CableData(**cable, straight=file.cable.rest_shape == "straight"),
         n=file.n,
         element=file.element,
         start=file.boundary.start,

@@ -8,7 +8,7 @@ from typing import Literal, Self
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
-from dlo_casadi.effects import Cable, Effect, Kinematics, Load, SectionLaw, StateEffect
+from dlo_casadi.effects import CableData, Effect, Kinematics, Load, SectionLaw, StateEffect
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.rest_curvature import RestCurvature
@@ -32,7 +32,7 @@ STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
 COARSE_MESH = 10
 # Name of the parameter: roll of the end clamp against the declared one [rad], as by a rest twist.
 END_ROLL = "end_roll"
-# Size of the camera's part of `Pose.vector`.
+# Size of the camera's part of `HeldPose.vector`.
 VIEWPOINT_SIZE = 3
 
 
@@ -48,7 +48,7 @@ class CableModel:
 
     Parameters
     ----------
-    cable : Cable
+    cable : CableData
     n : int
         Number of elements.
     element : str
@@ -70,7 +70,7 @@ class CableModel:
     Immutable: `model.with_effect(effect)` returns another model.
     """
 
-    cable: Cable
+    cable: CableData
     n: int = 40
     element: str = DEFAULT_ELEMENT
     start: StartKind = "pinned"
@@ -113,7 +113,7 @@ class CableModel:
 
     @property
     def n_pose(self) -> int:
-        """Size of `pose.Pose.vector`."""
+        """Size of `HeldPose.vector`."""
         return EndConditions.size(self.node) + VIEWPOINT_SIZE
 
     @property

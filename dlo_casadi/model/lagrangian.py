@@ -69,7 +69,7 @@ class Lagrangian:
     p : (n_parameters,)
         In the order of `model.names`.
     pose : (n_pose,)
-        A declared pose, see `pose.Pose.vector`.
+        A declared pose, see `HeldPose.vector`.
     deviation : (n_deviations,)
         Unknowns of one pose of its own, see `deviation_names`.
     lam : (n_border,)

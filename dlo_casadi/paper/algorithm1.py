@@ -25,11 +25,11 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import arc_headings
 from dlo_casadi.equilibrium.minima import ipopt, run_ipopt
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import out_of_reach
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.model.cable_model import CableModel
@@ -153,7 +153,7 @@ class InnerProblem:
 
     Parameters
     ----------
-    cable : Cable
+    cable : CableData
     gravity : (float, float) [m/s^2]
     n : int
         Number of links.
@@ -161,7 +161,9 @@ class InnerProblem:
         beta = c n.
     """
 
-    def __init__(self, cable: Cable, gravity: tuple[float, ...], n: int, c: float = WEIGHT) -> None:
+    def __init__(
+        self, cable: CableData, gravity: tuple[float, ...], n: int, c: float = WEIGHT
+    ) -> None:
         self.chain = Chain(cable.length, n, "link")
         self.weight = cable.mass / n * np.array(gravity)
         self.beta = c * n
@@ -199,7 +201,7 @@ class InnerProblem:
         weight = -(middles @ self.weight).sum()
         return float(bending + weight + self.beta * target.residual(nodes[1:-1]))
 
-    def first_guess(self, pose: Pose, target: Target) -> FloatArray:
+    def first_guess(self, pose: HeldPose, target: Target) -> FloatArray:
         """Arc through both ends on the pose's branch; without one the arc nearer to the points."""
         sides = {"ccw": (1,), "cw": (-1,)}.get(pose.branch or "", (1, -1))
         places, length = self.chain.places, self.chain.length
@@ -332,7 +334,7 @@ def best_parameters(
 
 
 def run_algorithm1(
-    cable: Cable,
+    cable: CableData,
     poses: Sequence[MeasuredPose],
     gravity: tuple[float, ...],
     n: int = 10,
@@ -343,7 +345,7 @@ def run_algorithm1(
 
     Parameters
     ----------
-    cable : Cable
+    cable : CableData
         Its `bending_stiffness` is where k_theta starts; theta_0 starts at zero.
     poses : sequence of MeasuredPose
         Those held out, unreadable or out of reach are not used.
@@ -399,7 +401,7 @@ def run_algorithm1(
 
 
 def _usable(
-    cable: Cable, poses: Sequence[MeasuredPose], gravity: tuple[float, ...], n: int
+    cable: CableData, poses: Sequence[MeasuredPose], gravity: tuple[float, ...], n: int
 ) -> list[MeasuredPose]:
     """Fit poses that have points and are within reach."""
     model = CableModel(cable, n=n, element="link", gravity=gravity)

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench, line_or_markers
 
@@ -22,7 +22,7 @@ class MeasuredPose:
 
     Parameters
     ----------
-    pose : Pose
+    pose : HeldPose
         End conditions as declared.
     sensors : tuple of Sensor
         Those of points first; empty if the pose could not be read.
@@ -34,7 +34,7 @@ class MeasuredPose:
         points where the sensors have means of them.
     """
 
-    pose: Pose
+    pose: HeldPose
     sensors: tuple[Sensor, ...] = ()
     held_out: bool = False
     line: Centerline | Markers | None = None
@@ -42,7 +42,7 @@ class MeasuredPose:
     @classmethod
     def of_points(
         cls,
-        pose: Pose,
+        pose: HeldPose,
         points: FloatArray,
         weight: FloatArray | None = None,
         held_out: bool = False,

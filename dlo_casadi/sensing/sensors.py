@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange, chord_places
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.node import Node
 from dlo_casadi.sensing.noise import Count, NoiseModel
@@ -63,7 +63,7 @@ class Sensor(ABC):
         """Common errors (R, c) of its residuals, of one std each; none by default."""
         return np.zeros((len(self.kinds), 0))
 
-    def places(self, pose: Pose, length: float) -> FloatArray:
+    def places(self, pose: HeldPose, length: float) -> FloatArray:
         """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L."""
         return chord_places(self.points, pose, length)
 
@@ -104,7 +104,7 @@ class _Known(Sensor):
     s: FloatArray
     marked = True
 
-    def places(self, pose: Pose, length: float) -> FloatArray:
+    def places(self, pose: HeldPose, length: float) -> FloatArray:
         """The known arc lengths (K,) [m]."""
         return self.s
 

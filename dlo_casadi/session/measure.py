@@ -9,9 +9,8 @@ import numpy as np
 
 from dlo_casadi import vision
 from dlo_casadi.config import Camera as DeclaredCamera
-from dlo_casadi.config import Config, Images
-from dlo_casadi.config import Pose as DeclaredPose
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.config import Config, Images, Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.io.points import read_points
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -49,7 +48,7 @@ def read_inputs(config: Config, step: Callable[[str, int, int], None]) -> tuple[
     return tuple(inputs)
 
 
-def _read(config: Config, pose: DeclaredPose) -> PoseInput:
+def _read(config: Config, pose: Pose) -> PoseInput:
     skipped = {item.name: item.reason for item in config.skipped}
     try:
         if pose.name in skipped:
@@ -80,7 +79,7 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
     )
 
 
-def _measured(pose: DeclaredPose, item: PoseInput, std: float) -> MeasuredPose:
+def _measured(pose: Pose, item: PoseInput, std: float) -> MeasuredPose:
     """A pose with its sensors; pixels have the standard deviation `std` [m] at weight one."""
     held = replace(conditions(pose), camera_center=item.camera_center)
     held_out = pose.role == "held_out"
@@ -96,7 +95,7 @@ def _measured(pose: DeclaredPose, item: PoseInput, std: float) -> MeasuredPose:
     return seen.with_readings(pose.readings)
 
 
-def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
+def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
     """The line (K, 2) [m] in a photograph as if its end were free; None if there is none.
 
     It ends where the cable does, and not where the configuration says.
@@ -112,20 +111,20 @@ def line_without_end(config: Config, pose: DeclaredPose) -> np.ndarray | None:
         return None
 
 
-def conditions(pose: DeclaredPose) -> Pose:
+def conditions(pose: Pose) -> HeldPose:
     """End conditions of a configured pose."""
-    names = [item.name for item in fields(Pose) if hasattr(pose, item.name)]
-    return Pose(**{name: getattr(pose, name) for name in names})
+    names = [item.name for item in fields(HeldPose) if hasattr(pose, item.name)]
+    return HeldPose(**{name: getattr(pose, name) for name in names})
 
 
-def _reader(config: Config, pose: DeclaredPose) -> Callable[[Config, DeclaredPose], PoseInput]:
+def _reader(config: Config, pose: Pose) -> Callable[[Config, Pose], PoseInput]:
     """How the files of a pose are read."""
     if config.experiment.measurement.kind != "images" or pose.paths[0].suffix.lower() == ".csv":
         return _read_csv
     return _read_views if config.experiment.in_space else _read_image
 
 
-def _read_csv(config: Config, pose: DeclaredPose) -> PoseInput:
+def _read_csv(config: Config, pose: Pose) -> PoseInput:
     read = read_points(pose.paths[0], pose.start, pose.end, config.cable.length)
     kept = _kept(read.points)
     s = None if read.s is None else read.s[kept]
@@ -138,7 +137,7 @@ def _kept(points: np.ndarray) -> slice:
     return slice(None, None, max(1, -(-len(points) // MOST_POINTS)))
 
 
-def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
+def _read_views(config: Config, pose: Pose) -> PoseInput:
     """Photographs of a cable in space; those that cannot be used are told of."""
     images, problems = {}, []
     for name, path in pose.photographs.items():
@@ -166,7 +165,7 @@ def _read_views(config: Config, pose: DeclaredPose) -> PoseInput:
     )
 
 
-def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
+def _read_image(config: Config, pose: Pose) -> PoseInput:
     image = vision.read_image(pose.paths[0])
     try:
         view = view_of(config, image)
@@ -193,12 +192,12 @@ def _read_image(config: Config, pose: DeclaredPose) -> PoseInput:
     )
 
 
-def _held(config: Config, pose: DeclaredPose) -> vision.KnownCable:
+def _held(config: Config, pose: Pose) -> vision.KnownCable:
     """What is known of the cable in a photograph."""
     return vision.KnownCable(pose.start, pose.end, config.cable.diameter, config.cable.length)
 
 
-def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
+def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
     """Pictures (h, w, 3) of each step of the camera, as far as it comes.
 
     By the photograph's name and that of the step.
@@ -234,7 +233,7 @@ def draw_steps(config: Config, pose: DeclaredPose) -> dict[str, np.ndarray]:
     return drawn
 
 
-def _turned(config: Config, pose: DeclaredPose, image: np.ndarray) -> str:
+def _turned(config: Config, pose: Pose, image: np.ndarray) -> str:
     """Sentence for a photograph that can be measured once it is turned.
 
     A board's markers tell the way up; two reference points do not.

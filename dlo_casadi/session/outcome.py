@@ -150,7 +150,7 @@ class PoseInput:
     center : (float, float), optional [m]
         Middle of the photograph in the board frame.
     camera_center : (float, float, float), optional [m]
-        Where a calibrated camera stood, see `pose.Pose`.
+        Where a calibrated camera stood, see `HeldPose`.
     pixel : float, optional [m]
         Size of a pixel on the board.
     weight : (K,), optional

@@ -22,7 +22,7 @@ class BranchShape:
     branch : "ccw", "cw", "previous" or None
         What the pose has to name for it to be predicted; None if no name does.
     turns : 0.5, -0.5 or None
-        Or tell, see `Pose`.
+        Or tell, see `HeldPose`.
     """
 
     rmse: float

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.codegen import generate
-from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, LumpedMass
+from dlo_casadi.effects import AxialStretch, BendingSoftening, CableData, LumpedMass
 from dlo_casadi.model.cable_model import CableModel
 
 HERE = Path(__file__).parent
@@ -38,7 +38,7 @@ def run(problems: int = 100) -> dict[str, Any]:
         law = () if gravity is SPACE else (BendingSoftening(),)
         for effects in ((), (AxialStretch(), LumpedMass(), *law)):
             torsion = 0.04 if gravity is SPACE else None
-            cable = Cable(0.8, 0.2, 0.01, 0.05, torsional_stiffness=torsion)
+            cable = CableData(0.8, 0.2, 0.01, 0.05, torsional_stiffness=torsion)
             model = CableModel(cable, 12, element, start, end, gravity, effects=effects)  # type: ignore[arg-type]
             p = model.nominal.copy()
             p[1:] += 1e-3

@@ -31,14 +31,14 @@ from scipy.optimize import brentq
 
 from benchmarks import speed
 from dlo_casadi.codegen import CompiledSolver
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import ELEMENTS
 
 FloatArray = NDArray[np.floating]
-CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
+CABLE = CableData(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
 RADIUS = CABLE.diameter / 2
 # Of a solid round section: both peers derive stiffness from a modulus and this.
 AREA, SECOND_MOMENT = np.pi * RADIUS**2, np.pi * RADIUS**4 / 4
@@ -121,8 +121,8 @@ def distance(curve: CubicSpline, nodes: FloatArray) -> FloatArray:
     return np.hypot(*(nodes - curve(s)).T)
 
 
-def _pose(end: FloatArray) -> Pose:
-    return Pose((0.0, 0.0), (float(end[0]), float(end[1])), branch="ccw")
+def _pose(end: FloatArray) -> HeldPose:
+    return HeldPose((0.0, 0.0), (float(end[0]), float(end[1])), branch="ccw")
 
 
 def compiled(n: int, element: str, repeats: int = 200) -> Method:

@@ -19,11 +19,11 @@ from benchmarks.space_ipopt import Ipopt
 from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.codegen.generate import generate, table_of
 from dlo_casadi.codegen.shapes import pose_table, records_of
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses, limited
 from dlo_casadi.equilibrium.minima import by_ipopt
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel, EndKind, StartKind
 
@@ -72,10 +72,10 @@ class Problem:
         poses[:, 2:4], poses[:, 4:] = self.ends, self.headings
         return poses
 
-    def pose(self, i: int) -> Pose:
+    def pose(self, i: int) -> HeldPose:
         """One pose for the Python solver."""
         end, (first, last), model = self.ends[i], self.headings[i], self.model
-        return Pose(
+        return HeldPose(
             (0.0, 0.0),
             None if model.end == "free" else (float(end[0]), float(end[1])),
             float(first) if model.start == "clamped" else None,
@@ -90,7 +90,7 @@ class SpaceProblem:
     model: CableModel
     p: FloatArray
     rest: FloatArray
-    poses: tuple[Pose, ...]
+    poses: tuple[HeldPose, ...]
 
     @property
     def table(self) -> FloatArray:
@@ -101,7 +101,7 @@ class SpaceProblem:
 @lru_cache
 def _unit_cable(n: int, element: str) -> CableModel:
     """A cable of 1 m in space: cables that differ in their stiffness share its functions."""
-    cable = Cable(1.0, 0.1, 0.01, 1.0, torsional_stiffness=1.0)
+    cable = CableData(1.0, 0.1, 0.01, 1.0, torsional_stiffness=1.0)
     return CableModel(cable, n, element, "clamped", "clamped", (0.0, 0.0, -9.81))  # type: ignore[arg-type]
 
 
@@ -128,7 +128,7 @@ def space_problem(
         roll = Rotation.from_rotvec([rng.uniform(-np.pi, np.pi), 0.0, 0.0])
         end = rng.uniform(0.5, 0.9) * chord.apply([1.0, 0.0, 0.0])
         found.append(
-            Pose(
+            HeldPose(
                 (0.0, 0.0, 0.0),
                 tuple(end),
                 start_orientation=tuple(first.as_quat()),
@@ -203,7 +203,7 @@ def random_problem(
     length = rng.uniform(0.3, 3.0)
     weight = 9.81 * length * np.exp(rng.uniform(np.log(0.02), np.log(1.0)))
     stiffness = np.exp(rng.uniform(np.log(0.002), np.log(100.0)))
-    cable = Cable(1.0, 1.0 / 9.81, 0.01, stiffness / (weight * length**2))
+    cable = CableData(1.0, 1.0 / 9.81, 0.01, stiffness / (weight * length**2))
     model = CableModel(cable, n=n, element=element)
     rest = model.rest_basis @ rng.normal(size=model.rest_basis.shape[1])
     turn = np.abs(rest * np.diff(model.chain.cells, axis=1).ravel()).sum()
@@ -224,7 +224,7 @@ def held_problem(
     """
     mass = 0.1
     stiffness = 9.81 * mass * np.exp(rng.uniform(np.log(0.003), np.log(3.0)))
-    model = CableModel(Cable(1.0, mass, 0.01, stiffness), n=n, start=start, end=end)
+    model = CableModel(CableData(1.0, mass, 0.01, stiffness), n=n, start=start, end=end)
     width = np.diff(model.chain.cells, axis=1).ravel()
     rest = model.rest_basis @ rng.normal(size=model.rest_basis.shape[1])
     rest *= rng.uniform(0.0, np.pi) / np.abs(rest * width).sum()
@@ -303,7 +303,7 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
     Joints at their bound count as conditions.
     """
     model, phi = problem.model, shape["x"][:, 0]
-    pose = Pose((0.0, 0.0), (float(end[0]), float(end[1])))
+    pose = HeldPose((0.0, 0.0), (float(end[0]), float(end[1])))
     given = Inputs.of(model.nominal, problem.rest, pose.vector[None])
     shapes = Shapes.declared(phi[None, :, None], shape["end_force"][None])
     _, slope, matrix = assembly_of(model).balance(shapes, given)
@@ -329,7 +329,7 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
 def compare_with_ipopt(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> str:
     """Our energy against IPOPT's: same, lower, higher or ipopt_failed."""
     model, p, rest = problem.model, problem.model.nominal, problem.rest
-    pose = Pose((0.0, 0.0), (float(end[0]), float(end[1])))
+    pose = HeldPose((0.0, 0.0), (float(end[0]), float(end[1])))
     found = [by_ipopt(model, p, rest, pose, phi) for phi in guesses(model, p, rest, pose)]
     stable = [eq for eq in found if eq is not None and eq.stable]
     if not stable:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.guesses import guessed_frames
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential
 
@@ -67,7 +67,7 @@ class Ipopt:
             },
         )
 
-    def solve(self, p: FloatArray, rest: FloatArray, pose: Pose) -> Iterator[Found]:
+    def solve(self, p: FloatArray, rest: FloatArray, pose: HeldPose) -> Iterator[Found]:
         """Each first guess from which IPOPT converges."""
         model, count = self.model, self.model.n + 1
         deviation = np.zeros(len(model.deviation_names))

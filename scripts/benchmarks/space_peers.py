@@ -28,7 +28,7 @@ from benchmarks.peers import COURANT, missing_elastica, missing_mujoco, relax, r
 from benchmarks.space_ipopt import Ipopt
 from benchmarks.space_speed import CABLE, FINE, Timed, problem, reference
 from dlo_casadi.equilibrium.guesses import guessed_frames
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.assembly import assembly_of
 
 FloatArray = NDArray[np.floating]
@@ -46,12 +46,12 @@ UNIFORM_DAMPING, JOINT_DAMPING = 20.0, 0.1
 class Start:
     """Links of equal length from the start to the end, with their frames: for a simulator."""
 
-    pose: Pose
+    pose: HeldPose
     nodes: FloatArray  # (n + 1, 3) [m]
     frames: Rotation  # (n,)
 
 
-def start_at(pose: Pose, n: int, fine: FloatArray) -> Start:
+def start_at(pose: HeldPose, n: int, fine: FloatArray) -> Start:
     """The first guess that lies nearest to a shape, its links turned until they reach the end."""
     own = problem(n, "arc", 0.0)
     ends = np.array(pose.start), np.array(pose.end)
@@ -83,14 +83,14 @@ def distances(nodes: FloatArray, fine: FloatArray) -> FloatArray:
 
 
 # A method takes a pose and the fine shape and returns nodes (n + 1, 3) and seconds.
-Method = Callable[[Pose, FloatArray], tuple[FloatArray, float]]
+Method = Callable[[HeldPose, FloatArray], tuple[FloatArray, float]]
 
 
 def compiled(n: int, element: str) -> Method:
     """The generated C solver, cold."""
     timed = Timed(problem(n, element, 0.0))
 
-    def solve(pose: Pose, fine: FloatArray) -> tuple[FloatArray, float]:
+    def solve(pose: HeldPose, fine: FloatArray) -> tuple[FloatArray, float]:
         seconds, shape = timed.solve(pose, None, 20)
         return shape["points"][0], float(np.median(seconds))
 
@@ -104,7 +104,7 @@ def ipopt(n: int, element: str) -> Method:
     own = problem(n, element, 0.0)
     solver = Ipopt(own.model)
 
-    def solve(pose: Pose, fine: FloatArray) -> tuple[FloatArray, float]:
+    def solve(pose: HeldPose, fine: FloatArray) -> tuple[FloatArray, float]:
         given = Inputs.of(own.model.nominal, own.rest, pose.vector[None])
         results = []
         for found in solver.solve(own.model.nominal, own.rest, pose):
@@ -126,7 +126,7 @@ def elastica(n: int) -> Method:
     # The shear mode of an element on its own small rotary inertia limits explicit steps.
     step = COURANT * 2 / np.sqrt(SHEAR * AREA / (density * SECOND_MOMENT))
 
-    def solve(pose: Pose, fine: FloatArray) -> tuple[FloatArray, float]:
+    def solve(pose: HeldPose, fine: FloatArray) -> tuple[FloatArray, float]:
         start = start_at(pose, n, fine)
         # Their third director is along the rod.
         directors = start.frames.as_matrix()[:, :, [1, 2, 0]].transpose(2, 1, 0)
@@ -184,7 +184,7 @@ def mujoco(n: int) -> Method:
     def text(values: FloatArray) -> str:
         return " ".join(f"{value:.17g}" for value in values)
 
-    def solve(pose: Pose, fine: FloatArray) -> tuple[FloatArray, float]:
+    def solve(pose: HeldPose, fine: FloatArray) -> tuple[FloatArray, float]:
         start = start_at(pose, n, fine)
         first, last = (np.roll(frame, 1) for frame in pose.frames)  # w ahead
         model = mj.MjModel.from_xml_string(

@@ -20,15 +20,15 @@ from benchmarks.speed import FLAGS, HERE, summary
 from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.codegen.shapes import pose_table, records_of
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 # Elements of the mesh against which errors are measured: of fourth order, 1e-6 m and less.
 FINE = 96
 # The cable and the ends of the rendered session of markers in space; places [m], quaternions.
-CABLE = Cable(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
+CABLE = CableData(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
 START = (0.4, -0.2, 0.3), (-0.480585, -0.087156, -0.095296, 0.867387)
 ENDS = [
     ((0.74719, -0.43401, 0.40592), (0.382257, 0.048187, -0.181262, 0.904821)),
@@ -60,7 +60,7 @@ def problem(n: int, element: str, bent: float = 1.0) -> SpaceProblem:
     rest = model.rest_basis @ coefficients
     start, first = START
     poses = tuple(
-        Pose(start, end, start_orientation=first, end_orientation=last) for end, last in ENDS
+        HeldPose(start, end, start_orientation=first, end_orientation=last) for end, last in ENDS
     )
     return SpaceProblem(model, model.nominal, rest, poses)
 
@@ -73,7 +73,7 @@ def reference(bent: float = 1.0) -> tuple[FloatArray, ...]:
     return tuple(solver.solve(pose).points for pose in fine.poses)
 
 
-def moved(pose: Pose, rng: np.random.Generator) -> Pose:
+def moved(pose: HeldPose, rng: np.random.Generator) -> HeldPose:
     """The pose whose end is 1 mm and 0.5 degrees away."""
     by, about = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     turn = Rotation.from_rotvec(np.radians(0.5) * about)
@@ -109,12 +109,12 @@ class Timed:
         self._work = np.empty(source.workspace)
 
     def solve(
-        self, pose: Pose, warm: NDArray[np.void] | None, repeats: int
+        self, pose: HeldPose, warm: NDArray[np.void] | None, repeats: int
     ) -> tuple[FloatArray, NDArray[np.void]]:
         """Seconds (repeats,) of solves, and the shape."""
         return self._run(self._c.dlo_time, pose, 0, warm, repeats)
 
-    def bare(self, pose: Pose, which: int, warm: NDArray[np.void] | None) -> NDArray[np.void]:
+    def bare(self, pose: HeldPose, which: int, warm: NDArray[np.void] | None) -> NDArray[np.void]:
         """Shape to which the bare method leads; zeros if it leads nowhere."""
         out = np.zeros(1, records_of(self.own.model).shape)
         at, _ = pose_table(self.own.model, [pose])
@@ -125,7 +125,7 @@ class Timed:
         return out
 
     def time_bare(
-        self, pose: Pose, which: int, warm: NDArray[np.void] | None, repeats: int
+        self, pose: HeldPose, which: int, warm: NDArray[np.void] | None, repeats: int
     ) -> float:
         """Its least seconds."""
         return float(self._run(self._c.dlo_time_bare, pose, which, warm, repeats)[0].min())
@@ -133,7 +133,7 @@ class Timed:
     def _run(
         self,
         clock: Callable[..., None],
-        pose: Pose,
+        pose: HeldPose,
         which: int,
         warm: NDArray[np.void] | None,
         repeats: int,

@@ -19,16 +19,16 @@ from scipy.optimize import minimize
 
 from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.codegen.compiled import compile_library
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.guesses import arc_headings
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential
 
 FloatArray = NDArray[np.floating]
 HERE = Path(__file__).parent
 # The paper's cable and its end poses on a grid of one inch (Table 4).
-CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=949.56 * 0.08125)
+CABLE = CableData(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=949.56 * 0.08125)
 GRID = [
     (14, 10),
     (20, 0),
@@ -166,9 +166,9 @@ def by_casadi(n: int, kind: str, repeats: int) -> dict[str, Any]:
     for end in poses():
         start = arc_headings(model.chain.places, CABLE.length, end, 1)
         p = np.concatenate(
-            [model.nominal, np.zeros(n - 1), Pose((0.0, 0.0), end).vector, np.zeros(6)]
+            [model.nominal, np.zeros(n - 1), HeldPose((0.0, 0.0), end).vector, np.zeros(6)]
         )
-        good = reference.solve(Pose((0.0, 0.0), tuple(end), branch="ccw")).x[:, 0]
+        good = reference.solve(HeldPose((0.0, 0.0), tuple(end), branch="ccw")).x[:, 0]
         # Sixteen at a time, so that no conversion of arguments is timed.
         tiled = {
             name: np.tile(value, (16, 1)).T
@@ -197,7 +197,7 @@ def by_cobyla(n: int) -> dict[str, Any]:
     reference = CompiledSolver(model, model.nominal, np.zeros(n - 1))
     seconds, reached = [], 0
     for end in poses()[:4]:
-        good = reference.solve(Pose((0.0, 0.0), tuple(end), branch="ccw")).x[:, 0]
+        good = reference.solve(HeldPose((0.0, 0.0), tuple(end), branch="ccw")).x[:, 0]
         start = arc_headings(model.chain.places, CABLE.length, end, 1)
 
         def energy(theta: FloatArray) -> float:

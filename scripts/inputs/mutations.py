@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from dlo_casadi.config import dump_yaml
-from dlo_casadi.effects import EFFECTS, Cable
+from dlo_casadi.effects import EFFECTS, CableData
 
 Random = np.random.Generator
 # A node of plain data: what holds it, and under which key or index.
@@ -78,7 +78,7 @@ def _declare(document: dict[str, Any], random: Random) -> None:
     if "model" not in document:
         return
     effect = pick(random, sorted(EFFECTS))
-    names = [q.name for q in EFFECTS[effect]().parameters(Cable(0.5, 0.2, 0.01, 0.3))]
+    names = [q.name for q in EFFECTS[effect]().parameters(CableData(0.5, 0.2, 0.01, 0.3))]
     values = {
         name: {
             "value": float(pick(random, (-1, 1)) * 10.0 ** random.integers(-4, 4)),

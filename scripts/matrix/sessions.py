@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import MeasurementEffect
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.prediction import Prediction, predict_poses
 from dlo_casadi.io.points import write_points
@@ -221,7 +221,7 @@ def true_shapes(
     model: CableModel,
     cell: Cell,
     stiffness: float,
-    poses: list[Pose],
+    poses: list[HeldPose],
     generator: np.random.Generator,
 ) -> list[Prediction] | None:
     """Shapes of a cable whose length, fixtures and sensors are off by draws from tolerances.
@@ -291,7 +291,7 @@ def write_seen(
 
 
 def read_off(
-    pose: Document, held: Pose, shape: Prediction, generator: np.random.Generator
+    pose: Document, held: HeldPose, shape: Prediction, generator: np.random.Generator
 ) -> Document:
     """Readings of a pose, with their noise."""
     names = [key for key in pose if key.endswith(("_force", "_moment"))]

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi import CableModel, EquilibriumError, solve_equilibrium
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.errors import EquilibriumError
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.canvas import BLUE, ORANGE
 from paper import published
 from paper.content import Claim, Part, Section, Table, drawing, number

@@ -7,8 +7,8 @@ from concurrent.futures import Executor
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi import CableModel
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.canvas import GREY
 from dlo_casadi.runtime.parallel import map_in_order
 from paper import published

@@ -8,10 +8,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi import CableModel, Equilibrium, Pose, solve_equilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
+from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND, Equilibrium
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
@@ -34,7 +36,7 @@ class Row:
     alpha^f.
     """
 
-    pose: Pose
+    pose: HeldPose
     before: float
     after: float
     after_at_before: float
@@ -48,7 +50,7 @@ def chain() -> CableModel:
     return CableModel(published.cable(), n=published.LINKS, element="link")
 
 
-def energy_of(model: CableModel, found: Equilibrium, rest: FloatArray, pose: Pose) -> float:
+def energy_of(model: CableModel, found: Equilibrium, rest: FloatArray, pose: HeldPose) -> float:
     """Energy [J] of a shape for another rest curvature."""
     given = Inputs.of(model.nominal, rest, pose.vector[None])
     return float(assembly_of(model).energy(found.shapes, given)[0])
@@ -82,7 +84,7 @@ def rows_of_table_4(roundings: int = ROUNDINGS) -> list[Row]:
     return rows
 
 
-def with_bounded_heading(pose: Pose) -> float:
+def with_bounded_heading(pose: HeldPose) -> float:
     """Energy [J] of a pose if Eq. 8's bound is applied to theta_1, a heading, too."""
     model = chain()
     problem = potential(model)

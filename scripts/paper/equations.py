@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi import CableModel, solve_equilibrium
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.constrained import (
     Interval,
     profile_interval,
@@ -17,7 +17,7 @@ from dlo_casadi.estimation.constrained import (
 )
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import Tolerances
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.paper.algorithm1 import gravity_slopes, run_algorithm1
 from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from dlo_casadi.runtime.parallel import map_in_order

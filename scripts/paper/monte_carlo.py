@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi import CableModel, DloError
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -27,7 +27,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.cable_model import Tolerances
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.report.canvas import BLACK, BLUE
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading

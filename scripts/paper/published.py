@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from dlo_casadi import Cable, CableModel, Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 
@@ -45,14 +47,14 @@ def rest_angles() -> FloatArray:
     return np.array([float(final[f"theta_0_{i}"]) for i in range(2, LINKS + 1)])
 
 
-def poses() -> list[Pose]:
+def poses() -> list[HeldPose]:
     """The twelve poses of Table 4 on the grid of one inch from which it was rounded.
 
     The branch is that of the printed energies: counter-clockwise from start to end.
     """
     rows = table(4)
     ends = [(INCH * row["grid_x"], INCH * row["grid_y"]) for row in rows]
-    return [Pose((0.0, 0.0), end, branch="ccw", name=label(end)) for end in ends]
+    return [HeldPose((0.0, 0.0), end, branch="ccw", name=label(end)) for end in ends]
 
 
 def label(end: tuple[float, float]) -> str:
@@ -60,9 +62,9 @@ def label(end: tuple[float, float]) -> str:
     return f"({end[0]:.2f}, {end[1]:.2f})".replace("-0.00", "0.00").replace("-", "−")
 
 
-def cable(stiffness: float = STIFFNESS) -> Cable:
+def cable(stiffness: float = STIFFNESS) -> CableData:
     """The paper's cable with a bending stiffness [N m^2]."""
-    return Cable(LENGTH, MASS, DIAMETER, stiffness)
+    return CableData(LENGTH, MASS, DIAMETER, stiffness)
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi import Cable, CableModel
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.estimation.prediction import Prediction, predict_poses
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from paper import published
@@ -41,7 +42,7 @@ class Replica:
     name : str
     stiffness : float [N m^2]
         True.
-    guess : Cable
+    guess : CableData
         With the stiffness that a fit starts from.
     theta_0 : (9,) [rad]
         True rest angles of ten links.
@@ -54,7 +55,7 @@ class Replica:
 
     name: str
     stiffness: float
-    guess: Cable
+    guess: CableData
     theta_0: FloatArray
     measured: tuple[MeasuredPose, ...]
     truth: FloatArray

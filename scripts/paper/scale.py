@@ -20,12 +20,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi import CableModel, CompiledSolver, Pose
+from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
-from dlo_casadi.model.cable_model import Tolerances
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from paper import published
@@ -55,7 +56,7 @@ def simulated(poses: int) -> list[MeasuredPose]:
         radius = published.LENGTH * np.sqrt(rng.uniform(0.2, 0.9))
         angle = rng.uniform(-0.45 * np.pi, 0.1 * np.pi)
         end = (float(radius * np.cos(angle)), float(radius * np.sin(angle)))
-        pose = Pose((0.0, 0.0), end, branch="ccw", name=f"{len(out)}")
+        pose = HeldPose((0.0, 0.0), end, branch="ccw", name=f"{len(out)}")
         shape = solver.solve(pose, throw=False)
         if shape.status != "ok":
             continue

@@ -12,10 +12,13 @@ import scipy
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from dlo_casadi import CableModel, CompiledSolver, Pose, solve_equilibrium
+from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.guesses import arc_headings
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.canvas import BLACK, GREY, VERMILLION
 from paper import published
 from paper.content import Claim, Part, Section, Table, Target, drawing, duration, mm
@@ -111,7 +114,7 @@ def by_c(element: Method, n: int, truth: list[FloatArray]) -> tuple[float, float
 
 
 def _seen(
-    model: CableModel, rest: FloatArray, pose: Pose, x: FloatArray, lam: FloatArray
+    model: CableModel, rest: FloatArray, pose: HeldPose, x: FloatArray, lam: FloatArray
 ) -> NodeCurve:
     """Curve of given headings."""
     given = Inputs.of(model.nominal, rest, pose.vector[None])
@@ -158,7 +161,7 @@ def by_cobyla(truth: list[FloatArray]) -> dict[int, tuple[float, float, int]]:
     return out
 
 
-def cobyla(pose: Pose, n: int) -> FloatArray:
+def cobyla(pose: HeldPose, n: int) -> FloatArray:
     """Eq. 8 in relative angles (n,) [rad] by COBYLA, from the arc through both ends."""
     model, rest = _model("link", n)
     h = model.chain.h

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from dlo_casadi.codegen import Capsule, HalfSpace, generate
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import CableData
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 
@@ -41,12 +41,12 @@ UNITS = {"bend_radius": "m", "force": "N", "twist": "1/m", "clearance": "m"}
 def example(*, in_space: bool = False) -> tuple[CableModel, FloatArray, FloatArray]:
     """A cable of 0.9 m, straight at rest: pinned at both ends, in space clamped."""
     if in_space:
-        cable = Cable(0.9, 0.12, 0.01, 0.08, name="example", torsional_stiffness=0.06)
+        cable = CableData(0.9, 0.12, 0.01, 0.08, name="example", torsional_stiffness=0.06)
         model = CableModel(
             cable, 16, "quadratic", "clamped", "clamped", (0.0, 0.0, -9.81), n_rest=0
         )
     else:
-        cable = Cable(0.9, 0.12, 0.01, 0.08, name="example")
+        cable = CableData(0.9, 0.12, 0.01, 0.08, name="example")
         model = CableModel(cable, n=24, element="arc", n_rest=0)
     return model, model.nominal, np.zeros(model.chain.n_rests)
 

@@ -17,7 +17,7 @@ import numpy as np
 from plan import Scene, draw, example, obstacles_of, read_scene, scene_of
 
 from dlo_casadi.codegen import CompiledSolver, Shape
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 
 try:
     from ompl import base as ob
@@ -37,9 +37,9 @@ class InPlane:
         """Set a state."""
         state[0], state[1] = numbers
 
-    def at(self, state: Any) -> Pose:
+    def at(self, state: Any) -> HeldPose:
         """What the solver is asked for."""
-        return Pose((0.0, 0.0), (state[0], state[1]), branch="ccw")
+        return HeldPose((0.0, 0.0), (state[0], state[1]), branch="ccw")
 
 
 class InSpace:
@@ -55,11 +55,11 @@ class InSpace:
         turn, size = state.rotation(), np.linalg.norm(numbers[3:])
         turn.x, turn.y, turn.z, turn.w = (number / size for number in numbers[3:])
 
-    def at(self, state: Any) -> Pose:
+    def at(self, state: Any) -> HeldPose:
         """What the solver is asked for."""
         turn, place = state.rotation(), (state.getX(), state.getY(), state.getZ())
         last = (turn.x, turn.y, turn.z, turn.w)
-        return Pose((0.0, 0.0, 0.0), place, start_orientation=self.held, end_orientation=last)
+        return HeldPose((0.0, 0.0, 0.0), place, start_orientation=self.held, end_orientation=last)
 
 
 class Leader:
@@ -105,7 +105,7 @@ class Leader:
             why = "another shape" if far else None
         return path.shapes if self._judge(why, "motion") else ()
 
-    def _shape(self, pose: Pose) -> Shape:
+    def _shape(self, pose: HeldPose) -> Shape:
         """Shape of the cable, whatever its status."""
         return self.gripper.solver.solve(pose, throw=False)
 

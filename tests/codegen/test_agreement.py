@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from dlo_casadi.codegen import CompiledSolver
-from dlo_casadi.effects import EFFECTS, Cable, Load, MeasurementEffect
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import EFFECTS, CableData, Load, MeasurementEffect
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
-CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
+CABLE = CableData(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
 ENDS = [(0.5, 0.1), (0.3, -0.5), (0.7, 0.05)]
 CLAMPS = (0.7, -0.6)
 # Values of parameters at which each effect is felt.
@@ -57,7 +57,7 @@ def difference(names, element, start, end, n=12):
     solver = CompiledSolver(model, p, rest, flags=("-O0",))  # compiles quickly
     worst = 0.0
     for place in ENDS:
-        pose = Pose(
+        pose = HeldPose(
             (0.0, 0.0),
             None if end == "free" else place,
             CLAMPS[0] if start == "clamped" else None,
@@ -99,7 +99,7 @@ def test_clamps_that_give_way(element, end):
     p, rest = np.array([0.3, 0.2]), np.zeros(model.chain.n_cells)
     solver = CompiledSolver(model, p, rest, flags=("-O0",))
     last = CLAMPS[1] if end == "clamped" else None
-    pose = Pose((0.0, 0.0), None if end == "free" else ENDS[0], CLAMPS[0], last)
+    pose = HeldPose((0.0, 0.0), None if end == "free" else ENDS[0], CLAMPS[0], last)
     shape = solver.solve(pose)
     found = solve_equilibrium(model, p, rest, pose)
     assert shape.points == pytest.approx(found.points, abs=1e-8)

@@ -8,14 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.codegen import Capsule, CompiledSolver, HalfSpace
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
-POSE = Pose(
+POSE = HeldPose(
     (0.0, 0.0, 0.0),
     (0.4, 0.1, 0.1),
     start_orientation=(0.0, 0.0, 0.0, 1.0),
@@ -28,7 +28,7 @@ FLOOR = HalfSpace((0.0, 0.0, -0.3), (0.0, 0.0, 2.0))
 
 @pytest.fixture(scope="module")
 def space():
-    cable = Cable(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
+    cable = CableData(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
     model = CableModel(cable, 12, "quadratic", "clamped", "clamped", gravity=(0.0, 0.0, -9.81))
     return CompiledSolver(model, model.nominal, np.zeros(model.chain.n_rests), flags=("-O0",))
 
@@ -93,12 +93,12 @@ def test_the_nearest_of_many_obstacles_is_told_and_a_cut_is_negative(space):
 
 @pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_in_a_plane(element):
-    model = CableModel(Cable(0.8, 0.2, 0.01, 0.1), 12, element, "clamped", "pinned")
+    model = CableModel(CableData(0.8, 0.2, 0.01, 0.1), 12, element, "clamped", "pinned")
     solver = CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells), flags=("-O0",))
     pose = np.array([0.5, 0.1, 0.4])
 
     def posed(at):
-        return Pose((0.0, 0.0), tuple(at[:2]), start_heading=at[2])
+        return HeldPose((0.0, 0.0), tuple(at[:2]), start_heading=at[2])
 
     def solved(at, warm=None):
         return solver.solve(posed(at), warm=warm)

@@ -9,10 +9,10 @@ import pytest
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.compiled import compile_library
-from dlo_casadi.effects import Cable, ClampAngle, EndOffset, LengthError
+from dlo_casadi.effects import CableData, ClampAngle, EndOffset, LengthError
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
@@ -64,13 +64,13 @@ def test_both_lists_are_one(tmp_path, element, start, end):
     """Where the ends really are, of a cable as long as it really is."""
     effects = [LengthError("longer"), ClampAngle(start=start == "clamped", end=end == "clamped")]
     effects += [] if end == "free" else [EndOffset()]
-    cable = Cable(0.8, 0.2, 0.01, 0.1)
+    cable = CableData(0.8, 0.2, 0.01, 0.1)
     model = CableModel(cable, 12, element, start, end, effects=tuple(effects), gravity=(2.0, -9.0))
     p = model.nominal + np.array([0.0, *np.linspace(0.01, 0.03, len(model.names) - 1)])
     rng = np.random.default_rng(0)
     rest = np.full(model.chain.n_cells, 6.0) + rng.normal(size=model.chain.n_cells)
     poses = [
-        Pose(
+        HeldPose(
             (0.1, -0.1),
             None if end == "free" else tuple(0.5 * rng.uniform(-1, 1, size=2)),
             rng.uniform(-np.pi, np.pi) if start == "clamped" else None,
@@ -86,8 +86,8 @@ def test_both_lists_are_one(tmp_path, element, start, end):
 
 
 def test_clamps_hold_their_headings_and_the_far_way_is_a_turn_away():
-    model = CableModel(Cable(0.8, 0.2, 0.01, 0.1), 40, start="clamped", end="pinned")
-    pose = Pose((0.0, 0.0), (0.7, 0.0), start_heading=2.9)
+    model = CableModel(CableData(0.8, 0.2, 0.01, 0.1), 40, start="clamped", end="pinned")
+    pose = HeldPose((0.0, 0.0), (0.7, 0.0), start_heading=2.9)
     found = guesses(model, model.nominal, np.zeros(40), pose)
     assert len(found) == 4
     for phi in found:

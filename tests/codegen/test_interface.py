@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate, shapes
-from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, EndOffset, ImageScale
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import AxialStretch, BendingSoftening, CableData, EndOffset, ImageScale
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
-CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
+CABLE = CableData(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.3)
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow"]
 KINDS = [
     ("link", "pinned", "pinned"),
@@ -53,7 +53,7 @@ def clamped():
 
 
 def at(end, *, start=(0.0, 0.0), headings=(None, None), branch=None):
-    return Pose(start, end, *headings, branch=branch)
+    return HeldPose(start, end, *headings, branch=branch)
 
 
 def all_zero(shape):
@@ -176,7 +176,7 @@ def test_branches_bow_either_way():
 
 def test_a_branch_without_an_equilibrium_is_a_status():
     """A limp cable hangs, and does not stand up: nothing is returned in place of what was named."""
-    model = CableModel(Cable(0.8, 0.2, 0.01, 0.005), n=12)
+    model = CableModel(CableData(0.8, 0.2, 0.01, 0.005), n=12)
     solver = compiled(model, model.nominal, np.zeros(model.chain.n_cells))
     hung = solver.solve(at((0.5, 0.0)))
     assert hung.turn == 1
@@ -379,7 +379,7 @@ def test_no_compiler_is_an_error_that_says_so(monkeypatch):
 
 def test_a_start_anywhere_moves_everything_with_it(links):
     model, p, rest = cable()
-    pose = Pose((0.3, -0.4), (0.7, -0.1))
+    pose = HeldPose((0.3, -0.4), (0.7, -0.1))
     expected = solve_equilibrium(model, p, rest, pose)
     shape = links.solve(pose)
     assert np.abs(shape.points - expected.points).max() < 1e-8

@@ -8,7 +8,7 @@ import pytest
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size, records_of
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import CableData
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
@@ -16,7 +16,9 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compile
 
 @pytest.mark.parametrize("gravity", [(0.0, -9.81), (0.0, 0.0, -9.81)], ids=["plane", "space"])
 def test_every_field_is_where_the_compiler_puts_it(tmp_path, gravity):
-    cable = Cable(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011 if len(gravity) == 3 else None)
+    cable = CableData(
+        0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011 if len(gravity) == 3 else None
+    )
     model = CableModel(cable, 5, "arc", "clamped", "clamped", gravity)
     generate(model, model.nominal, np.zeros(model.chain.n_rests)).write(tmp_path)
     records = records_of(model)._asdict()

@@ -20,16 +20,16 @@ from benchmarks import memory
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate
 from dlo_casadi.codegen.cases import case_of
 from dlo_casadi.codegen.compiled import compile_library
-from dlo_casadi.effects import AxialStretch, BendingSoftening, Cable, LumpedMass, PointForce
+from dlo_casadi.effects import AxialStretch, BendingSoftening, CableData, LumpedMass, PointForce
 from dlo_casadi.equilibrium.guesses import guessed_frames
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
-CABLE = Cable(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
+CABLE = CableData(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow"]
 EFFECTS = {
     "axial_stretch": [1e-3],
@@ -62,7 +62,7 @@ def poses(count, rng, bend=0.4, roll=1.5):
         aim = Rotation.from_rotvec(bend * rng.normal(size=3))
         end = start + reach * (first * aim).apply([1.0, 0.0, 0.0])
         found.append(
-            Pose(
+            HeldPose(
                 tuple(start),
                 tuple(end),
                 start_orientation=tuple(first.as_quat()),
@@ -140,7 +140,7 @@ def test_other_ends(ends):
 def test_turns_twist_the_cable():
     model, p, rest = problem(n=20, curved=0.0)
     compiled = CompiledSolver(model, p, rest, flags=("-O0",))
-    straight = Pose(
+    straight = HeldPose(
         (0.0, 0.0, 0.0),
         (0.58, 0.0, 0.0),
         start_orientation=(0, 0, 0, 1),
@@ -233,7 +233,7 @@ def test_first_guesses_are_those_of_python_number_for_number(tmp_path, ends, gra
     library = ctypes.CDLL(str(compile_library(replace(source, files=texts), tmp_path, ("-O0",))))
     library.dlo_guess.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p]
     work = np.empty(source.workspace)
-    along = Pose(
+    along = HeldPose(
         (0.0, 0.0, 0.0),
         (0.0, 0.0, -0.4),
         start_orientation=(0, 0, 0, 1),
@@ -382,7 +382,7 @@ def test_a_path_finds_the_twist_at_which_the_cable_loops(n):
     """A bow that is twisted on snaps into a loop: at the same twist on either mesh."""
     compiled = CompiledSolver(*problem(n=n, curved=0.0), flags=("-O0",))
     ahead = (0.0, 0.0, 0.0, 1.0)
-    bow = Pose((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), start_orientation=ahead, end_orientation=ahead)
+    bow = HeldPose((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), start_orientation=ahead, end_orientation=ahead)
     turns = 0.02 * np.arange(170)
     path = compiled.path([moved(bow, 9, 2 * np.pi * turn) for turn in turns])
     assert path.first_jump == 154

@@ -11,11 +11,11 @@ import pytest
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.generate import MARK, comment
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import CableData
 from dlo_casadi.errors import OutputError
 from dlo_casadi.model.cable_model import CableModel
 
-CABLE = Cable(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
+CABLE = CableData(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
 STRICT = ["-Wall", "-Wextra", "-Wtrigraphs", "-Werror", "-fsyntax-only"]
 NASTY = {
     "end of a comment": "a */ int x; /* b",

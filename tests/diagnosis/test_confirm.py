@@ -9,15 +9,15 @@ from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.unknown_force import _Search
-from dlo_casadi.effects import Cable, LumpedMass, UnknownPull
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData, LumpedMass, UnknownPull
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 NOISE = 3e-4
-PLAIN = CableModel(Cable(0.5, 0.03, 0.006, 0.01), 12, n_rest=5)
+PLAIN = CableModel(CableData(0.5, 0.03, 0.006, 0.01), 12, n_rest=5)
 DECLARED = PLAIN.with_effect(LumpedMass())
 FIXED = {"lumped_mass.mass": 5e-3, "lumped_mass.position": 0.2}  # kg, m; nominal: 0 and L / 4
 
@@ -32,7 +32,7 @@ def base():
     """A cable that tapers and carries a known weight, fitted without the taper."""
     truth = taper_of(PLAIN).add_to(DECLARED)
     p = np.array([0.01, *FIXED.values(), 0.4])
-    poses = [Pose((0.0, 0.0), (x, y)) for x, y in ((0.3, 0.0), (0.2, -0.2), (0.35, 0.1))]
+    poses = [HeldPose((0.0, 0.0), (x, y)) for x, y in ((0.3, 0.0), (0.2, -0.2), (0.35, 0.1))]
     rng = np.random.default_rng(0)
     s = np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
     measured = [

@@ -13,15 +13,15 @@ from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.refits import start_from
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
-from dlo_casadi.effects import EFFECTS, Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import EFFECTS, CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import nuisances
 
-CABLE = Cable(0.8, 0.2, 0.01, 0.1)
+CABLE = CableData(0.8, 0.2, 0.01, 0.1)
 ENDS = ((0.6, 0.0), (0.3, 0.1), (0.5, -0.3), (0.2, -0.2), (0.65, 0.2), (0.35, -0.45), (0.5, 0.35))
 NOISE = 3e-4
 TETHER = (4.0, 0.45, 0.4, 0.3)  # N/m, m, m, m
@@ -32,7 +32,7 @@ def session(name: str, *values: float):
     """Fit of a plain model to a cable with one effect."""
     model = CableModel(CABLE, 40, effects=(EFFECTS[name](),), n_rest=5)
     rest = model.rest_basis @ np.array([0.5, 1.0, 1.5, 1.0, 0.0])
-    poses = [Pose((0.0, 0.0), end) for end in ENDS]
+    poses = [HeldPose((0.0, 0.0), end) for end in ENDS]
     shapes = predict_poses(model, np.array([0.1, *values]), rest, poses)
     rng = np.random.default_rng(0)
     s = np.linspace(0.02, 0.98, 30) * CABLE.length

@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.refits import confirm_from_data, from_data, screened_from_data
-from dlo_casadi.effects import BendingAnisotropy, Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import BendingAnisotropy, CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, misfits
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
-TRUE = Cable(1.0, 0.08, 0.007, bending_stiffness=0.018, torsional_stiffness=0.007)
+TRUE = CableData(1.0, 0.08, 0.007, bending_stiffness=0.018, torsional_stiffness=0.007)
 DECLARED = replace(TRUE, bending_stiffness=0.011, torsional_stiffness=0.007)
 HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
 NOISE = 5e-4
@@ -38,7 +38,7 @@ def base():
         turned = Rotation.from_rotvec(rng.uniform(-0.7, 0.7, 3))
         way = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3))
         end = tuple(way.apply([rng.uniform(0.6, 0.85), 0.0, 0.0]))
-        pose = Pose((0.0, 0.0, 0.0), end, end_orientation=tuple(turned.as_quat()))
+        pose = HeldPose((0.0, 0.0, 0.0), end, end_orientation=tuple(turned.as_quat()))
         (shape,) = predict_poses(flat, p, rest, [pose])
         points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 3))
         measured.append(MeasuredPose.of_points(pose, points))

@@ -5,8 +5,8 @@ import pytest
 
 from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
-from dlo_casadi.effects import EFFECTS, Cable, LumpedMass
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import EFFECTS, CableData, LumpedMass
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -15,14 +15,14 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.remarks import weight_warning
 
 EI, MASS = 0.06, 0.35
-MODEL = CableModel(Cable(0.65, 0.4, 0.015, 0.03), 10, start="clamped", end="free", n_rest=3)
+MODEL = CableModel(CableData(0.65, 0.4, 0.015, 0.03), 10, start="clamped", end="free", n_rest=3)
 
 
 def fitted(std, points, mass):
     """A cable with a weight near its middle, fitted without it; std of the points [m]."""
     heavy, rng = MODEL.with_effect(LumpedMass()), np.random.default_rng(0)
     p, rest = np.array([EI, mass, 0.3]), np.zeros(MODEL.chain.n_cells)
-    poses = [Pose((0.0, 0.0), None, h, name=f"{h:.1f}") for h in np.linspace(-3.0, 0.0, 10)]
+    poses = [HeldPose((0.0, 0.0), None, h, name=f"{h:.1f}") for h in np.linspace(-3.0, 0.0, 10)]
     s = np.linspace(0.65 / points, 0.65, points)
     measured = [
         MeasuredPose.of_points(

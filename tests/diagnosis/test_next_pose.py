@@ -7,7 +7,7 @@ import pytest
 
 from dlo_casadi.diagnosis.next_measurement import _separation, next_reading
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import Tolerances
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -20,7 +20,7 @@ def separation(noise):
     """Of two straight lines that lie a gap apart, measured at many points."""
     x = np.linspace(0.0, LENGTH, 11)
     lines = [NodeCurve(LENGTH, np.column_stack([x, 0 * x + y]), None) for y in (0.0, GAP)]
-    pose = Pose((0.0, 0.0), (LENGTH, 0.0))
+    pose = HeldPose((0.0, 0.0), (LENGTH, 0.0))
     measured = MeasuredPose.of_points(pose, np.zeros((POINTS, 2)))
     fit = SimpleNamespace(
         problem=SimpleNamespace(measured=(measured,), used=(0,)),

@@ -7,8 +7,8 @@ from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.selection import AddedEffect
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -16,7 +16,7 @@ from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 NOISE, CENTER, SIGNIFICANCE = 3e-4, (0.25, 0.0), 0.01
-PLAIN = CableModel(Cable(0.5, 0.03, 0.006, 0.01, straight=True), 12)
+PLAIN = CableModel(CableData(0.5, 0.03, 0.006, 0.01, straight=True), 12)
 ENDS = ((0.3, 0.0), (0.2, -0.2), (0.35, 0.1), (0.4, -0.1))
 
 
@@ -29,7 +29,7 @@ def found(coefficient: float):
     )
     model = taper.add_to(distortion.add_to(PLAIN))
     p = np.array([0.01, coefficient, 0.4])
-    poses = [Pose((0.0, 0.0), end) for end in ENDS]
+    poses = [HeldPose((0.0, 0.0), end) for end in ENDS]
     s = np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
     rng = np.random.default_rng(0)
     measured = [

@@ -9,21 +9,21 @@ from dlo_casadi.diagnosis.crossval import CrossValidation
 from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.selection import improving
 from dlo_casadi.diagnosis.structure import limiting_spread
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
-MODEL = CableModel(Cable(0.8, 0.03, 0.006, 0.02), 12, start="clamped", end="clamped", n_rest=5)
+MODEL = CableModel(CableData(0.8, 0.03, 0.006, 0.02), 12, start="clamped", end="clamped", n_rest=5)
 NOISE = 3e-4
 
 
 def hung_again(seed: int, scatter: float, count: int = 5) -> list[MeasuredPose]:
     """Repeats of one pose whose rest shape differs from one to the next [1/m]."""
     rng = np.random.default_rng(seed)
-    pose = Pose((0.0, 0.0), (0.45, -0.05), start_heading=-0.6, end_heading=0.5)
+    pose = HeldPose((0.0, 0.0), (0.45, -0.05), start_heading=-0.6, end_heading=0.5)
     s = np.linspace(0.02, 0.98, 40) * MODEL.cable.length
     out = []
     for _ in range(count):

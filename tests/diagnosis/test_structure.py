@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis.structure import structure_of
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -20,10 +20,10 @@ HEIGHTS = (0.3, 0.0, 0.45, 0.15, 0.4)
 @pytest.fixture(scope="module")
 def structure():
     """Five lines off by opposite waves along two normals, more so where the ends are far apart."""
-    cable = Cable(0.8, 0.05, 0.008, 0.02, torsional_stiffness=0.015)
+    cable = CableData(0.8, 0.05, 0.008, 0.02, torsional_stiffness=0.015)
     model = CableModel(cable, 8, start="clamped", end="clamped", gravity=(0.0, 0.0, -9.81))
     poses = [
-        Pose((0.0, 0.0, 0.0), (0.5, 0.0, z), None, None, ALONG_X, ALONG_X, name=f"pose_{k}")
+        HeldPose((0.0, 0.0, 0.0), (0.5, 0.0, z), None, None, ALONG_X, ALONG_X, name=f"pose_{k}")
         for k, z in enumerate(HEIGHTS)
     ]
     rng, s = np.random.default_rng(0), np.linspace(0.02, 0.98, POINTS) * cable.length

@@ -19,24 +19,24 @@ from dlo_casadi.effects import (
     NUISANCES,
     BendingAnisotropy,
     BendingSoftening,
-    Cable,
+    CableData,
     Setup,
     StiffnessGradient,
     UnknownPull,
 )
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import REACTIONS
 
 EI, GJ, LENGTH, MASS, N = 0.05, 0.03, 0.8, 0.2, 8  # N m^2, N m^2, m, kg, elements
-FLAT = Cable(length=LENGTH, mass=MASS, diameter=0.01, bending_stiffness=EI)
+FLAT = CableData(length=LENGTH, mass=MASS, diameter=0.01, bending_stiffness=EI)
 CABLES = {"plane": FLAT, "space": replace(FLAT, torsional_stiffness=GJ)}
 GRAVITY = {"plane": (0.5, -9.7), "space": (0.3, 0.5, -9.7)}
 POSES = {
-    "plane": Pose((0.1, 0.05), (0.6, -0.05), 0.6, -0.5, camera_center=(0.3, -0.4, 1.5)),
-    "space": Pose(
+    "plane": HeldPose((0.1, 0.05), (0.6, -0.05), 0.6, -0.5, camera_center=(0.3, -0.4, 1.5)),
+    "space": HeldPose(
         (0.1, 0.05, -0.2),
         (0.6, 0.0, -0.1),
         start_orientation=tuple(Rotation.from_rotvec([0.1, -0.2, 0.4]).as_quat()),
@@ -533,7 +533,9 @@ def test_a_helix_of_a_softening_section(element, ratio):
     p = model.nominal.copy()
     p[-len(values) :] = values
     first, last = (tuple(map(float, rod.frames[i].as_quat())) for i in (0, -1))
-    pose = Pose((0.0,) * 3, tuple(rod.places[-1]), start_orientation=first, end_orientation=last)
+    pose = HeldPose(
+        (0.0,) * 3, tuple(rod.places[-1]), start_orientation=first, end_orientation=last
+    )
     x = np.array([frame.as_quat() for frame in rod.frames])
     eq = solve_equilibrium(model, p, np.zeros(model.chain.n_rests), pose, x_init=x)
     np.testing.assert_allclose(eq.points, rod.places, atol=1e-6)  # three Gauss points

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.effects import EFFECTS, Cable, Setup, StateEffect
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import EFFECTS, CableData, Setup, StateEffect
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -16,7 +16,7 @@ from dlo_casadi.rod.ends import REACTIONS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 LENGTH, NOISE, N = 0.6, 3e-4, 5
-FLAT = Cable(length=LENGTH, mass=0.06, diameter=0.006, bending_stiffness=0.02, straight=True)
+FLAT = CableData(length=LENGTH, mass=0.06, diameter=0.006, bending_stiffness=0.02, straight=True)
 CABLES = {"plane": FLAT, "space": replace(FLAT, torsional_stiffness=0.012)}
 GRAVITY = {"plane": (0.0, -9.81), "space": (0.0, 0.0, -9.81)}
 # Far beyond what a cable of that kind has by mistake.
@@ -65,13 +65,13 @@ STRONG = {
 }
 
 
-def poses_in(where: str, pinned: bool) -> list[Pose]:
+def poses_in(where: str, pinned: bool) -> list[HeldPose]:
     rng = np.random.default_rng(0)
     ends = np.array([0.4, 0.0, 0.0]) + rng.normal(scale=0.08, size=(3, 3))
     turns = rng.normal(scale=0.35, size=(3, 2, 3))
     if where == "plane":
         return [
-            Pose(
+            HeldPose(
                 (0.0, 0.0),
                 tuple(end[:2]),
                 *(None if pinned else float(turn[2]) for turn in pair),
@@ -81,7 +81,7 @@ def poses_in(where: str, pinned: bool) -> list[Pose]:
         ]
     frames = [[tuple(Rotation.from_rotvec(turn).as_quat()) for turn in pair] for pair in turns]
     return [
-        Pose((0.0,) * 3, tuple(end), start_orientation=first, end_orientation=last)
+        HeldPose((0.0,) * 3, tuple(end), start_orientation=first, end_orientation=last)
         for end, (first, last) in zip(ends[:2], frames, strict=False)
     ]
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.io.points import read_points
@@ -30,18 +30,18 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
 GRAVITY = (0.0, -9.81)  # m/s^2
-CABLE = Cable(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.5)
+CABLE = CableData(length=0.8125, mass=0.23, diameter=0.0128, bending_stiffness=0.5)
 ENDS = [(0.61, 0.0), (0.51, 0.1), (0.41, -0.3), (0.66, 0.2)]  # m
 
 
-def session(name: str) -> tuple[Cable, list[MeasuredPose]]:
+def session(name: str) -> tuple[CableData, list[MeasuredPose]]:
     """Cable and poses of a bench session with CSV centre-lines."""
     config = load_config(BENCH / name / "session.yaml")
     data = config.cable
-    cable = Cable(data.length, data.mass, data.diameter, data.prior_bending_stiffness, name)
+    cable = CableData(data.length, data.mass, data.diameter, data.prior_bending_stiffness, name)
     poses = [
         MeasuredPose.of_points(
-            Pose(item.start, item.end, branch=item.branch, name=item.name),
+            HeldPose(item.start, item.end, branch=item.branch, name=item.name),
             read_points(item.paths[0], item.start, item.end).points,
             held_out=item.role == "held_out",
         )
@@ -51,7 +51,7 @@ def session(name: str) -> tuple[Cable, list[MeasuredPose]]:
 
 
 @cache
-def fine_rod(cable: Cable) -> CableModel:
+def fine_rod(cable: CableData) -> CableModel:
     return CableModel(cable, n=160, n_rest=4)
 
 
@@ -60,13 +60,15 @@ def measured(
     ends: list[tuple[float, float]],
     kappa_0: float = 1.5,
     noise: float = 3e-4,
-    cable: Cable = CABLE,
+    cable: CableData = CABLE,
 ) -> list[MeasuredPose]:
     """Points of a fine rod of constant rest curvature [1/m], with white noise [m]."""
     rng = np.random.default_rng(0)
     model = fine_rod(cable)
     rest = np.full(160, kappa_0)
-    poses = [Pose((0.0, 0.0), end, branch="ccw", name=f"pose {k}") for k, end in enumerate(ends)]
+    poses = [
+        HeldPose((0.0, 0.0), end, branch="ccw", name=f"pose {k}") for k, end in enumerate(ends)
+    ]
     found = solve_equilibria(model, np.array([stiffness]), rest, poses)
     return [
         MeasuredPose.of_points(pose, eq.points[2:-1] + rng.normal(scale=noise, size=(158, 2)))
@@ -134,7 +136,7 @@ def test_least_squares_equals_linear_regression_in_the_compliance():
 def test_distance_of_nodes_to_their_nearest_points():
     """r_p by hand: 0.01 m off two points of a line, and a node in a gap that does not count."""
     x = np.concatenate([np.linspace(0.01, 0.3, 30), np.linspace(0.6, 0.99, 40)])
-    line = MeasuredPose.of_points(Pose((0.0, 0.0), (1.0, 0.0)), np.stack([x, 0 * x], axis=1))
+    line = MeasuredPose.of_points(HeldPose((0.0, 0.0), (1.0, 0.0)), np.stack([x, 0 * x], axis=1))
     target = Target.of(line, gap=0.1)
     nodes = np.array([[0.2, 0.01], [0.42, 0.0], [0.8, -0.01]])
     np.testing.assert_array_equal(target.nearest(nodes)[1], [True, False, True])
@@ -267,8 +269,8 @@ def test_parameters_are_those_of_the_model():
     """k_theta = EI / h and theta_0 = kappa_0 h give the energy of Eq. 6 in `CableModel`."""
     result = run_algorithm1(CABLE, measured(0.3, ENDS), GRAVITY, n=6, max_iterations=1)
     problem = InnerProblem(CABLE, GRAVITY, 6, c=0.0)
-    shape = solve_equilibrium(result.model, result.p, result.rest, Pose((0.0, 0.0), ENDS[0]))
-    line = MeasuredPose.of_points(Pose((0.0, 0.0), ENDS[0]), shape.points[1:-1])
+    shape = solve_equilibrium(result.model, result.p, result.rest, HeldPose((0.0, 0.0), ENDS[0]))
+    line = MeasuredPose.of_points(HeldPose((0.0, 0.0), ENDS[0]), shape.points[1:-1])
     by_paper = problem.objective(
         shape.phi, Target.of(line, gap=1.0), result.k_theta, result.theta_0
     )
@@ -280,7 +282,7 @@ def test_held_out_and_unread_poses_are_not_used():
     extra = [
         MeasuredPose.of_points(poses[0].pose, poses[0].points + 0.1, held_out=True),
         MeasuredPose.of_points(poses[1].pose, np.empty((0, 2))),
-        MeasuredPose.of_points(Pose((0.0, 0.0), (2.0, 0.0)), poses[2].points),  # out of reach
+        MeasuredPose.of_points(HeldPose((0.0, 0.0), (2.0, 0.0)), poses[2].points),  # out of reach
     ]
     plain = run_algorithm1(CABLE, poses, GRAVITY, n=5, max_iterations=1)
     more = run_algorithm1(CABLE, [*poses, *extra], GRAVITY, n=5, max_iterations=1)
@@ -296,10 +298,10 @@ def test_only_pins_are_known():
     in_space = replace(CABLE, torsional_stiffness=CABLE.bending_stiffness)
     assert not applies(CableModel(in_space, gravity=(0.0, 0.0, -9.81)))
     clamped = MeasuredPose.of_points(
-        Pose((0.0, 0.0), (0.5, 0.0), start_heading=0.0, name="p3"), np.eye(2)
+        HeldPose((0.0, 0.0), (0.5, 0.0), start_heading=0.0, name="p3"), np.eye(2)
     )
     with pytest.raises(EstimationError, match="p3: the paper's method knows pinned ends only"):
         run_algorithm1(CABLE, [clamped], GRAVITY)
-    free = MeasuredPose.of_points(Pose((0.0, 0.0), name="p4"), np.eye(2))
+    free = MeasuredPose.of_points(HeldPose((0.0, 0.0), name="p4"), np.eye(2))
     with pytest.raises(EstimationError, match="p4"):
         run_algorithm1(CABLE, [free], GRAVITY)

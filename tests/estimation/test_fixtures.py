@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
@@ -15,7 +15,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.remarks import fit_warnings
 
 NOISE = 5e-5
-MODEL = CableModel(Cable(0.6, 0.06, 0.008, 0.05), 10, n_rest=5)
+MODEL = CableModel(CableData(0.6, 0.06, 0.008, 0.05), 10, n_rest=5)
 TRUTH, REST = np.array([0.05]), np.full(10, 0.8)
 
 
@@ -24,7 +24,7 @@ def moved_session(scatter: float, count: int = 24) -> tuple[Fit, float]:
     rng = np.random.default_rng(1)
     angles, reach = rng.uniform(-2.2, 0.2, count), rng.uniform(0.3, 0.5, count)
     ends = np.stack([reach * np.cos(angles), reach * np.sin(angles)], axis=1)
-    declared = [Pose((0.0, 0.0), (float(x), float(y))) for x, y in ends]
+    declared = [HeldPose((0.0, 0.0), (float(x), float(y))) for x, y in ends]
     moved = ends + rng.normal(scale=scatter, size=(count, 2))
     true = [replace(p, end=(float(x), float(y))) for p, (x, y) in zip(declared, moved, strict=True)]
     s = np.linspace(0.02, 0.98, 60) * MODEL.cable.length

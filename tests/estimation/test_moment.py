@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.effects import BendingSoftening, Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import BendingSoftening, CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.stiffness import law_of, measured_moment_curve
 from dlo_casadi.model.cable_model import CableModel
 
 EI = 8e-4
-CABLE = Cable(0.25, 0.0173, 0.001, EI)
+CABLE = CableData(0.25, 0.0173, 0.001, EI)
 WEIGHT = CABLE.mass * 9.81 / CABLE.length
 # Torsional stiffness, gravity and a clamp across it.
-PLANE = (None, (0.0, -9.81), Pose((0.0, 0.0), start_heading=0.0))
-SPACE = (4e-4, (3.0, 4.0, -8.4), Pose((0.0,) * 3, start_orientation=(0.0, 0.0, 0.6, 0.8)))
+PLANE = (None, (0.0, -9.81), HeldPose((0.0, 0.0), start_heading=0.0))
+SPACE = (4e-4, (3.0, 4.0, -8.4), HeldPose((0.0,) * 3, start_orientation=(0.0, 0.0, 0.6, 0.8)))
 
 
 @pytest.mark.parametrize("marked", [False, True])

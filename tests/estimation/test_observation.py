@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import (
     NoiseModel,
@@ -141,7 +141,7 @@ def test_first_places_along_the_chords(gap):
         exact = exact[(exact < 0.4) | (exact > 0.45)]
     points = on_circle(exact) + rng.normal(scale=3e-4, size=(len(exact), 2))
     (end,) = on_circle(np.array([LENGTH]))
-    item = MeasuredPose.of_points(Pose((0.0, 0.0), (float(end[0]), float(end[1]))), points)
+    item = MeasuredPose.of_points(HeldPose((0.0, 0.0), (float(end[0]), float(end[1]))), points)
     places = item.places(LENGTH)
     assert np.all(np.diff(places) >= 0)
     # Noise of 0.3 mm lengthens chords of 18 mm by 2e-4 of themselves; the chord over a gap of
@@ -150,7 +150,7 @@ def test_first_places_along_the_chords(gap):
 
 
 def test_a_pose_knows_whether_it_can_be_read():
-    pose = Pose((0.0, 0.0))
+    pose = HeldPose((0.0, 0.0))
     assert not MeasuredPose.of_points(pose, np.empty((0, 2))).readable
     item = MeasuredPose.of_points(pose, np.zeros((3, 2)))
     np.testing.assert_array_equal(item.relative_std, 1.0)

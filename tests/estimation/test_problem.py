@@ -9,7 +9,7 @@ import pytest
 from dlo_casadi.effects import (
     AxialStretch,
     BendingSoftening,
-    Cable,
+    CableData,
     EndOffset,
     GravityTilt,
     ImageScale,
@@ -20,7 +20,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
@@ -37,7 +37,7 @@ from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 
-CABLE = Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
+CABLE = CableData(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 STD = 3e-4  # m
 ENDS = [
     (0.55, 0.1),
@@ -52,8 +52,8 @@ ENDS = [
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 
 
-def poses_at(count: int) -> list[Pose]:
-    return [Pose((0.0, 0.0), end, branch="ccw", name=f"pose {end}") for end in ENDS[:count]]
+def poses_at(count: int) -> list[HeldPose]:
+    return [HeldPose((0.0, 0.0), end, branch="ccw", name=f"pose {end}") for end in ENDS[:count]]
 
 
 def measured_from(

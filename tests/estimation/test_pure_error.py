@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import displacements, spread_across
 from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
 from dlo_casadi.estimation.repeats import (
@@ -28,7 +28,7 @@ LENGTH, STD = 1.0, 5e-4
 DECLARED = NoiseModel(STD, source="declared")
 
 
-def lines(noise: NoiseModel, count: int, pose: Pose) -> list[MeasuredPose]:
+def lines(noise: NoiseModel, count: int, pose: HeldPose) -> list[MeasuredPose]:
     """Repeats of a straight line whose points are off across it."""
     rng = np.random.default_rng(0)
     s = np.linspace(0.03, 0.97, 60) * LENGTH
@@ -42,7 +42,7 @@ def lines(noise: NoiseModel, count: int, pose: Pose) -> list[MeasuredPose]:
 def test_repeats_tell_size_and_correlation():
     """Sixteen lines; the distances from their mean lose one degree of freedom."""
     truth = NoiseModel(3e-3, share=0.9, length=0.05, kernel="gaussian")
-    measured = lines(truth, 16, Pose((0.0, 0.0), (LENGTH, 0.0)))
+    measured = lines(truth, 16, HeldPose((0.0, 0.0), (LENGTH, 0.0)))
     found = with_repeats(DECLARED, measured, LENGTH)
     assert found.source == "repeats"
     assert found.known
@@ -70,7 +70,7 @@ def test_repeats_tell_size_and_correlation():
 
 
 def test_poses_that_repeat_to_the_noise_or_are_taken_once_leave_it_as_declared():
-    pose = Pose((0.0, 0.0), (LENGTH, 0.0))
+    pose = HeldPose((0.0, 0.0), (LENGTH, 0.0))
     assert with_repeats(DECLARED, lines(DECLARED, 5, pose), LENGTH) is DECLARED
     far_off = lines(NoiseModel(3e-3), 2, pose)
     once = [far_off[0], replace(far_off[1], pose=replace(pose, end=(LENGTH, 0.01)))]
@@ -113,6 +113,6 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
 
 
 def test_repeats_of_a_point_each_tell_of_no_noise():
-    pose = Pose((0.0, 0.0), (LENGTH, 0.0))
+    pose = HeldPose((0.0, 0.0), (LENGTH, 0.0))
     points = [MeasuredPose.of_points(pose, np.array([[0.5, y]])) for y in (-0.01, 0.01)]
     assert with_repeats(DECLARED, points, LENGTH) is DECLARED

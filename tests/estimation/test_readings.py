@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.effects import Cable, SensorBias, Setup, StartSpring
+from dlo_casadi.effects import CableData, SensorBias, Setup, StartSpring
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -17,22 +17,22 @@ from dlo_casadi.rod.ends import REACTIONS, reaction_rows
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 
-CABLE = Cable(0.8, 0.2, 0.012, 0.04)
+CABLE = CableData(0.8, 0.2, 0.012, 0.04)
 IN_SPACE = replace(CABLE, torsional_stiffness=0.02)
 TURNED = (0.1, -0.2, 0.3, np.sqrt(1 - 0.14))
 
 
-def clamped(space: bool) -> tuple[CableModel, Pose]:
+def clamped(space: bool) -> tuple[CableModel, HeldPose]:
     if space:
         model = CableModel(IN_SPACE, 12, start="clamped", end="clamped", gravity=(0.0, 0.0, -9.81))
-        pose = Pose((0.0, 0.0, 0.0), (0.5, 0.2, 0.1), None, None, (0.0, 0.0, 0.0, 1.0), TURNED)
+        pose = HeldPose((0.0, 0.0, 0.0), (0.5, 0.2, 0.1), None, None, (0.0, 0.0, 0.0, 1.0), TURNED)
         return model, pose
-    return CableModel(CABLE, 12, start="clamped", end="clamped"), Pose(
+    return CableModel(CABLE, 12, start="clamped", end="clamped"), HeldPose(
         (0.0, 0.0), (0.5, 0.2), 0.3, -0.4
     )
 
 
-def reactions(model: CableModel, pose: Pose) -> tuple[dict[str, np.ndarray], float, np.ndarray]:
+def reactions(model: CableModel, pose: HeldPose) -> tuple[dict[str, np.ndarray], float, np.ndarray]:
     """By their names, energy [J], and nodes."""
     rest = np.full(model.chain.n_rests, 0.5)
     eq = solve_equilibrium(model, model.nominal, rest, pose)
@@ -41,7 +41,7 @@ def reactions(model: CableModel, pose: Pose) -> tuple[dict[str, np.ndarray], flo
     return {name: found[at] for name, at in reaction_rows(model.node).items()}, eq.energy, eq.points
 
 
-def moved(pose: Pose, model: CableModel, reaction: str, k: int, step: float) -> Pose:
+def moved(pose: HeldPose, model: CableModel, reaction: str, k: int, step: float) -> HeldPose:
     """The fixture moved along, or turned about, the k-th axis of the world."""
     side = reaction.split("_")[0]
     if reaction.endswith("force"):
@@ -100,7 +100,7 @@ def test_a_spring_at_a_pin_holds_a_moment():
     model = CableModel(CABLE, 12, effects=(StartSpring(),))
     p = model.nominal.copy()
     p[[model.names.index(f"start_spring.{name}") for name in ("stiffness", "heading")]] = 0.05, 0.4
-    rest, pose = np.zeros(model.chain.n_rests), Pose((0.0, 0.0), (0.6, 0.0))
+    rest, pose = np.zeros(model.chain.n_rests), HeldPose((0.0, 0.0), (0.6, 0.0))
     eq = solve_equilibrium(model, p, rest, pose)
     found = assembly_of(model).reactions(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
     np.testing.assert_allclose(found[[2, 5]], [0.05 * (eq.phi[0] - 0.4), 0.0], atol=1e-12)
@@ -139,7 +139,7 @@ def test_readings_are_residuals_beside_points():
     """In units of their noise; what is of points (modes, weights, projections) is theirs alone."""
     points = np.array([[0.1, 0.0], [0.3, 0.0], [0.5, 0.0]])
     readings = {"end_force": (1.0, 2.0), "start_moment": (0.3,)}
-    item = MeasuredPose.of_points(Pose((0.0, 0.0)), points).with_readings(readings)
+    item = MeasuredPose.of_points(HeldPose((0.0, 0.0)), points).with_readings(readings)
     assert item.reactions == ("end_force", "start_moment")
     assert list(item.kinds) == ["point"] * 3 + ["moment", "force", "force"]
     seen = Observed(NodeCurve(0.8, np.array([[0.0, 0.0], [0.8, 0.0]]), None), np.zeros(6))
@@ -159,7 +159,9 @@ def test_noise_and_bias_of_readings_are_estimated():
     model = CableModel(CABLE, 10, start="clamped", end="clamped", n_rest=4)
     ends = rng.uniform([0.35, -0.3], [0.6, 0.3], size=(12, 2))
     headings = rng.uniform(-0.6, 0.6, size=(12, 2))
-    poses = [Pose((0.0, 0.0), tuple(end), *turn) for end, turn in zip(ends, headings, strict=True)]
+    poses = [
+        HeldPose((0.0, 0.0), tuple(end), *turn) for end, turn in zip(ends, headings, strict=True)
+    ]
     s = np.linspace(0.05, 0.75, 20)
     measured = []
     predicted = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), poses)

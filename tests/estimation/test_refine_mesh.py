@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation import fit as fitting
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
-MODEL = CableModel(Cable(0.5, 0.1, 0.006, 0.02), 10, n_rest=0)
+MODEL = CableModel(CableData(0.5, 0.1, 0.006, 0.02), 10, n_rest=0)
 NOISE = 3e-4
 
 
@@ -19,7 +19,9 @@ def test_a_fit_that_gets_stuck_on_a_finer_mesh_starts_again(monkeypatch):
 
     Stuck here: at twice the stiffness, with nothing that descends from there.
     """
-    poses = [Pose((0.0, 0.0), end, name=f"{k}") for k, end in enumerate([(0.4, 0.0), (0.3, -0.1)])]
+    poses = [
+        HeldPose((0.0, 0.0), end, name=f"{k}") for k, end in enumerate([(0.4, 0.0), (0.3, -0.1)])
+    ]
     shapes = predict_poses(MODEL, MODEL.nominal, np.zeros(MODEL.chain.n_rests), poses)
     rng, s = np.random.default_rng(0), np.linspace(0.01, 0.49, 40)
     measured = [

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, begin, relaxed
@@ -17,7 +17,7 @@ from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 
-CABLE = Cable(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03)
+CABLE = CableData(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03)
 HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
 ROLL, NOISE, TURNED = -2.3, 5e-4, (3.4, 2.2, 1.2, 0.1, -1.1, -2.1)
 
@@ -42,7 +42,7 @@ def problem_of(marked: bool = True) -> tuple[Problem, np.ndarray]:
             "start_orientation": (0.0, 0.0, 0.0, 1.0),
             "end_orientation": tuple(end.as_quat()),
         }
-        pose = Pose((0.0, 0.0, 0.0), place, **frames)
+        pose = HeldPose((0.0, 0.0, 0.0), place, **frames)
         (shape,) = predict_poses(MODEL, p, rest, [pose])
         points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 3))
         measured.append(MeasuredPose.of_points(pose, points, s=s if marked else None))

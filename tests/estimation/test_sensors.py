@@ -3,7 +3,7 @@
 import numpy as np
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Centerline, Markers
@@ -70,7 +70,7 @@ def test_markers_are_compared_in_all_directions_at_their_arc_lengths():
     s = np.array([0.2, 0.5, 0.9])
     now = seen()
     offset = np.array([[0.0, 0.0, 0.05], [0.01, 0.0, 0.0], [0.0, -0.02, 0.0]])
-    item = MeasuredPose.of_points(Pose((0.0, 0.0)), now.curve.at(s) + offset, s=s)
+    item = MeasuredPose.of_points(HeldPose((0.0, 0.0)), now.curve.at(s) + offset, s=s)
     places = item.located(now, item.places(LENGTH))
     np.testing.assert_array_equal(places, s)
     np.testing.assert_allclose(item.residual(now, places), offset.ravel(), atol=1e-12)
@@ -90,7 +90,7 @@ def test_sensors_of_a_pose_follow_one_another():
     now = seen()
     points = now.curve.at(s) + 1e-3
     line, markers = Centerline(points, np.ones(3)), Markers(points, np.array([1.0, 2.0, 1.0]), s)
-    item = MeasuredPose(Pose((0.0, 0.0)), (line, markers))
+    item = MeasuredPose(HeldPose((0.0, 0.0)), (line, markers))
     places = np.concatenate([line.located(now, s), s])
     both = [line.residual(now, places[:3]), markers.residual(now, s)]
     np.testing.assert_array_equal(item.residual(now, places), np.concatenate(both))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dlo_casadi.effects import Cable, LumpedMass
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData, LumpedMass
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -16,7 +16,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.stages import fitted_parameters
 
 NOISE, LENGTH = 3e-4, 0.5
-PLAIN = CableModel(Cable(LENGTH, 0.03, 0.006, 0.01, straight=True), 12)
+PLAIN = CableModel(CableData(LENGTH, 0.03, 0.006, 0.01, straight=True), 12)
 MASS, PLACE = "lumped_mass.mass", "lumped_mass.position"
 
 
@@ -24,7 +24,7 @@ MASS, PLACE = "lumped_mass.mass", "lumped_mass.position"
 def fitted(request):
     """Fit with a weight, and whether there was one."""
     model = PLAIN.with_effect(LumpedMass())
-    poses = [Pose((0.0, 0.0), end) for end in ((0.3, 0.0), (0.2, -0.2), (0.35, 0.1))]
+    poses = [HeldPose((0.0, 0.0), end) for end in ((0.3, 0.0), (0.2, -0.2), (0.35, 0.1))]
     # Lighter than nothing where there is none: the fit ends at the bound of 0.
     p = np.array([0.01, request.param or -2e-3, 0.2])
     s, rng = np.linspace(0.02, 0.98, 30) * LENGTH, np.random.default_rng(0)

@@ -16,8 +16,8 @@ from tiny_sessions import write_session
 from dlo_casadi.api import predict
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet import shape_table as shape_table_module
@@ -29,7 +29,7 @@ from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import open_executor
 from dlo_casadi.session import run_session
 
-CABLE = Cable(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
+CABLE = CableData(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
 REST = np.zeros(10)
 GRID = Grid((-0.4, 0.4, 9), (-0.3, 0.3, 7))
 
@@ -109,7 +109,9 @@ def test_a_list_of_poses_of_a_clamped_cable(kind, tmp_path):
     rows = pq.read_table(output).to_pylist()
     for k, row in enumerate(rows[:2]):
         end = (columns["end_x_m"][k], columns["end_y_m"][k])
-        pose = Pose((0.0, 0.0), end, start_heading=0.2, end_heading=columns["end_heading_rad"][k])
+        pose = HeldPose(
+            (0.0, 0.0), end, start_heading=0.2, end_heading=columns["end_heading_rad"][k]
+        )
         found = solve_equilibrium(plan.model, plan.p, plan.rest, pose)
         assert row["energy"] == pytest.approx(found.energy, rel=1e-8)
         assert row["end_heading"] == columns["end_heading_rad"][k]
@@ -185,10 +187,10 @@ def test_bad_lists(text, message, tmp_path):
 
 def test_a_model_is_pickled_without_its_expressions():
     model = CableModel(CABLE, n=10)
-    before = solve_equilibrium(model, model.nominal, REST, Pose((0.0, 0.0), (0.3, 0.0)))
+    before = solve_equilibrium(model, model.nominal, REST, HeldPose((0.0, 0.0), (0.3, 0.0)))
     copy = pickle.loads(pickle.dumps(model))
     assert copy == model
-    after = solve_equilibrium(copy, copy.nominal, REST, Pose((0.0, 0.0), (0.3, 0.0)))
+    after = solve_equilibrium(copy, copy.nominal, REST, HeldPose((0.0, 0.0), (0.3, 0.0)))
     assert np.array_equal(before.phi, after.phi)
 
 

@@ -10,9 +10,9 @@ from matplotlib.image import imread
 
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
-from dlo_casadi.effects import Cable
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.fitted_cable import FittedCable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report import figures, figures_poses
 from dlo_casadi.report.canvas import save_figure
@@ -184,8 +184,8 @@ def test_a_prediction_is_drawn(tmp_path, end):
     points = np.stack([np.linspace(0, 0.4, 21), -0.25 * np.linspace(0, 1, 21)], axis=1)
     force = np.array([0.0, -1.0])
     shape = SimpleNamespace(
-        cable=FittedCable(CableModel(Cable(0.8, 0.05, 0.01, 0.02, name="rope")), *[None] * 3),
-        pose=Pose((0.0, 0.0), end),
+        cable=FittedCable(CableModel(CableData(0.8, 0.05, 0.01, 0.02, name="rope")), *[None] * 3),
+        pose=HeldPose((0.0, 0.0), end),
         equilibrium=SimpleNamespace(
             lam_start=force, lam=0 * force, energy=1.0, min_bend_radius=0.1, stable=end is None
         ),

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from small_sessions import BARE
 from test_terminal import said
 
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.report import figures
 from dlo_casadi.report.canvas import BLACK
@@ -22,7 +22,7 @@ STD = 3e-4
 @pytest.mark.parametrize("d", [2, 3])
 def test_a_line_is_compared_across_and_a_marker_in_all_directions(d):
     """Of a line of 3 points and 5 markers: the RMS over all of them."""
-    pose = Pose((0.0,) * d)
+    pose = HeldPose((0.0,) * d)
     line = MeasuredPose.of_points(pose, np.zeros((3, d)))
     markers = MeasuredPose.of_points(pose, np.zeros((5, d)), s=np.arange(5.0))
     assert noise_distance([line], STD) == pytest.approx(np.sqrt(d - 1) * STD)

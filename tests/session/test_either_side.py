@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
 from dlo_casadi.config import dump_yaml
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty, tipping, tipping_of
 from dlo_casadi.estimation.prediction import predict_poses
@@ -20,7 +20,7 @@ from dlo_casadi.report.documents import report_dict
 from dlo_casadi.session.pose_shape import BranchShape
 from dlo_casadi.session.remarks import doubts_of
 
-CABLE = Cable(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03, straight=True)
+CABLE = CableData(0.9, 0.1, 0.01, bending_stiffness=0.04, torsional_stiffness=0.03, straight=True)
 HELD = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
 # What is measured is drawn on the mesh of the fit.
 MODEL = CableModel(CABLE, 8, "quadratic", **HELD)
@@ -47,7 +47,7 @@ def ways(pose):
 
 def clamped(place, bend, roll):
     end = Rotation.from_rotvec([0.0, *bend]) * Rotation.from_rotvec([roll, 0.0, 0.0])
-    return Pose((0.0,) * 3, tuple(place), None, None, AHEAD, tuple(end.as_quat()))
+    return HeldPose((0.0,) * 3, tuple(place), None, None, AHEAD, tuple(end.as_quat()))
 
 
 def evenly(place, bend):

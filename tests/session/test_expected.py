@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import uncertainty_of
@@ -15,7 +15,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.stages import fit_stage
 
 STD, DRAWN = 4e-4, 60
-CABLE = Cable(0.8, 0.05, 0.008, 0.02)
+CABLE = CableData(0.8, 0.05, 0.008, 0.02)
 LOOM = replace(CABLE, torsional_stiffness=0.015)
 S = np.linspace(0.03, 0.97, 40) * CABLE.length
 PLANE = CableModel(CABLE, 12, n_rest=0)
@@ -27,11 +27,11 @@ def poses_of(model):
     """Three, the cable well below the chord, so that it moves along itself, too."""
     if not model.in_space:
         return [
-            Pose((0.0, 0.0), end, name=str(end)) for end in ((0.4, 0.1), (0.5, 0.0), (0.3, 0.3))
+            HeldPose((0.0, 0.0), end, name=str(end)) for end in ((0.4, 0.1), (0.5, 0.0), (0.3, 0.3))
         ]
     held = {"start_orientation": (0.0, 0.0, 0.0, 1.0)}
     ends = ((0.4, 0.1, 0.1), (0.5, -0.1, 0.0), (0.3, 0.2, 0.2))
-    return [Pose((0.0, 0.0, 0.0), end, **held, name=str(end)) for end in ends]
+    return [HeldPose((0.0, 0.0, 0.0), end, **held, name=str(end)) for end in ends]
 
 
 def repeats(model, p, poses, scatter, marked, rng, near=None):

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import EFFECTS, Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import EFFECTS, CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -36,9 +36,9 @@ def test_a_declared_mesh_is_kept_and_its_error_told():
 
 def test_the_points_that_weigh_less_are_the_outlying_ones():
     """The first pose is held out, and no two poses have the same number of points."""
-    model = CableModel(Cable(0.8, 0.03, 0.006, 0.02), 12, n_rest=5)
+    model = CableModel(CableData(0.8, 0.03, 0.006, 0.02), 12, n_rest=5)
     rng = np.random.default_rng(0)
-    poses = [Pose((0.0, 0.0), (0.45, y)) for y in (-0.1, 0.0, 0.1, 0.2)]
+    poses = [HeldPose((0.0, 0.0), (0.45, y)) for y in (-0.1, 0.0, 0.1, 0.2)]
     shapes = predict_poses(model, model.nominal, np.ones(model.chain.n_cells), poses)
     measured = []
     for k, (pose, shape) in enumerate(zip(poses, shapes, strict=True)):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty, tipping, tipping_of
 from dlo_casadi.errors import ConfigError
@@ -22,14 +22,14 @@ from dlo_casadi.session.remarks import branch_warnings, doubts_of
 from dlo_casadi.session.stages import fit_stage
 
 EI, STD = 0.028, 1e-3
-MODEL = CableModel(Cable(0.5, 0.3, 0.012, EI), 12, start="clamped", end="free", n_rest=5)
+MODEL = CableModel(CableData(0.5, 0.3, 0.012, EI), 12, start="clamped", end="free", n_rest=5)
 STRAIGHT = np.zeros(MODEL.chain.n_cells)
 UP = np.pi / 2
 
 
 def held(beyond, branch=None):
     """A pose whose gripper points so far beyond straight up [rad]."""
-    return Pose((0.0, 0.0), None, UP + beyond, branch=branch, name=f"{beyond:+.2f}")
+    return HeldPose((0.0, 0.0), None, UP + beyond, branch=branch, name=f"{beyond:+.2f}")
 
 
 def fallen(pose):
@@ -173,7 +173,7 @@ def test_in_space_a_cable_is_followed_too():
 
     def gripper(beyond):
         half = -(UP + beyond) / 2  # counter-clockwise against y
-        return Pose((0.0,) * 3, start_orientation=(0.0, np.sin(half), 0.0, np.cos(half)))
+        return HeldPose((0.0,) * 3, start_orientation=(0.0, np.sin(half), 0.0, np.cos(half)))
 
     before, after = gripper(1.2), gripper(0.3)
     x = solve_equilibrium(model, model.nominal, rest, before).x
@@ -193,7 +193,7 @@ def test_in_space_a_cable_gives_way_to_one_side_of_two():
     rest = np.zeros(model.chain.n_rests)
     rest[model.chain.n_cells : 2 * model.chain.n_cells] = 6.0
     half = -(UP + 1.0) / 2
-    held = Pose((0.0,) * 3, start_orientation=(0.0, np.sin(half), 0.0, np.cos(half)))
+    held = HeldPose((0.0,) * 3, start_orientation=(0.0, np.sin(half), 0.0, np.cos(half)))
     found = solve_equilibrium(model, model.nominal, rest, held)
     assert found.stable
     assert abs(found.points[-1, 1]) > 0.2

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import MeasuredPoints, write_points
@@ -23,11 +23,11 @@ ENDS = ((0.5, 0.1), (0.6, -0.1), (0.4, 0.2))
 
 def session(folder, count, marked, std):
     """Three poses of a cable that is stiffer than declared, and all that was measured of them."""
-    model = CableModel(Cable(*CABLE.values()), 20)
+    model = CableModel(CableData(*CABLE.values()), 20)
     p, rest = model.nominal * 1.3, np.zeros(model.chain.n_rests)
     rng, poses, all_points = np.random.default_rng(0), [], []
     s = np.sort(rng.uniform(0.01, 0.99, count)) * model.cable.length
-    found = predict_poses(model, p, rest, [Pose((0.0, 0.0), end) for end in ENDS])
+    found = predict_poses(model, p, rest, [HeldPose((0.0, 0.0), end) for end in ENDS])
     for k, (end, shape) in enumerate(zip(ENDS, found, strict=True)):
         points = shape.curve.at(s) + STD * rng.normal(size=(count, 2))
         write_points(folder / f"{k}.csv", points, s if marked else None)

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.pixels import Pixels, ViewInput, pixel_std, pixels_of
@@ -134,7 +134,7 @@ def test_a_pose_of_photographs(line):
     shown = curve()
     points = shown.at(S) if line else np.zeros((0, 3))
     item = MeasuredPose(
-        Pose((0.0, 0.0, 0.0)),
+        HeldPose((0.0, 0.0, 0.0)),
         (sensor(0.4, shown), sensor(-0.4, shown)),
         line=line_or_markers(points),
     )

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
@@ -19,7 +19,7 @@ from dlo_casadi.session.measure import conditions, read_inputs
 from dlo_casadi.session.plausibility import find_suspicions
 
 ROOT = Path(__file__).parents[2]
-CABLE = Cable(0.8, 0.2, 0.012, 0.04)
+CABLE = CableData(0.8, 0.2, 0.012, 0.04)
 ARM = np.array([0.05, -0.01, 0.02])
 
 
@@ -39,14 +39,16 @@ def read(request):
         cable, gravity = replace(CABLE, torsional_stiffness=0.02), (0.0, 0.0, -9.81)
         frames = Rotation.from_rotvec(rng.normal(scale=0.6, size=(6, 3)))
         poses = [
-            Pose((0.0,) * 3, tuple(end), None, None, (0.0, 0.0, 0.0, 1.0), tuple(frame.as_quat()))
+            HeldPose(
+                (0.0,) * 3, tuple(end), None, None, (0.0, 0.0, 0.0, 1.0), tuple(frame.as_quat())
+            )
             for end, frame in zip(ends, frames, strict=True)
         ]
         axes = frames.as_matrix()
     else:
         cable, gravity, headings = CABLE, (0.0, -9.81), rng.normal(scale=0.8, size=6)
         poses = [
-            Pose((0.0, 0.0), tuple(end), 0.0, heading)
+            HeldPose((0.0, 0.0), tuple(end), 0.0, heading)
             for end, heading in zip(ends, headings, strict=True)
         ]
         axes = np.array([[[np.cos(h), -np.sin(h)], [np.sin(h), np.cos(h)]] for h in headings])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.effects import Cable
-from dlo_casadi.equilibrium.pose import Pose
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import (
     measured_branches,
@@ -22,7 +22,7 @@ from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_si
 from dlo_casadi.session.stages import fit_stage, initial_stage, pose_shape
 
 # Stiff beside its weight, EI / (w L^3) = 3: its bow is stable upwards, and lower downwards.
-MODEL = CableModel(Cable(0.5, 0.02, 0.006, 0.08), 12, n_rest=0)
+MODEL = CableModel(CableData(0.5, 0.02, 0.006, 0.08), 12, n_rest=0)
 NOISE = 3e-4
 ENDS = ((0.4, 0.0), (0.35, 0.1), (0.3, -0.1))
 
@@ -32,7 +32,7 @@ def measured(*branches, held_out=(), told=False):
     rng = np.random.default_rng(0)
     rest = np.zeros(MODEL.chain.n_cells)
     poses = [
-        Pose((0.0, 0.0), end, branch=branch, name=f"{k}")
+        HeldPose((0.0, 0.0), end, branch=branch, name=f"{k}")
         for k, (end, branch) in enumerate(zip(ENDS, branches, strict=True))
     ]
     s = np.linspace(0.02, 0.98, 40) * MODEL.cable.length
@@ -163,11 +163,11 @@ def test_a_fit_is_no_worse_than_the_stiffness_alone():
 
 def test_a_cable_twisted_the_other_way_round_is_told_by_its_turns():
     """Its end clamp is rolled by nearly half a turn."""
-    cable = Cable(1.0, 0.1, 0.01, bending_stiffness=0.05, torsional_stiffness=0.04)
+    cable = CableData(1.0, 0.1, 0.01, bending_stiffness=0.05, torsional_stiffness=0.04)
     held = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
     model = CableModel(cable, 10, "quadratic", **held)
     ahead, rolled = (0.0, 0.0, 0.0, 1.0), (np.sin(1.45), 0.0, 0.0, np.cos(1.45))
-    pose = Pose((0, 0, 0), (0.9, 0.1, 0), start_orientation=ahead, end_orientation=rolled)
+    pose = HeldPose((0, 0, 0), (0.9, 0.1, 0), start_orientation=ahead, end_orientation=rolled)
     flat = np.zeros(model.chain.n_rests)
     poses = [pose, *(replace(pose, turns=turns) for turns in (0.5, -0.5))]
     predicted, *either = predict_poses(model, model.nominal, flat, poses)
