@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from dlo_casadi.api import PredictedShape as PredictedShape
     from dlo_casadi.api import Result as Result
     from dlo_casadi.api import fit as fit
     from dlo_casadi.api import predict as predict
+    from dlo_casadi.cable import FittedCable as FittedCable
+    from dlo_casadi.cable import Shape as Shape
+    from dlo_casadi.cable import load as load
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Config as Config
     from dlo_casadi.config import load_config as load_config
@@ -26,7 +28,8 @@ if TYPE_CHECKING:
 # Module -> its public names. They are imported when they are first asked for, so that the command
 # answers at once and an interrupt finds it ready.
 _PUBLIC = {
-    "api": "PredictedShape Result fit predict",
+    "api": "Result fit predict",
+    "cable": "FittedCable Shape load",
     "codegen": "CompiledSolver",
     "config": "Config load_config",
     "effects": "EFFECTS",

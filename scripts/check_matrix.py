@@ -51,9 +51,9 @@ from rich.console import Console
 from scipy.special import stdtrit
 
 import dlo_casadi as dlo
-from dlo_casadi.api import PredictedShape, Result
+from dlo_casadi.api import Result
+from dlo_casadi.cable import Shape
 from dlo_casadi.cli import main as command
-from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import student_95, threshold
 from dlo_casadi.io.files import write_file
@@ -240,18 +240,17 @@ def compare_with_c(results: Path, session: Session, row: Row) -> None:
         return
     code, said = commanded(*words[:2], *words[4:], "--json")
     predicted = dlo.predict(results, **held)
-    if code or not np.allclose(json.loads(said)["points"], predicted.points()):
+    if code or not np.allclose(json.loads(said)["points"], predicted.points):
         row.halves.append("dlo predict --json is not the prediction")
     apart = np.abs(solved_in_c(predicted) - predicted.equilibrium.points).max()
     if not apart <= APART * predicted.curve.length:
         row.halves.append(f"the generated C is {apart:.2g} m from Python's prediction")
 
 
-def solved_in_c(predicted: PredictedShape) -> np.ndarray:
+def solved_in_c(predicted: Shape) -> np.ndarray:
     """Nodes (n + 1, d) [m] of the same pose by the generated C, compiled."""
-    (model, p, rest, _), pose = predicted.cable, predicted.pose
-    flags = ("-O0",)  # compiles quickly
-    return CompiledSolver(model, p, rest, flags=flags).solve(pose).points
+    solver = predicted.cable.compile(flags=("-O0",))  # compiles quickly
+    return solver.solve(predicted.pose).points
 
 
 def matching(cells: Sequence[Cell], levels: str) -> list[Cell]:

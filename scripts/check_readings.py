@@ -42,11 +42,11 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import profile_intervals
 from dlo_casadi.estimation.fit import fine_enough
 from dlo_casadi.io.files import write_file
-from dlo_casadi.report.canvas import BLUE, GREY, VERMILLION, save_figure, styled
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.session.measure import conditions
+from dlo_casadi.show.style import BLUE, GREY, VERMILLION, save_figure, styled
 
 ROOT = Path(__file__).resolve().parent.parent
 STD, FORCE_STD, MOMENT_STD = 3e-4, 0.015, 1e-3  # m, N, N m

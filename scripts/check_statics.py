@@ -68,7 +68,7 @@ def rod_of(problem: SpaceProblem) -> Rod:
 def start_of(problem: SpaceProblem, eq: Equilibrium) -> FloatArray:
     """State (13,) at the start of a shape."""
     first = Rotation.from_quat(eq.x[0])
-    force, moment = eq.lam_start, first.inv().apply(eq.moments[0])
+    force, moment = eq.start_force, first.inv().apply(eq.moments[0])
     return np.concatenate([eq.points[0], eq.x[0], force / problem.p[0], moment / problem.p[0]])
 
 
@@ -77,7 +77,7 @@ def states_of(problem: SpaceProblem, rod: Rod, eq: Equilibrium) -> tuple[FloatAr
     s = np.linspace(0.0, 1.0, problem.model.n + 1)
     y = np.zeros((len(s), 13))
     y[:, PLACE], y[:, FRAME] = eq.points, kirchhoff.same_sign(eq.x)
-    y[:, FORCE] = eq.lam_start / problem.p[0] - np.outer(s, rod.load)
+    y[:, FORCE] = eq.start_force / problem.p[0] - np.outer(s, rod.load)
     cells = problem.model.chain.cells.mean(axis=1)
     strains = np.stack([eq.twist, *eq.curvature.reshape(2, -1)])
     at_nodes = np.stack([np.interp(s, cells, strain) for strain in strains], axis=1)

@@ -36,7 +36,7 @@ def main() -> None:
     draw_camera_steps()
     result = dlo.fit(ROOT / "configs/cable.yaml")
     result.plot().savefig(PICTURES / "poses.png", dpi=100)
-    result.predict(end=(0.3, -0.1)).plot().savefig(PICTURES / "shape.png", dpi=80)
+    result.cable.solve(end=(0.3, -0.1)).plot().savefig(PICTURES / "shape.png", dpi=80)
     print(result)
 
 

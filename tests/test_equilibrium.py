@@ -88,10 +88,10 @@ def test_limp_cable_converges_to_the_catenary(element):
         model = CableModel(CableData(length, weight * length / 9.81, 0.005, stiffness), n, element)
         hung = solve(model, stiffness, HeldPose((0.0, 0.0), (span, 0.0), branch="ccw"))
         assert hung.stable
-        found = np.array([-hung.points[:, 1].min(), -hung.lam[0]])
+        found = np.array([-hung.points[:, 1].min(), -hung.end_force[0]])
         errors.append(np.linalg.norm(found - exact))
     # The end's pin is pulled inwards, and down by half of the weight (exact on any mesh).
-    assert hung.lam == pytest.approx([-exact[1], -weight * length / 2], rel=1e-3)
+    assert hung.end_force == pytest.approx([-exact[1], -weight * length / 2], rel=1e-3)
     assert np.all(orders(errors) > 1.9), f"measured orders {orders(errors)}"
 
 
@@ -127,7 +127,7 @@ def test_heavy_cantilever_against_an_integrator(element):
         model = CableModel(cable, n, element, start="clamped", end="free")
         bent = solve(model, stiffness, HeldPose((0.0, 0.0), start_heading=heading))
         assert bent.stable
-        np.testing.assert_allclose(bent.lam, 0.0)
+        np.testing.assert_allclose(bent.end_force, 0.0)
         gaps = [np.hypot(*(bent.points[k] - exact(k * length / n)[2:])) for k in (n // 2, n)]
         if element != "link":  # the clamp's moment: force times lever of the weight
             lever = weight * np.trapezoid(exact(np.linspace(0, length, 4001))[2], dx=length / 4000)
@@ -157,8 +157,8 @@ def test_pinned_elastica(element, slope):
         model = CableModel(CableData(length, 0.1, 0.01, stiffness), n, element, gravity=WEIGHTLESS)
         bent = solve(model, stiffness, HeldPose((0.0, 0.0), (span, 0.0), branch="ccw"))
         assert bent.stable
-        assert bent.lam[1] == pytest.approx(0.0, abs=1e-8)  # IPOPT's tol, times EI / L^2
-        errors.append([abs(bent.lam[0] - thrust), abs(-bent.points[n // 2, 1] - sag)])
+        assert bent.end_force[1] == pytest.approx(0.0, abs=1e-8)  # IPOPT's tol, times EI / L^2
+        errors.append([abs(bent.end_force[0] - thrust), abs(-bent.points[n // 2, 1] - sag)])
     assert np.all(orders(errors) > 1.9), f"measured orders {orders(errors)}"
 
 
@@ -277,8 +277,8 @@ def test_reactions_are_slopes_of_the_energy(element):
         starts = [hold(element, start=tuple(x)).energy for x in (step, -step)]
         # Third derivatives of order EI / L^4 ~ 0.1 to 10 N/m^2 times d^2 / 6, and energies good
         # to 1e-10 J over 2 d.
-        assert -(ends[0] - ends[1]) / (2 * d) == pytest.approx(held.lam[axis], abs=2e-6)
-        assert -(starts[0] - starts[1]) / (2 * d) == pytest.approx(held.lam_start[axis], abs=2e-6)
+        assert -(ends[0] - ends[1]) / (2 * d) == pytest.approx(held.end_force[axis], abs=2e-6)
+        assert -(starts[0] - starts[1]) / (2 * d) == pytest.approx(held.start_force[axis], abs=2e-6)
 
 
 @ALL
@@ -286,7 +286,7 @@ def test_weight_and_reactions_sum_to_zero(element):
     """The holders carry what hangs on the cable: its weight, the lump's, the point force."""
     held = hold(element)
     loads = np.array([0.2, 0.4 - 9.81 * (HEAVY.mass + 0.05)])
-    np.testing.assert_allclose(held.lam + held.lam_start, loads, atol=1e-10)
+    np.testing.assert_allclose(held.end_force + held.start_force, loads, atol=1e-10)
 
 
 @ALL
@@ -300,7 +300,7 @@ def test_moments_about_the_start_sum_to_zero(element):
         x = held.points[:, 0]
         center = np.array([(x[0] + x[-1] + 4 * x[1::2].sum() + 2 * x[2:-1:2].sum()) / 48, 0.0])
     weight_moment = -9.81 * HEAVY.mass * center[0]
-    end_moment = held.points[-1, 0] * held.lam[1] - held.points[-1, 1] * held.lam[0]
+    end_moment = held.points[-1, 0] * held.end_force[1] - held.points[-1, 1] * held.end_force[0]
     # Links: exact up to IPOPT's tol. Others: Simpson's rule over 16 elements, h^4 x''' L / 180.
     assert end_moment == pytest.approx(weight_moment, abs=1e-8 if element == "link" else 1e-4)
 
@@ -318,7 +318,7 @@ def test_a_turned_board_gives_a_turned_shape():
         turned, 0.1, HeldPose((0.0, 0.0), (float(end[0]), float(end[1])), branch="ccw"), 0.7
     )
     np.testing.assert_allclose(other.points, one.points @ turn.T, atol=1e-8)  # IPOPT's tol
-    np.testing.assert_allclose(other.lam, turn @ one.lam, atol=1e-7)
+    np.testing.assert_allclose(other.end_force, turn @ one.end_force, atol=1e-7)
     assert other.energy == pytest.approx(one.energy, abs=1e-9)
 
 
@@ -342,7 +342,7 @@ def test_straight_strut_about_the_euler_load(share, status):
         model, p, np.zeros(20), HeldPose((0.0, 0.0), end), x_init=np.zeros((21, 1))
     )
     np.testing.assert_allclose(straight.phi, 0.0, atol=1e-8)
-    assert straight.lam[0] == pytest.approx(share * euler, rel=1e-6)
+    assert straight.end_force[0] == pytest.approx(share * euler, rel=1e-6)
     assert straight.status is status
 
 
@@ -369,7 +369,7 @@ def test_second_mode_is_flagged_and_avoided():
     single = solve(model, 0.3, pose)
     assert single.stable
     # The second mode thrusts four times as hard as the first; both bend equally far, nearly.
-    assert double.lam[0] > 3.5 * single.lam[0]
+    assert double.end_force[0] > 3.5 * single.end_force[0]
     assert double.energy > 3.5 * single.energy
 
 
@@ -469,8 +469,8 @@ def test_free_cable_hangs_straight_down(element):
     assert hung.stable
     np.testing.assert_allclose(hung.points[:, 0], 0.3, atol=1e-8)
     np.testing.assert_allclose(hung.points[-1], [0.3, 0.5 - HEAVY.length], atol=1e-8)
-    np.testing.assert_array_equal(hung.lam, 0.0)
-    np.testing.assert_allclose(hung.lam_start, [0.0, -9.81 * HEAVY.mass], atol=1e-12)
+    np.testing.assert_array_equal(hung.end_force, 0.0)
+    np.testing.assert_allclose(hung.start_force, [0.0, -9.81 * HEAVY.mass], atol=1e-12)
 
 
 def test_a_joint_at_its_bound_is_reported():

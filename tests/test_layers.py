@@ -19,6 +19,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "thresholds": set(),
     "runtime": set(),
+    "show": {"io"},
     "rod": set(),
     "effects": {"rod"},
     "model": {"rod", "effects"},
@@ -26,6 +27,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "config": {"rod", "effects", "model"},
     "io": {*MECHANICS, "config"},
     "codegen": {*MECHANICS, "io"},
+    "cable": {*MECHANICS, "config", "io", "codegen", "show"},
     "vision": set(),
     "sensing": {*MECHANICS, "vision"},
     "estimation": {*MECHANICS, "sensing"},
@@ -36,9 +38,10 @@ FITTING = {*MECHANICS, "sensing", "estimation", "diagnosis"}
 MAY_IMPORT["session"] = {*FITTING, "paper", "config", "io", "vision", "runtime"}
 # A report reads results and solves nothing.
 MAY_IMPORT["report"] = {*MAY_IMPORT["session"], "session"} - {"equilibrium", "paper", "sensing"}
+MAY_IMPORT["report"] |= {"cable", "show"}
 MAY_IMPORT["report"] |= {"equilibrium", "sensing"}  # types of what they hold
 MAY_IMPORT["fleet"] = {"config", "io", "session", "report", "runtime", "codegen", "model"}
-MAY_IMPORT["api"] = {"config", "equilibrium", "io", "session", "report"}
+MAY_IMPORT["api"] = {"cable", "config", "session", "report"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 
 

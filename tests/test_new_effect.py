@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import dlo_casadi as dlo
-from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.cable import load
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import EFFECTS, CableData, Effect, Fitted, PointForce, PointLoad, Setup
 from dlo_casadi.effects.cable import Parameter
@@ -21,9 +21,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.report.documents import parameters_of
 
 NOISE = 3e-4
 LIFT, PLACE = 0.4, 0.35  # N, m
@@ -130,18 +128,18 @@ def test_the_results_tell_of_it(result, tmp_path):
     assert report["stages"][-1]["parameters"]["balloon.lift"]["value"] > 0
     assert "A balloon tied to the cable" in (tmp_path / "results" / "report.html").read_text()
     assert "the declared model lacked balloon" in str(result)
-    model, p, *_ = load_parameters(tmp_path / "results")
-    assert model.effects == result.fit.model.effects
-    assert p[model.names.index("balloon.lift")] == result.fit.value("balloon.lift")
+    cable = load(tmp_path / "results")
+    assert cable.model.effects == result.fit.model.effects
+    assert cable.p[cable.model.names.index("balloon.lift")] == result.fit.value("balloon.lift")
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 def test_the_generated_solver_knows_it(result):
-    model, p, rest, _ = parameters_of(result)
-    solver = CompiledSolver(model, p, rest, flags=("-O0",))  # compiles quickly
+    cable = result.cable
+    solver = cable.compile(flags=("-O0",))  # compiles quickly
     for end in ENDS:
         pose = HeldPose((0.0, 0.0), end)
-        expected = solve_equilibrium(model, p, rest, pose)
+        expected = solve_equilibrium(cable.model, cable.p, cable.rest, pose)
         assert solver.solve(pose).points == pytest.approx(expected.points, abs=1e-8)
 
 

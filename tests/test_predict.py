@@ -11,12 +11,12 @@ from matplotlib.text import Text
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.api import predict
+from dlo_casadi import predict
+from dlo_casadi.cable.file import load, parameters_hash
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.io.parameters import load_parameters, parameters_hash
 from dlo_casadi.report.documents import fit_dict, shared_fixtures
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -60,46 +60,42 @@ def loom(tmp_path_factory):
 
 def test_the_cable_spans_from_start_to_end(pinned):
     shape = predict(pinned, end=(0.3, -0.1))
-    points = shape.points(201)
+    points = shape.curve.at(np.linspace(0.0, shape.curve.length, 201))
 
     # The fitted end_offset is within its tolerance of 0.2 mm, a few of which are seen.
     assert points[0] == pytest.approx([0.0, 0.0], abs=1e-9)
     assert points[-1] == pytest.approx([0.3, -0.1], abs=1e-3)
     length = np.hypot(*np.diff(points, axis=0).T).sum()
     assert length == pytest.approx(0.55, abs=2e-3)  # length_error is within 0.5 mm, mesh of 20
-    assert shape.equilibrium.stable
+    assert shape.stable
 
 
 def test_reactions_carry_the_weight(pinned):
-    eq = predict(pinned, end=(0.3, -0.1)).equilibrium
+    shape = predict(pinned, end=(0.3, -0.1))
 
-    assert eq.lam + eq.lam_start == pytest.approx([0.0, -0.2 * 9.81], abs=1e-9)
+    assert shape.end_force + shape.start_force == pytest.approx([0.0, -0.2 * 9.81], abs=1e-9)
 
 
 def test_the_reaction_is_the_slope_of_the_energy(pinned):
     """-lam = dV/d(end), by central differences of step h: error of order h^2."""
     h, end = 1e-4, np.array([0.3, -0.1])
-    cable = load_parameters(pinned)
+    cable = load(pinned)
     slope = [
-        (
-            predict(cable, end + step).equilibrium.energy
-            - predict(cable, end - step).equilibrium.energy
-        )
-        / (2 * h)
+        (predict(cable, end + step).energy - predict(cable, end - step).energy) / (2 * h)
         for step in h * np.eye(2)
     ]
-    assert -predict(cable, end).equilibrium.lam == pytest.approx(slope, rel=1e-4)
+    assert -predict(cable, end).end_force == pytest.approx(slope, rel=1e-4)
 
 
 def test_the_bend_radius_is_that_of_the_curve(pinned):
     shape = predict(pinned, end=(0.3, -0.1))
     s = np.linspace(0.0, shape.curve.length, 2001)
-    x, y = shape.points(2001).T
+    x, y = shape.curve.at(s).T
     heading = np.unwrap(np.arctan2(np.gradient(y, s), np.gradient(x, s)))
     sharpest = np.abs(np.gradient(heading, s)[20:-20]).max()
 
     # Cells of 1/20 of the length have one curvature each: a tenth of a radius at most.
-    assert shape.equilibrium.min_bend_radius == pytest.approx(1 / sharpest, rel=0.1)
+    assert shape.min_bend_radius == pytest.approx(1 / sharpest, rel=0.1)
 
 
 def test_arc_lengths_beside_the_cable_are_refused(pinned):
@@ -107,13 +103,10 @@ def test_arc_lengths_beside_the_cable_are_refused(pinned):
     length = shape.curve.length
 
     ends = shape.curve.at([0.0, length * (1 + 1e-12)])  # beyond the end by rounding alone
-    assert ends == pytest.approx(shape.points(2), abs=1e-12)
+    assert ends == pytest.approx(shape.points[[0, -1]], abs=1e-12)
     for wrong in ([-0.1, 2.0], [0.1, np.nan]):
         with pytest.raises(DloError, match=r"is not on the cable: . of 2 .* outside 0 to 0.55 m"):
             shape.curve.at(wrong)
-    for count in (0, 1, 2.5):
-        with pytest.raises(DloError, match=f"two points or more, from start to end, found {count}"):
-            shape.points(count)
 
 
 @pytest.mark.parametrize("end", [(0.3, -0.1), (0.02, -0.5), (0.5, 0.1)])
@@ -131,6 +124,22 @@ def test_the_numbers_at_the_arrows_lie_inside_the_axes(pinned, end):
         assert inside.y0 < box.y0 < box.y1 < inside.y1
 
 
+def test_frames_follow_the_curve(pinned, loom):
+    """Right-handed and orthonormal; at the start in space the clamp's own, to errors of the fit."""
+    for shape in (predict(pinned, end=(0.3, -0.1)), predict(loom, **IN_SPACE)):
+        d = shape.points.shape[1]
+        ahead = np.diff(shape.points, axis=0)
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+        middle = (shape.frames[1:] + shape.frames[:-1])[:, :, 0] / 2
+        assert middle == pytest.approx(ahead, abs=1e-3)  # steps of up to 0.04 rad
+        assert np.linalg.det(shape.frames) == pytest.approx(1.0)
+        assert shape.frames.swapaxes(1, 2) @ shape.frames == pytest.approx(
+            np.tile(np.eye(d), (101, 1, 1)), abs=1e-12
+        )
+    clamp = Rotation.from_quat(shape.pose.start_orientation).as_matrix()
+    assert shape.frames[0] == pytest.approx(clamp, abs=0.02)
+
+
 def test_branches_turn_the_way_they_are_named(pinned):
     turn = {}
     for branch in ("ccw", "cw"):
@@ -140,8 +149,8 @@ def test_branches_turn_the_way_they_are_named(pinned):
 
 
 def test_a_moved_start_moves_the_cable(pinned):
-    here = predict(pinned, end=(0.3, -0.1)).points()
-    there = predict(pinned, start=(1.0, 2.0), end=(1.3, 1.9)).points()
+    here = predict(pinned, end=(0.3, -0.1)).points
+    there = predict(pinned, start=(1.0, 2.0), end=(1.3, 1.9)).points
 
     assert there - here == pytest.approx(np.tile([1.0, 2.0], (101, 1)), abs=1e-6)
 
@@ -162,7 +171,7 @@ def test_an_end_out_of_reach_is_told_with_numbers(pinned):
 
 def test_what_a_fit_has_found_of_the_fixtures_is_told(pinned):
     shape = predict(pinned, end=(0.3, -0.1))
-    x, y = shape.points()[-1]
+    x, y = shape.points[-1]
     assert (x, y) != (0.3, -0.1)  # the fitted end_offset
     assert f"end of the cable: ({x:.5f}, {y:.5f}) m: fixture errors of the fit" in str(shape)
 
@@ -182,9 +191,9 @@ def test_folders_of_results_are_suggested_not_configurations(pinned, tmp_path):
 def test_a_free_end_hangs(overhang):
     shape = predict(overhang, start_heading=0.0)
 
-    assert shape.equilibrium.lam == pytest.approx([0.0, 0.0])
-    assert shape.equilibrium.lam_start == pytest.approx([0.0, -0.02 * 9.81], abs=1e-9)
-    assert shape.points()[-1, 1] < 0
+    assert shape.end_force == pytest.approx([0.0, 0.0])
+    assert shape.start_force == pytest.approx([0.0, -0.02 * 9.81], abs=1e-9)
+    assert shape.points[-1, 1] < 0
 
 
 IN_SPACE = {"end": (0.7, -0.3, 0.35), "end_orientation": (0.1, -0.1, 0.1, 0.98489)}
@@ -192,7 +201,7 @@ IN_SPACE = {"end": (0.7, -0.3, 0.35), "end_orientation": (0.1, -0.1, 0.1, 0.9848
 
 def test_a_cable_in_space_leaves_its_grippers_along_their_axes(loom):
     shape = predict(loom, **IN_SPACE)
-    points = shape.points()
+    points = shape.points
 
     # Tolerances of 0.2 mm and 5 mrad, of which the fit takes up to two.
     assert points[0] == pytest.approx([0.4, -0.2, 0.3], abs=1e-9)
@@ -201,7 +210,7 @@ def test_a_cable_in_space_leaves_its_grippers_along_their_axes(loom):
     frames = Rotation.from_quat([shape.pose.start_orientation, shape.pose.end_orientation])
     assert ends == pytest.approx(frames.apply([1.0, 0.0, 0.0]), abs=2e-2)
     eq = shape.equilibrium
-    assert eq.lam + eq.lam_start == pytest.approx([0.0, 0.0, -0.03 * 9.81], abs=1e-9)
+    assert eq.end_force + eq.start_force == pytest.approx([0.0, 0.0, -0.03 * 9.81], abs=1e-9)
     said = str(shape)
     assert "end: (0.7, -0.3, 0.35) m" in said
     assert len(re.findall(r"moment of the cable on its \w+: \(.*, .*, .*\) N m", said)) == 2
@@ -210,14 +219,14 @@ def test_a_cable_in_space_leaves_its_grippers_along_their_axes(loom):
 
 def test_the_reaction_in_space_is_the_slope_of_the_energy(loom):
     """-lam = dV/d(end), by central differences of step h: error of order h^2."""
-    h, cable = 1e-4, load_parameters(loom)
+    h, cable = 1e-4, load(loom)
 
     def energy(step):
         moved = np.add(IN_SPACE["end"], step)
-        return predict(cable, **(IN_SPACE | {"end": moved})).equilibrium.energy
+        return predict(cable, **(IN_SPACE | {"end": moved})).energy
 
     slope = [(energy(step) - energy(-step)) / (2 * h) for step in h * np.eye(3)]
-    assert -predict(cable, **IN_SPACE).equilibrium.lam == pytest.approx(slope, rel=1e-4)
+    assert -predict(cable, **IN_SPACE).end_force == pytest.approx(slope, rel=1e-4)
 
 
 def test_turns_that_slip_off_over_a_loop_are_an_error(loom):
@@ -237,7 +246,7 @@ def test_turns_twist_the_cable(loom):
 @pytest.fixture(scope="module")
 def evenly_rolled(loom):
     """Ends of the loom of which both ways round are equally low; rolled by so much more [rad]."""
-    held = load_parameters(loom).metadata.fixtures
+    held = load(loom).metadata.fixtures
     frame = Rotation.from_quat(held["start_orientation"])
     end = held["start"] + frame.apply([0.45, 0.0, 0.0])
 
@@ -247,7 +256,7 @@ def evenly_rolled(loom):
 
     def excess(angle):
         ways = [predict(loom, **rolled(angle), turns=turns) for turns in (0.5, -0.5)]
-        return ways[0].equilibrium.energy - ways[1].equilibrium.energy
+        return ways[0].energy - ways[1].energy
 
     even = brentq(excess, 2.4, 3.9, xtol=1e-5)
     return lambda more: rolled(even + more)
@@ -255,7 +264,7 @@ def evenly_rolled(loom):
 
 def test_near_half_a_turn_both_ways_round_are_predicted(loom, evenly_rolled):
     """By how much more the clamp is rolled is the angle; it is known no better than end_roll."""
-    std = load_parameters(loom).std["end_roll"]
+    std = load(loom).metadata.std["end_roll"]
     for more, turns in ((-0.5 * std, 0.5), (0.5 * std, -0.5)):
         ends = evenly_rolled(more)
         shape = predict(loom, **ends)
@@ -265,14 +274,14 @@ def test_near_half_a_turn_both_ways_round_are_predicted(loom, evenly_rolled):
         for side in (shape, shape.other_side):
             told = predict(loom, **ends, turns=side.pose.turns)
             assert told.other_side is None
-            assert side.points() == pytest.approx(told.points(), abs=1e-8)
-        assert shape.equilibrium.energy < shape.other_side.equilibrium.energy
+            assert side.points == pytest.approx(told.points, abs=1e-8)
+        assert shape.energy < shape.other_side.energy
     for far in (-1.0, 1.0):
         assert predict(loom, **evenly_rolled(far)).other_side is None
 
 
 def test_the_command_tells_both_ways_round(loom, evenly_rolled, capsys):
-    std = load_parameters(loom).std["end_roll"]
+    std = load(loom).metadata.std["end_roll"]
     ends = evenly_rolled(-0.5 * std)
     numbers = {key: [str(x) for x in ends[key]] for key in ("end", "end_orientation")}
     asked = ["--end", *numbers["end"], "--end-orientation", *numbers["end_orientation"]]

@@ -78,7 +78,7 @@ def test_a_turned_world_gives_the_same_shape(element):
     )
     mine, other = solved(here, OUT_OF_PLANE, curved(here)), solved(there, turned, curved(there))
     np.testing.assert_allclose(other.points, turn.apply(mine.points), atol=1e-9)
-    np.testing.assert_allclose(other.lam, turn.apply(mine.lam), atol=1e-9)
+    np.testing.assert_allclose(other.end_force, turn.apply(mine.end_force), atol=1e-9)
     np.testing.assert_allclose(other.moments, turn.apply(mine.moments), atol=1e-9)
     assert other.energy == pytest.approx(mine.energy, abs=1e-11)
 

@@ -3,16 +3,15 @@
 import argparse
 from pathlib import Path
 
+from dlo_casadi.cable import FittedCable, load
 from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, one_of, option
 from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
-from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
 from dlo_casadi.fleet.shape_table import Plan
-from dlo_casadi.io.parameters import load_parameters
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
 
@@ -71,17 +70,15 @@ def predict(chosen: argparse.Namespace) -> None:
     dlo predict results/wire --end -0.12 0 --start-heading 0 --end-heading -6.2832
     dlo predict results/loom --end 0.6 0.1 0.3 --end-orientation 0 0 0 1 --turns 1
     """
-    from dlo_casadi import api
-    from dlo_casadi.report.canvas import save_figure
-    from dlo_casadi.report.figures_poses import prediction_figure
     from dlo_casadi.report.terminal import prediction_table
+    from dlo_casadi.show.style import save_figure
 
     figure = chosen.figure
     if figure is not None and figure.suffix.lower() not in DRAWN:
         raise DloError(f"--figure {figure}: the name must end in {', '.join(DRAWN)}")
-    shape = api.predict(chosen.parameters, **{name: getattr(chosen, name) for name in HELD})
+    shape = load(chosen.parameters).solve(**{name: getattr(chosen, name) for name in HELD})
     if figure is not None:
-        save_figure(figure, prediction_figure(shape))
+        save_figure(figure, shape.plot())
     # What a reader of the prediction should know of the file it came from.
     notes = []
     if shape.cable.metadata.edited:
@@ -138,16 +135,19 @@ def shape_table(chosen: argparse.Namespace) -> None:
             f"--output {chosen.output}: the table is a Parquet file.\n"
             f"  Try: --output {chosen.output.with_suffix('.parquet')}"
         )
-    cable = load_parameters(chosen.parameters)
+    cable = load(chosen.parameters)
     if pose_size(cable.model) != len(COLUMNS):
         raise DloError(
             f"{cable.model.cable.name!r} is in space: tables hold shapes in a plane.\n"
             "  Try: dlo predict, or dlo generate-solver for many shapes"
         )
-    model, p, rest, metadata = with_mesh(cable, chosen)
+    cable = cable.with_mesh(chosen.elements, chosen.element)
+    metadata = cable.metadata
     poses = _poses(cable, chosen)
     output = chosen.output.resolve()
-    plan = Plan(model, p, rest, chosen.branch, output.with_name(f"{output.name}.parts"))
+    plan = Plan(
+        cable.model, cable.p, cable.rest, chosen.branch, output.with_name(f"{output.name}.parts")
+    )
     counter = Counter(quiet=chosen.quiet, noun="pose", size=plan.chunk, count=poses.count)
     with counter, open_executor(chosen.jobs, chosen.scheduler) as executor:
         counts = tables.shape_table(
@@ -212,23 +212,10 @@ def generate_solver(chosen: argparse.Namespace) -> None:
     dlo generate-solver results/cable/parameters.yaml --output solver
     dlo generate-solver results/cable --output solver --prefix rope --elements 40
     """
-    model, p, rest, _ = with_mesh(load_parameters(chosen.parameters), chosen)
-    solver = generate(model, p, rest, chosen.prefix)
+    cable = load(chosen.parameters).with_mesh(chosen.elements, chosen.element)
+    solver = generate(cable.model, cable.p, cable.rest, chosen.prefix)
     written = solver.write(chosen.output)
     page = Page(chosen)
     page.data({"files": [str(path) for path in written], "solver_hash": solver.hash})
     for text in (*written, f"model hash {solver.hash}"):
         page.say(text)
-
-
-def with_mesh(cable: FittedCable, chosen: argparse.Namespace) -> FittedCable:
-    """The cable on the mesh that is chosen with the options `MESH`."""
-    if not (chosen.elements or chosen.element):
-        return cable
-    if cable.model.has_state:
-        raise DloError(
-            f"{cable.model.cable.name!r} has a rest shape that changed from pose to pose, which is "
-            "known on the fit's elements alone: leave out --elements and --element"
-        )
-    model = cable.model.with_mesh(chosen.elements or cable.model.n, chosen.element)
-    return cable._replace(model=model, rest=model.rest_basis @ cable.metadata.coefficients)

@@ -40,9 +40,9 @@ class Equilibrium:
     points : (n + 1, dimension) [m]
         Nodes from start to end.
     energy : float [J]
-    lam : (dimension,) [N]
+    end_force : (dimension,) [N]
         Force of the cable on whatever holds its end; zero at a free end.
-    lam_start : (dimension,) [N]
+    start_force : (dimension,) [N]
         Force of the cable on whatever holds its start.
     moments : (2, increment) [N m]
         Of the cable on its clamps (start, end), in space about the world's axes; zero at pins.
@@ -70,8 +70,8 @@ class Equilibrium:
     x: FloatArray
     points: FloatArray
     energy: float
-    lam: FloatArray
-    lam_start: FloatArray
+    end_force: FloatArray
+    start_force: FloatArray
     moments: FloatArray
     multipliers: FloatArray
     bound_multipliers: FloatArray
@@ -170,8 +170,8 @@ def equilibria_of(
                 x=shapes.x[j],
                 points=points[j],
                 energy=float(energies[j]),
-                lam=on_fixtures[j, rows["end_force"]],
-                lam_start=on_fixtures[j, rows["start_force"]],
+                end_force=on_fixtures[j, rows["end_force"]],
+                start_force=on_fixtures[j, rows["start_force"]],
                 moments=np.squeeze(np.array(moments)),
                 multipliers=shapes.lam[j],
                 bound_multipliers=bound_multipliers[j],

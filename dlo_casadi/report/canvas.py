@@ -6,24 +6,27 @@ import textwrap
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from dlo_casadi.io.files import write_file
 from dlo_casadi.report.scene import Mark, Room, Scene, seen
 from dlo_casadi.session.outcome import Outcome
+from dlo_casadi.show.style import (
+    BLACK,
+    BLUE,
+    FORCE,
+    GREY,
+    ORANGE,
+    STYLE,
+    VERMILLION,
+    lay_out,
+    styled,
+)
 
-# Colours that the colour-blind can tell apart, each at least 4.5 to 1 against white.
-BLACK, GREY = "#1F2933", "#6B7280"
-ORANGE, BLUE, GREEN, VERMILLION = "#B35A00", "#0067A3", "#00805A", "#9E2A00"
-HELD_OUT = "#8C3B6C"  # poses that no fit saw
-FORCE = "#6A3D9A"
 # Stages that are compared, in every figure.
 STAGE_LINES: dict[str, dict[str, Any]] = {
     "before": {"color": ORANGE, "ls": "--"},
@@ -52,31 +55,9 @@ STYLES: dict[str, dict[str, Any]] = {
     "fixture end": {"color": BLACK, "marker": "o", "ms": 3, "markevery": [0]},
 }
 
-_STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "axes.titlesize": 10,
-    "axes.labelsize": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E3E3E3",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "lines.linewidth": 1.6,
-    "font.family": "DejaVu Sans",
-    "text.parse_math": False,  # a name with two dollar signs is no formula
-}
 # Width [inch] of a chart: on a telephone its letters are still as large as that of a footnote.
 WIDTH = 4.8
 _SVG = "http://www.w3.org/2000/svg"
-
-
-def save_figure(path: Path, drawing: Figure, dpi: float = 150) -> None:
-    """Write a figure in the format of the file's ending, whole or not at all."""
-    with mpl.rc_context(_STYLE):
-        _lay_out(drawing, dpi)
-        write_file(path, lambda stream: drawing.savefig(stream, format=path.suffix[1:], dpi=dpi))
 
 
 def inline_svg(drawing: Figure, name: str) -> str:
@@ -86,8 +67,8 @@ def inline_svg(drawing: Figure, name: str) -> str:
     tells at the pointer. All other ids are made of the `name` of the chart.
     """
     text = io.StringIO()
-    with mpl.rc_context(_STYLE | {"svg.fonttype": "none", "svg.hashsalt": name}):
-        _lay_out(drawing, 72)
+    with mpl.rc_context(STYLE | {"svg.fonttype": "none", "svg.hashsalt": name}):
+        lay_out(drawing, 72)
         drawing.savefig(text, format="svg", metadata={"Date": None})
     root = ET.fromstring(text.getvalue())
     for unwanted in root[:2]:  # metadata, and a style that would be one of the whole page
@@ -109,30 +90,10 @@ def inline_svg(drawing: Figure, name: str) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def _lay_out(drawing: Figure, dpi: float) -> None:
-    """Lay a figure out once: one that still has an engine is drawn twice each time."""
-    drawing.set_dpi(dpi)
-    layout = drawing.get_layout_engine()
-    if layout is not None:
-        layout.execute(drawing)
-        drawing.set_layout_engine(None)
-
-
 def headline(drawing: Figure, text: str) -> None:
     """Write what a figure shows above it, in lines that are no wider than it."""
     letters = int(12 * drawing.get_figwidth())
     drawing.suptitle(textwrap.fill(text, letters, break_on_hyphens=False), fontsize=11)
-
-
-@contextmanager
-def styled(
-    size: tuple[float, float], layout: Literal["constrained"] | None = "constrained"
-) -> Iterator[Figure]:
-    """Open a figure of a size [inch], to be drawn in the style of all figures."""
-    with mpl.rc_context(_STYLE):
-        drawing = Figure(figsize=size, layout=layout)
-        FigureCanvasAgg(drawing)
-        yield drawing
 
 
 @contextmanager

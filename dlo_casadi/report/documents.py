@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable import FittedCable
+from dlo_casadi.cable.file import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.config import Config, dump_yaml
 from dlo_casadi.effects import Effect, known_effect
-from dlo_casadi.equilibrium.fitted_cable import FittedCable
 from dlo_casadi.errors import DloError, well_formed
 from dlo_casadi.estimation.result import Fit, uncertainty_of
-from dlo_casadi.io.parameters import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.report.words import ALWAYS, all_warnings
 from dlo_casadi.session.hypotheses import Suspicion
@@ -219,8 +219,8 @@ def parameters_text(outcome: Outcome) -> str:
     return head + dump_yaml(parameters_dict(outcome))
 
 
-def parameters_of(outcome: Outcome) -> FittedCable:
-    """The fitted cable of a run, as `load_parameters` would read it from the run's file."""
+def fitted_cable(outcome: Outcome) -> FittedCable:
+    """The fitted cable of a run, as `load` would read it from the run's file."""
     fit, metadata = outcome.fit, metadata_of(parameters_dict(outcome), outcome.config.path)
     return FittedCable(fit.model, fit.p, final_rest(fit), metadata)
 

@@ -18,8 +18,10 @@ from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 from dlo_casadi.estimation.stiffness import LEAST_POINTS, law_of, measured_moment_curve
 from dlo_casadi.report import canvas, words
 from dlo_casadi.report.scene import Mark, Scene, next_marks, pull_marks, scene_of
-from dlo_casadi.report.words import NOISE_ALONE, compared, directions, millimetres
+from dlo_casadi.report.words import NOISE_ALONE, compared, directions
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
+from dlo_casadi.show import style
+from dlo_casadi.show.text import millimetres
 from dlo_casadi.thresholds import NORMAL_95
 
 # A candidate that was not refitted.
@@ -57,16 +59,16 @@ def figures_of(outcome: Outcome) -> dict[str, Figure]:
 def write_figures(folder: Path, drawn: Mapping[str, Figure]) -> None:
     """Write figures by their names into a folder."""
     for name, drawing in drawn.items():
-        canvas.save_figure(folder / f"{name}.png", drawing, _DPI)
+        style.save_figure(folder / f"{name}.png", drawing, _DPI)
 
 
 # ---- errors ------------------------------------------------------------------------------------
 
 
 _KINDS = {
-    "fit": ("o", canvas.BLUE),
-    "cross-validated": ("D", canvas.BLUE),
-    "held out": ("s", canvas.HELD_OUT),
+    "fit": ("o", style.BLUE),
+    "cross-validated": ("D", style.BLUE),
+    "held out": ("s", style.HELD_OUT),
 }
 
 
@@ -88,7 +90,7 @@ def errors_figure(outcome: Outcome) -> Figure:
         left, right = _error_axis(axes, [value for *_, value in rows], floor, 4.0)
         for y, (_, kind, value) in zip(places, rows, strict=True):
             if value is None or not np.isfinite(value):
-                axes.text(1.1 * left, y, "no value", va="center", color=canvas.GREY, bbox=_PAPER)
+                axes.text(1.1 * left, y, "no value", va="center", color=style.GREY, bbox=_PAPER)
                 continue
             marker, color = _KINDS[kind]
             at = float(np.clip(1e3 * value, left, right))
@@ -118,7 +120,7 @@ def errors_figure(outcome: Outcome) -> Figure:
 def pose_errors_figure(outcome: Outcome) -> Figure:
     """Error of every pose, before and after; a row of it can be chosen on the page."""
     floor = outcome.measurement.noise_distance
-    looks = {"before": ("^", canvas.ORANGE), "after": ("o", canvas.BLUE)}
+    looks = {"before": ("^", style.ORANGE), "after": ("o", style.BLUE)}
     stages = [(stage, label, *looks[kind]) for kind, label, stage in compared(outcome)]
     height = 1.6 + 0.2 * len(stages) + 0.22 * max(3, len(outcome.poses))
     with canvas.chart(outcome, "error of each pose", height) as (drawing, (axes,)):
@@ -127,7 +129,7 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
         left, right = _error_axis(axes, (x for own in errors for x in own), floor, 1.6)
         for k, (pose, own) in enumerate(zip(outcome.poses, errors, strict=True)):
             at = np.clip([np.nan if x is None else 1e3 * x for x in own], left, right)
-            axes.plot(at, [-k] * len(at), color=canvas.GREY, lw=1.2, zorder=1)
+            axes.plot(at, [-k] * len(at), color=style.GREY, lw=1.2, zorder=1)
             said = []
             for x, error, (_, label, marker, color) in zip(at, own, stages, strict=True):
                 fill = "white" if pose.role == "held_out" else color
@@ -141,7 +143,7 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
         axes.set_ylim(0.6 - len(outcome.poses), 0.6)
         handles = [*(canvas.dot(*look) for _, *look in stages), _floor(floor)]
         if any(pose.role == "held_out" for pose in outcome.poses):
-            handles.append(canvas.dot("hollow: held out", "o", canvas.GREY, fill="white"))
+            handles.append(canvas.dot("hollow: held out", "o", style.GREY, fill="white"))
         drawing.legend(handles=handles, loc="outside lower center", ncols=1)
     return drawing
 
@@ -163,12 +165,12 @@ def _error_axis(
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.grid(visible=False, axis="y")
-    axes.axvline(1e3 * floor, color=canvas.BLACK, ls="--", lw=1.2, zorder=0.9)
+    axes.axvline(1e3 * floor, color=style.BLACK, ls="--", lw=1.2, zorder=0.9)
     return low, high
 
 
 def _floor(floor: float) -> Line2D:
-    return canvas.line_of(f"{NOISE_ALONE} {millimetres(floor)}", color=canvas.BLACK, ls="--")
+    return canvas.line_of(f"{NOISE_ALONE} {millimetres(floor)}", color=style.BLACK, ls="--")
 
 
 def _name(pose: PoseInput) -> str:
@@ -187,7 +189,7 @@ def residuals_figure(outcome: Outcome) -> Figure:
     with canvas.chart(outcome, said, 1.4 + 1.9 * len(panels), len(panels)) as (drawing, grid):
         for axes, (kind, label, stage, way, direction) in zip(grid, panels, strict=True):
             axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
-            axes.axhline(0, color=canvas.GREY, lw=0.8)
+            axes.axhline(0, color=style.GREY, lw=0.8)
             for k, pose in enumerate(outcome.poses):
                 shape = stage.shapes.get(pose.name)
                 if shape is None:
@@ -198,7 +200,7 @@ def residuals_figure(outcome: Outcome) -> Figure:
                 axes.plot(
                     shape.s[every],
                     np.atleast_2d(shape.residual.T)[way, every] / noise,
-                    color=canvas.HELD_OUT if held_out else canvas.BLUE,
+                    color=style.HELD_OUT if held_out else style.BLUE,
                     ls="--" if held_out else "-",
                     lw=1.1,
                     alpha=0.85 if held_out else 0.45,
@@ -231,12 +233,12 @@ def _residual_range(stage: Stage, noise: float) -> tuple[float, float]:
     return low - 0.08 * (high - low), high + 0.08 * (high - low)
 
 
-def _legend_of_poses(drawing: Figure, poses: Iterable[PoseInput], **style: Any) -> None:
+def _legend_of_poses(drawing: Figure, poses: Iterable[PoseInput], **drawn: Any) -> None:
     """Tell fit poses, held-out poses if there are any, and the band of noise apart."""
-    handles = [canvas.line_of("fit pose", color=canvas.BLUE, **style)]
+    handles = [canvas.line_of("fit pose", color=style.BLUE, **drawn)]
     if any(pose.role == "held_out" for pose in poses):
         handles.append(
-            canvas.line_of("held-out pose", color=canvas.HELD_OUT, **({"ls": "--"} | style))
+            canvas.line_of("held-out pose", color=style.HELD_OUT, **({"ls": "--"} | drawn))
         )
     handles.append(canvas.line_of("95 % of the noise lies within", color=_BAND, lw=8))
     drawing.legend(handles=handles, loc="outside lower center", ncols=2)
@@ -252,12 +254,12 @@ def readings_figure(outcome: Outcome) -> Figure:
         for axes, name in zip(grid, names, strict=True):
             std, unit = outcome.measurement.std_of(name.split("_")[1])
             axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
-            axes.axhline(0, color=canvas.GREY, lw=0.8)
+            axes.axhline(0, color=style.GREY, lw=0.8)
             for k, pose in enumerate(poses):
                 if name not in stage.shapes[pose.name].readings:
                     continue
                 known, model = stage.shapes[pose.name].readings[name]
-                color = canvas.HELD_OUT if pose.role == "held_out" else canvas.BLUE
+                color = style.HELD_OUT if pose.role == "held_out" else style.BLUE
                 apart = 0.2 * (np.arange(len(known)) - (len(known) - 1) / 2)
                 axes.plot(k + apart, (known - model) / std, ".-", color=color, lw=0.6, ms=6)
             parts = f"{', '.join('xyz'[: len(apart)])} from left to right, "
@@ -289,9 +291,9 @@ def rest_curvature_figure(outcome: Outcome) -> Figure:
                 axes.plot(rest.s, value, **canvas.STAGE_LINES[kind], label=label)
                 if kind == "after":
                     low, high = value - NORMAL_95 * std, value + NORMAL_95 * std
-                    band = axes.fill_between(rest.s, low, high, color=canvas.BLUE, alpha=0.2, lw=0)
+                    band = axes.fill_between(rest.s, low, high, color=style.BLUE, alpha=0.2, lw=0)
                     band.set_label("its 95 % band")
-            axes.axhline(0, color=canvas.GREY, lw=0.8)
+            axes.axhline(0, color=style.GREY, lw=0.8)
             about = direction and f" k_{direction}"
             axes.set(xlim=(0, outcome.config.cable.length), ylabel=f"rest curvature{about} [1/m]")
         grid[-1].set_xlabel("arc length from the start s [m]")
@@ -312,11 +314,11 @@ def moment_figure(outcome: Outcome) -> Figure | None:
         for pose in shown:
             found = measured_moment_curve(pose.points, cable.length, weight, gravity, pose.s)
             label = "from the centre-line alone" if pose is shown[0] else None
-            axes.plot(found.curvature, 1e3 * found.moment, ".", color=canvas.BLUE, label=label)
+            axes.plot(found.curvature, 1e3 * found.moment, ".", color=style.BLUE, label=label)
             most = max(most, float(found.curvature.max()))
         grid = np.linspace(0.0, most, 200)
         law = law_of(outcome.fit.model, outcome.fit.p, grid)
-        axes.plot(grid, 1e3 * law, color=canvas.VERMILLION, label="fitted law of the section")
+        axes.plot(grid, 1e3 * law, color=style.VERMILLION, label="fitted law of the section")
         axes.set(xlabel="curvature [1/m]", ylabel="bending moment [N mm]", xlim=(0, None))
         drawing.legend(loc="outside lower center", ncols=1)
     return drawing
@@ -334,9 +336,9 @@ def candidates_figure(outcome: Outcome) -> Figure:
     elif not outcome.effects:
         said = "candidates tried; the declared model needs none"
     looks = {
-        "added": (canvas.BLUE, "added to the model"),
-        "tied": (canvas.ORANGE, "cannot be told apart from it"),
-        "refitted": (canvas.GREY, "refitted, not added"),
+        "added": (style.BLUE, "added to the model"),
+        "tied": (style.ORANGE, "cannot be told apart from it"),
+        "refitted": (style.GREY, "refitted, not added"),
         "": (_UNTRIED, "not refitted"),
     }
     found = set()
@@ -385,9 +387,9 @@ def next_pose_figure(outcome: Outcome) -> Figure:
     """Where to hold the end in the next pose, among those that were taken."""
     handles = [
         canvas.line_of("measured", **canvas.STYLES["taken"]),
-        canvas.dot("next end", "P", canvas.VERMILLION),
-        canvas.dot("starts", "s", canvas.BLACK),
-        canvas.dot("ends", "o", canvas.BLACK),
+        canvas.dot("next end", "P", style.VERMILLION),
+        canvas.dot("starts", "s", style.BLACK),
+        canvas.dot("ends", "o", style.BLACK),
     ]
     return _scene_figure(outcome, next_marks, handles, "which pose to measure next")
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,22 +11,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.equilibrium.spread import EDGE
 from dlo_casadi.report import canvas
-from dlo_casadi.report.scene import (
-    Room,
-    Scene,
-    arrow,
-    band_outline,
-    beside,
-    scene_of,
-    scenes_of,
-    seen,
-)
+from dlo_casadi.report.scene import Room, Scene, beside, scene_of, scenes_of, seen
 from dlo_casadi.report.tables import error_rows
-from dlo_casadi.report.words import Compared, compared, label_of, millimetres
+from dlo_casadi.report.words import Compared, compared, label_of
 from dlo_casadi.session.outcome import Outcome, PoseInput
+from dlo_casadi.show import style
+from dlo_casadi.show.style import band_outline
+from dlo_casadi.show.text import millimetres
 
 _POSES_A_PAGE = 20
 # Points of a measured line that are drawn, about: on a page of poses, with all poses in one frame.
@@ -39,8 +31,6 @@ _FACTORS = (1, 5, 10, 20, 50, 100)
 _NARROWEST, _PANEL, _TALLEST = 7.5, 3.1, 8.0
 # Height [inch] of what is above a panel, and above and below all of them.
 _ABOVE, _AROUND = 0.15, 1.4
-# How far beyond the tip of an arrow its number stands, as a share of its length.
-_BEYOND = 0.2
 
 
 # ---- pages of poses ----------------------------------------------------------------------------
@@ -53,7 +43,7 @@ def draw_poses(folder: Path, outcome: Outcome) -> None:
     for page in range(pages):
         name = "poses.png" if pages == 1 else f"poses_{page + 1}.png"
         shown = poses[page * _POSES_A_PAGE : (page + 1) * _POSES_A_PAGE]
-        canvas.save_figure(folder / name, _page(outcome, shown))
+        style.save_figure(folder / name, _page(outcome, shown))
 
 
 def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
@@ -71,7 +61,7 @@ def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
         center, span = np.zeros(2), room.window
     factor = _magnification(stages, config.cable.length)
     rows, columns = _arranged(len(poses))
-    with canvas.styled(_page_size(rows, columns, float(span[1] / span[0]))) as drawing:
+    with style.styled(_page_size(rows, columns, float(span[1] / span[0]))) as drawing:
         grid = drawing.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         shown = zip(grid.flat, poses, scenes, marks, strict=False)
         for axes, pose, scene, (under, over) in shown:
@@ -107,7 +97,7 @@ def _legend_of(
 ) -> list[Line2D | Patch]:
     experiment, readings = outcome.config.experiment, outcome.measurement.readings
     handles: list[Line2D | Patch] = [
-        canvas.line_of("measured", color=canvas.BLACK, marker=".", ls="none", ms=7),
+        canvas.line_of("measured", color=style.BLACK, marker=".", ls="none", ms=7),
         *(canvas.line_of(label, **canvas.STAGE_LINES[kind]) for kind, label, _ in stages),
     ]
     if experiment.in_space and "clamped" in (experiment.boundary.start, experiment.boundary.end):
@@ -115,11 +105,11 @@ def _legend_of(
             canvas.line_of(f"clamp's {name}", **canvas.STYLES[f"axis-{name}"]) for name in "xyz"
         ]
     if experiment.in_space or readings:
-        handles.append(canvas.line_of("force on the ends", color=canvas.FORCE))
+        handles.append(canvas.line_of("force on the ends", color=style.FORCE))
     if readings:
-        handles.append(canvas.line_of("force as read", color=canvas.BLACK, ls=":"))
+        handles.append(canvas.line_of("force as read", color=style.BLACK, ls=":"))
     if any(pose.role == "held_out" for pose in poses):
-        handles.append(Patch(fc="white", ec=canvas.HELD_OUT, lw=2, label="held out of the fit"))
+        handles.append(Patch(fc="white", ec=style.HELD_OUT, lw=2, label="held out of the fit"))
     return handles
 
 
@@ -148,13 +138,13 @@ def _draw_pose(
                 axes.fill(*outline.T, color=canvas.STAGE_LINES[kind]["color"], alpha=0.2)
     if len(pose.points):
         shown = pose.points[:: max(1, len(pose.points) // _POINTS)]
-        axes.plot(*place(shown).T, ".", color=canvas.BLACK, ms=2.5)
+        axes.plot(*place(shown).T, ".", color=style.BLACK, ms=2.5)
     axes.set_aspect("equal")
     title = pose.name
     if last is not None:
         ends = place(last.curve[[0, -1]])
-        axes.plot(*ends[0], "s", color=canvas.BLACK, ms=4)
-        axes.plot(*ends[1], "o", color=canvas.BLACK, ms=4)
+        axes.plot(*ends[0], "s", color=style.BLACK, ms=4)
+        axes.plot(*ends[1], "o", color=style.BLACK, ms=4)
     if not len(pose.points):
         title += ": not read"
     elif last is None:
@@ -167,9 +157,9 @@ def _draw_pose(
         title += f"\n{millimetres(last.measured_branch.rmse)} on the measured branch; true size"
     axes.set_title(title)
     if pose.role == "held_out":
-        axes.title.set_color(canvas.HELD_OUT)
+        axes.title.set_color(style.HELD_OUT)
         for spine in axes.spines.values():
-            spine.set(visible=True, color=canvas.HELD_OUT, linewidth=2)
+            spine.set(visible=True, color=style.HELD_OUT, linewidth=2)
 
 
 def _magnification(stages: Sequence[Compared], size: float) -> int:
@@ -220,69 +210,24 @@ def _arranged(count: int) -> tuple[int, int]:
 def outcome_figure(outcome: Outcome) -> Figure:
     """All poses in one frame: measured points, and the shapes predicted from their ends alone."""
     stage = outcome.stages[-1]
-    with canvas.styled((7.0, 5.0)) as drawing:
+    with style.styled((7.0, 5.0)) as drawing:
         axes = drawing.subplots()
         scene, _ = scene_of(outcome)
         canvas.draw_marks(axes, scene.ground())
         for pose in outcome.poses:
-            color = canvas.HELD_OUT if pose.role == "held_out" else canvas.BLUE
+            color = style.HELD_OUT if pose.role == "held_out" else style.BLUE
             shape = stage.shapes.get(pose.name)
             if shape is not None:
                 axes.plot(*seen(scene.points(shape.curve)).T, color=color, lw=1.4)
             if len(pose.points):
                 shown = pose.points[:: max(1, len(pose.points) // _POINTS_IN_ONE)]
-                axes.plot(*seen(scene.points(shown)).T, ".", color=canvas.BLACK, ms=2.5)
-        axes.plot([], [], ".", color=canvas.BLACK, label="measured")
-        axes.plot([], [], color=canvas.BLUE, label=label_of(stage, outcome))
+                axes.plot(*seen(scene.points(shown)).T, ".", color=style.BLACK, ms=2.5)
+        axes.plot([], [], ".", color=style.BLACK, label="measured")
+        axes.plot([], [], color=style.BLUE, label=label_of(stage, outcome))
         if any(pose.role == "held_out" for pose in outcome.poses):
-            axes.plot([], [], color=canvas.HELD_OUT, label="held out of the fit")
+            axes.plot([], [], color=style.HELD_OUT, label="held out of the fit")
         canvas.frame(axes, scene)
         errors = ", ".join(f"{name} {value}" for name, value in error_rows(outcome)[:2])
         axes.set_title(f"{outcome.config.cable.name}: {errors}")
         drawing.legend(loc="outside lower center", ncols=3)
-    return drawing
-
-
-def prediction_figure(shape: CableShape) -> Figure:
-    """A predicted shape with the forces on its fixtures."""
-    points, eq = shape.points(), shape.equilibrium
-    forces = {"start": eq.lam_start, "end": eq.lam}
-    largest = max(float(np.linalg.norm(force)) for force in forces.values())
-    reach = 0.25 * float(np.ptp(points, axis=0).max()) / max(largest, 1e-12)
-    in_space = shape.cable.model.in_space
-    with canvas.styled((7.0, 6.0)) as drawing:
-        axes: Any = drawing.add_subplot(projection="3d" if in_space else None)
-        if not in_space:
-            band = band_outline(points, shape.band())
-            axes.fill(*band.T, color=canvas.BLUE, alpha=0.15, lw=0, label="90 % of next hangings")
-        axes.plot(*points.T, color=canvas.BLUE, lw=2.5, label="cable")
-        if shape.other_side is not None:
-            other = shape.other_side.points()
-            axes.plot(*other.T, "--", color=canvas.BLUE, lw=1.5, label="on the other side")
-        for at, (side, force) in zip((points[0], points[-1]), forces.items(), strict=True):
-            if side == "end" and shape.pose.end is None:
-                continue
-            marker = "s" if side == "start" else "o"
-            axes.plot(*at[:, None], marker, color=canvas.BLACK, ms=7, label=side)
-            size = float(np.linalg.norm(force))
-            if size <= 1e-3 * largest or largest == 0:
-                continue
-            axes.plot(*arrow(at, reach * force).T, color=canvas.VERMILLION, lw=1.8)
-            beyond = at + (1 + _BEYOND) * reach * force
-            paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
-            number = axes.text(*beyond, f"{size:.3g} N", ha="center", va="center", bbox=paper)
-            number.set_color(canvas.VERMILLION)
-            axes.plot(*beyond[:, None], alpha=0)  # a text does not count for the axes' limits
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.12)
-        axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})
-        axes.plot([], [], color=canvas.VERMILLION, label="force of the cable on its fixtures")
-        drawing.legend(loc="outside lower center", ncols=4)
-        state = "stable" if eq.stable else "NOT stable"
-        axes.set_title(
-            f"energy {eq.energy:.4g} J, smallest bend radius {millimetres(eq.min_bend_radius)}, "
-            f"{state}",
-            color=canvas.GREY if eq.stable else canvas.VERMILLION,
-        )
-        drawing.suptitle(f"{shape.cable.model.cable.name}: predicted shape", fontsize=12)
     return drawing

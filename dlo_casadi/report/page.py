@@ -22,8 +22,10 @@ from dlo_casadi.report.canvas import inline_svg
 from dlo_casadi.report.figures import figures_of
 from dlo_casadi.report.page_pictures import pictures, pose_pictures, scene_pictures, view_pictures
 from dlo_casadi.report.scene import VIEWS
-from dlo_casadi.report.words import compared, millimetres
+from dlo_casadi.report.words import compared
 from dlo_casadi.session.outcome import Outcome, ParameterEstimate, PoseInput
+from dlo_casadi.show import text
+from dlo_casadi.show.text import millimetres
 from dlo_casadi.thresholds import NORMAL_95
 
 # By which a page is known as written by this package.
@@ -249,7 +251,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals |= {"words": words, "tables": tables}
-    for item in (units, breakable, counted, sentence, millimetres, words.vector):
+    for item in (units, breakable, counted, sentence, millimetres, text.vector):
         environment.filters[item.__name__] = item
     return environment
 

@@ -28,10 +28,11 @@ from dlo_casadi.report.scene import (
     scenes_of,
     seen,
 )
-from dlo_casadi.report.words import Compared, branch_text, compared, millimetres
+from dlo_casadi.report.words import Compared, branch_text, compared
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput
 from dlo_casadi.session.pose_shape import PoseShape
+from dlo_casadi.show.text import millimetres
 from dlo_casadi.vision import nearest_in_order
 
 Box = tuple[float, float, float, float]  # left, top, width, height

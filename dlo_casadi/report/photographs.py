@@ -13,9 +13,11 @@ from PIL import Image
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
-from dlo_casadi.report.canvas import STAGE_LINES, styled
-from dlo_casadi.report.words import compared, millimetres
+from dlo_casadi.report.canvas import STAGE_LINES
+from dlo_casadi.report.words import compared
 from dlo_casadi.session.outcome import Outcome, PoseInput
+from dlo_casadi.show.style import styled
+from dlo_casadi.show.text import millimetres
 from dlo_casadi.vision import read_image
 
 # All photographs of a page together [bytes], before they become text, which takes a third more.

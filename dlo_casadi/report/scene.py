@@ -17,6 +17,7 @@ from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.session.pose_shape import PoseShape
+from dlo_casadi.show.style import arrow
 
 # From where a room is seen: name, azimuth and elevation [degrees]. The first one is shown at first.
 VIEWS = (
@@ -30,8 +31,6 @@ _MM = 1e3
 _IN_ROOM, _AT_END, _PULLING = 0.15, 1 / 5, 0.25
 # Other shares of it: an axis of a frame, the air above the floor, half of a cross.
 _AXIS, _AIR, _CROSS = 0.09, 0.06, 0.05
-# An arrow's head, as a share of its length: how long and how wide.
-_HEAD = (0.28, 0.1)
 # Points of a measured line that are drawn beside others, about.
 _POINTS = 60
 
@@ -50,35 +49,9 @@ class Mark:
     """The word, if it is one."""
 
 
-def arrow(root: FloatArray, shaft: FloatArray) -> FloatArray:
-    """One line (K, d) that draws an arrow from a root (d,) along a shaft (d,).
-
-    Two barbs in a plane, four in space, where it is seen from anywhere.
-    """
-    size = max(float(np.linalg.norm(shaft)), 1e-12)
-    if len(shaft) == 2:
-        normals = [np.array([-shaft[1], shaft[0]])]
-    else:
-        across = np.cross(shaft, np.eye(3)[np.abs(shaft).argmin()])
-        across *= size / max(float(np.linalg.norm(across)), 1e-12)
-        normals = [across, np.cross(shaft, across) / size]
-    tip, back = root + shaft, root + (1 - _HEAD[0]) * shaft
-    sides = [sign * normal for sign in (1, -1) for normal in normals]
-    barbs = [point for side in sides for point in (back + _HEAD[1] * side, tip)]
-    return np.stack([root, tip, *barbs])
-
-
 def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray:
     """Points (K, d) [m] of the prediction beside the measured ones, distances multiplied."""
     return np.asarray(pose.points - factor * shape.gap)
-
-
-def band_outline(curve: FloatArray, half_width: FloatArray) -> FloatArray:
-    """Outline (2 M, 2) [m] of a band of half widths (M,) [m] about a planar curve (M, 2)."""
-    tangent = np.gradient(curve, axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
-    side = half_width[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    return np.concatenate([curve + side, (curve - side)[::-1]])
 
 
 # ---- scenes ------------------------------------------------------------------------------------

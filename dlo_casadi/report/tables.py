@@ -1,19 +1,15 @@
 """Rows of the tables of a report: parameters, errors, time, one predicted pose; notebooks."""
 
 import math
-from collections.abc import Iterable, Sequence
-from html import escape
 
 import numpy as np
 
-from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.errors import counted
 from dlo_casadi.report import words
 from dlo_casadi.session.outcome import MASS, Outcome, ParameterEstimate
-from dlo_casadi.session.pose_shape import BranchShape
+from dlo_casadi.show import text
+from dlo_casadi.show.text import html_table
 
-# Distances [m] that the table of a prediction shows.
-_SHOWN = 5e-6
 # A row of the tables of parameters: name, value, 95 % interval, remark.
 Row = tuple[str, str, str, str]
 
@@ -26,7 +22,7 @@ def describe(estimate: ParameterEstimate) -> tuple[str, str, str]:
     if estimate.interval_95 is not None:
         ends = ("unbounded" if x is None else f"{x:.4g}" for x in estimate.interval_95)
         interval = f"{' to '.join(ends)}{unit}"
-    value = words.plus_minus(estimate.value, estimate.std) + unit
+    value = text.plus_minus(estimate.value, estimate.std) + unit
     return (value, interval, "at a bound" if estimate.at_bound else "")
 
 
@@ -79,7 +75,7 @@ def nuisance_rows(outcome: Outcome) -> list[Row]:
         value, unit = fit.value(q.name), _after(q.unit)
         moved = round((value - q.nominal) / tolerance, 1) + 0.0
         remark = f"{moved:+.1f} of its tolerance {tolerance:g}{unit}"
-        rows.append((q.name, words.plus_minus(value, fit.std(q.name)) + unit, "", remark))
+        rows.append((q.name, text.plus_minus(value, fit.std(q.name)) + unit, "", remark))
     return rows
 
 
@@ -89,7 +85,7 @@ def fixed_rows(outcome: Outcome) -> list[Row]:
     kept = {"length": f"{cable.length:g} m", MASS: f"{cable.mass:g} kg"}
     if MASS in outcome.stages[-1].parameters:
         del kept[MASS]
-    kept["gravity"] = words.vector(outcome.config.experiment.gravity, "g", "m/s^2")
+    kept["gravity"] = text.vector(outcome.config.experiment.gravity, "g", "m/s^2")
     for q, free in zip(fit.model.parameters, fit.problem.unknowns.free, strict=True):
         if not free:
             kept[q.name] = f"{fit.value(q.name):.4g}{_after(q.unit)}"
@@ -168,7 +164,7 @@ def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
 
     def row(label: str, note: str, fit: float | None, held_out: float | None) -> dict[str, str]:
         known = {"fit": fit, "held_out": held_out, "validated": None}
-        cells = {key: words.millimetres(x, nothing) for key, x in known.items()}
+        cells = {key: text.millimetres(x, nothing) for key, x in known.items()}
         return {"label": label, "mark": "", "note": note, "chi2": nothing, **cells}
 
     marks = {stage.name: kind for kind, _, stage in words.compared(outcome)}
@@ -178,7 +174,7 @@ def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
         own = row(words.label_of(stage, outcome), stage.note, stage.rmse_fit, stage.rmse_held_out)
         own["mark"] = marks.get(stage.name, "")
         own["held_out"] += words.predicted_share(outcome, stage)
-        own["validated"] = words.millimetres(validated.get(stage.name), nothing)
+        own["validated"] = text.millimetres(validated.get(stage.name), nothing)
         if stage.chi2_per_dof is not None:
             own["chi2"] = f"{stage.chi2_per_dof:.3g}"
         rows.append(own)
@@ -192,15 +188,15 @@ def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
 def error_rows(outcome: Outcome) -> list[tuple[str, str]]:
     """RMS distance of the measured points from the last stage's shapes, and by noise alone."""
     stage, m = outcome.stages[-1], outcome.measurement
-    rows = [("error of the fit", words.millimetres(stage.rmse_fit))]
+    rows = [("error of the fit", text.millimetres(stage.rmse_fit))]
     if stage.rmse_held_out is not None:
         share = words.predicted_share(outcome, stage)
-        rows.append(("held out", words.millimetres(stage.rmse_held_out) + share))
+        rows.append(("held out", text.millimetres(stage.rmse_held_out) + share))
     if stage.other_branch:
         both = (stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch)
-        known = (words.millimetres(value) for value in both if value is not None)
+        known = (text.millimetres(value) for value in both if value is not None)
         rows.append((words.ON_BRANCH, ", ".join(known)))
-    return [*rows, (f"{words.NOISE_ALONE} ({m.std_source})", words.millimetres(m.noise_distance))]
+    return [*rows, (f"{words.NOISE_ALONE} ({m.std_source})", text.millimetres(m.noise_distance))]
 
 
 def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
@@ -223,51 +219,6 @@ def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
     return [(name, f"{seconds:.2f}", remark) for name, seconds, remark in rows]
 
 
-# ---- one predicted pose ------------------------------------------------------------------------
-
-
-def prediction_rows(shape: CableShape) -> list[tuple[str, str]]:
-    """Quantities of a predicted pose, and their values."""
-    rows, pose, eq, other = [], shape.pose, shape.equilibrium, shape.other_side
-    points = shape.points()
-    start = ("start", pose.start, points[0], eq.lam_start, eq.moments[0])
-    for side, at, reached, force, moment in (
-        start,
-        ("end", pose.end, points[-1], eq.lam, eq.moments[1]),
-    ):
-        if at is None:
-            rows.append((side, "free"))
-            continue
-        rows.append((side, words.vector(at, "g", "m")))
-        if math.dist(at, reached) > _SHOWN:
-            place = words.vector(reached, ".5f", "m")
-            rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
-        rows.append((f"force of the cable on its {side}", words.vector(force, ".4g", "N")))
-        held = (getattr(pose, f"{side}_{key}") for key in ("heading", "orientation"))
-        if any(direction is not None for direction in held):
-            said = words.vector(moment, ".4g", "N m") if np.ndim(moment) else f"{moment:.4g} N m"
-            rows.append((f"moment of the cable on its {side}", said))
-    rows.append(("energy", f"{eq.energy:.6g} J"))
-    rows.append(("smallest bend radius", words.millimetres(eq.min_bend_radius)))
-    rows.append(("stable", "yes" if eq.stable else "NO: the cable would not stay there"))
-    if other is not None and shape.tipping is not None:
-        apart = float(np.linalg.norm(other.points() - points, axis=1).max())
-        rows.append(("this side", f"`{_side(shape)}`"))
-        text = (
-            f"`{_side(other)}`: {other.equilibrium.energy:.6g} J, up to {words.millimetres(apart)} "
-            f"away; equally low with the clamp turned by {shape.tipping.angle:.2g} rad (known to "
-            f"{shape.tipping.std:.2g} rad)"
-        )
-        rows.append(("also stable", text))
-    return rows
-
-
-def _side(shape: CableShape) -> str | None:
-    """What tells the side on which a predicted cable hangs."""
-    turns = shape.pose.turns if shape.cable.model.in_space else None
-    return BranchShape(0.0, shape.pose.branch, turns).chosen_by
-
-
 # ---- results as a notebook shows them: a few lines, or a small table -----------------------------
 
 
@@ -287,25 +238,4 @@ def outcome_html(outcome: Outcome) -> str:
     """The same as a short table."""
     rows = [*fitted_rows(outcome), *error_rows(outcome)]
     remarks = [*words.verdict_lines(outcome), *words.all_warnings(outcome)]
-    return _table(outcome.config.cable.name, rows, remarks)
-
-
-def shape_text(shape: CableShape) -> str:
-    """A predicted pose in a few lines."""
-    lines = [f"  {name}: {value}" for name, value in prediction_rows(shape)]
-    return "\n".join([f"{shape.cable.model.cable.name}: predicted shape", *lines])
-
-
-def shape_html(shape: CableShape) -> str:
-    """The same as a short table."""
-    return _table(f"{shape.cable.model.cable.name}: predicted shape", prediction_rows(shape))
-
-
-def _table(title: str, rows: Sequence[Sequence[str]], remarks: Iterable[str] = ()) -> str:
-    """HTML table with everything escaped; the remarks below it."""
-    columns = max(map(len, rows))
-    full = [[*row, *[""] * (columns - len(row))] for row in rows]
-    cells = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in full]
-    body = "".join(f"<tr>{row}</tr>" for row in cells)
-    below = "".join(f"<div>{escape(remark.strip())}</div>" for remark in remarks)
-    return f"<div><b>{escape(title)}</b><table>{body}</table>{below}</div>"
+    return html_table(outcome.config.cable.name, rows, remarks)

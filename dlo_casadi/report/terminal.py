@@ -8,12 +8,12 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from dlo_casadi.cable import Shape
 from dlo_casadi.config import Config
-from dlo_casadi.equilibrium.fitted_cable import CableShape
 from dlo_casadi.errors import counted
 from dlo_casadi.report import tables, words
-from dlo_casadi.report.words import millimetres
 from dlo_casadi.session.outcome import Outcome, ReadingErrors
+from dlo_casadi.show.text import millimetres
 
 # Of the table of a check: the key of a pose's row, how its number is written, and times what.
 _CHECKED: dict[str, tuple[str, str, float]] = {
@@ -149,17 +149,15 @@ def _timing_table(outcome: Outcome) -> Table:
 # ---- one predicted pose ------------------------------------------------------------------------
 
 
-def prediction_table(shape: CableShape, notes: Iterable[str] = ()) -> RenderableType:
+def prediction_table(shape: Shape, notes: Iterable[str] = ()) -> RenderableType:
     """Reactions, energy, stability and shape of one predicted pose."""
-    table = _table(f"{shape.cable.model.cable.name}: predicted shape", ["quantity", "value"])
-    for row in tables.prediction_rows(shape):
+    table = _table(f"{shape.cable.name}: predicted shape", ["quantity", "value"])
+    for row in shape.rows():
         table.add_row(*row)
-    every = shape.points()
-    axes = "xyz"[: every.shape[1]]
+    axes = "xyz"[: shape.points.shape[1]]
     points = _table("Points from start to end", [], [f"{column} [m]" for column in ("s", *axes)])
-    for k in range(0, len(every), 10):
-        s = shape.cable.model.cable.length * k / (len(every) - 1)
-        points.add_row(f"{s:.4f}", *(f"{x:.5f}" for x in every[k]))
+    for s, point in zip(shape.s[::10], shape.points[::10], strict=True):
+        points.add_row(f"{s:.4f}", *(f"{x:.5f}" for x in point))
     return Group(table, points, *(Text(note) for note in notes))
 
 

@@ -1,7 +1,6 @@
 """The report in words: numbers, what stages are called, and all sentences."""
 
 import math
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted
 from dlo_casadi.session.outcome import FoundEffect, Outcome, Stage, StageName
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
+from dlo_casadi.show.text import millimetres, plus_minus, vector
 from dlo_casadi.thresholds import APART, NOTABLE
 
 # By what name tables and charts have the RMS distance that the noise of points gives by itself.
@@ -43,29 +43,9 @@ MOST_REPEATS = 20
 # ---- numbers -----------------------------------------------------------------------------------
 
 
-def millimetres(value: float | None, nothing: str = "-") -> str:
-    """A length [m] as text in mm, with three digits; a dash for none."""
-    return nothing if value is None else f"{1e3 * value:.3g} mm"
-
-
-def vector(components: Iterable[float], form: str, unit: str) -> str:
-    """Components of a vector in brackets, and their unit."""
-    return f"({', '.join(format(x, form) for x in components)}) {unit}"
-
-
 def score_text(score: float) -> str:
     """A candidate's score with two digits, or all before the point."""
     return f"{score:,.0f}" if score >= 100 else f"{score:.2g}"
-
-
-def plus_minus(value: float, std: float) -> str:
-    """A value with the digits that its standard deviation leaves: two of the latter."""
-    if not std > 0:
-        return f"{value:.4g}"
-    decimals = 1 - math.floor(math.log10(std))
-    if std >= 10 * abs(value) or not 0 <= decimals <= 7:
-        return f"{value:.2g} ± {std:.2g}"
-    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
 # ---- stages ------------------------------------------------------------------------------------

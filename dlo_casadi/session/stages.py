@@ -65,7 +65,7 @@ def pose_shape(
         _across(prediction, s, gap),
         eq.energy,
         eq.stable,
-        np.stack([eq.lam_start, eq.lam]),
+        np.stack([eq.start_force, eq.end_force]),
         _branch_shape(other, item) if item.readable and other is not None else None,
         readings=item.readings_beside(prediction.seen),
     )

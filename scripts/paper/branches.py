@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.report.canvas import BLUE, ORANGE
+from dlo_casadi.show.style import BLUE, ORANGE
 from paper import published
 from paper.content import Claim, Part, Section, Table, drawing, number
 from paper.replica import REVEALING

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.report.canvas import GREY
 from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.show.style import GREY
 from paper import published
 from paper.content import Part, Section, Target, drawing, mm
 from paper.figures import COLORS, MARKERS

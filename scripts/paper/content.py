@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 from numpy.typing import NDArray
 
-from dlo_casadi.report.canvas import styled
+from dlo_casadi.show.style import styled
 
 Verdict = Literal["holds", "in part", "does not hold", "cannot be told"]
 

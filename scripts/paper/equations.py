@@ -19,9 +19,9 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.paper.algorithm1 import gravity_slopes, run_algorithm1
-from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.session.stages import rest_curvature_of
+from dlo_casadi.show.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from dlo_casadi.thresholds import NORMAL_95
 from paper import branches, chords, published
 from paper.content import Claim, Part, Section, Table, drawing, number
@@ -80,7 +80,7 @@ def balance(stiffness: float, n: int = FIRST) -> Balance:
     pull = []
     for eq in found:
         # lam . d r(L) / d theta_a, summed over the headings behind the joint.
-        by_heading = h * (-eq.lam[0] * np.sin(eq.phi) + eq.lam[1] * np.cos(eq.phi))
+        by_heading = h * (-eq.end_force[0] * np.sin(eq.phi) + eq.end_force[1] * np.cos(eq.phi))
         pull.append(np.cumsum(by_heading[::-1])[::-1][1:])
     elastic = stiffness / h * (bends - rest * h)
     return Balance(bends, elastic, gravity, np.array(pull))

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.report.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
+from dlo_casadi.show.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION
 from paper import published
 from paper.content import Section, drawing
 from paper.fits import ELEMENTS, FIRST, LABELS, Estimate, Method, pick

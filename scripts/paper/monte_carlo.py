@@ -28,7 +28,6 @@ from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.report.canvas import BLACK, BLUE
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed
@@ -36,6 +35,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.fitting import nuisances
 from dlo_casadi.session.stages import rest_curvature_of
+from dlo_casadi.show.style import BLACK, BLUE
 from dlo_casadi.thresholds import NORMAL_95
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing, number, rms

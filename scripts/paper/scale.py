@@ -27,8 +27,8 @@ from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.report.canvas import BLUE, GREEN, ORANGE
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.show.style import BLUE, GREEN, ORANGE
 from paper import published
 from paper.content import Part, Section, Table, Target, drawing
 from paper.fits import REST_COEFFICIENTS

@@ -19,7 +19,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.report.canvas import BLACK, GREY, VERMILLION
+from dlo_casadi.show.style import BLACK, GREY, VERMILLION
 from paper import published
 from paper.content import Claim, Part, Section, Table, Target, drawing, duration, mm
 from paper.figures import COLORS, MARKERS

@@ -174,9 +174,10 @@ def plan(
     if parameters is None:
         model, p, rest = example(in_space=in_space)
     else:
-        from dlo_casadi.io.parameters import load_parameters
+        from dlo_casadi.cable import load
 
-        model, p, rest, _ = load_parameters(parameters)
+        cable = load(parameters)
+        model, p, rest = cable.model, cable.p, cable.rest
     scene_file = scene_file or scene_of(model)
     generate(model, p, rest).write(output / "solver")
     program = build(output / "solver", output / "build")

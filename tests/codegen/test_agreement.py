@@ -67,8 +67,8 @@ def difference(names, element, start, end, n=12):
         shape = solver.solve(pose)
         worst = max(worst, np.abs(shape.points - expected.points).max())
         assert shape.energy == pytest.approx(expected.energy, rel=1e-7)
-        assert shape.end_force == pytest.approx(expected.lam, rel=1e-6, abs=1e-6)
-        assert shape.start_force == pytest.approx(expected.lam_start, rel=1e-6, abs=1e-6)
+        assert shape.end_force == pytest.approx(expected.end_force, rel=1e-6, abs=1e-6)
+        assert shape.start_force == pytest.approx(expected.start_force, rel=1e-6, abs=1e-6)
         assert shape.min_bend_radius == pytest.approx(expected.min_bend_radius, rel=1e-5)
         if element == "arc":
             assert shape.moments[:, 0] == pytest.approx(expected.moments, rel=1e-6, abs=1e-6)

@@ -97,8 +97,8 @@ def test_shape_force_moment_energy_and_radius_are_those_of_python(element, effec
         shape = compiled.solve(pose)
         assert np.abs(shape.points - expected.points).max() < 1e-8
         assert shape.energy == pytest.approx(expected.energy, rel=1e-8)
-        assert shape.end_force == pytest.approx(expected.lam, abs=1e-7)
-        assert shape.start_force == pytest.approx(expected.lam_start, abs=1e-7)
+        assert shape.end_force == pytest.approx(expected.end_force, abs=1e-7)
+        assert shape.start_force == pytest.approx(expected.start_force, abs=1e-7)
         np.testing.assert_allclose(shape.moments, expected.moments, atol=1e-8)
         assert shape.min_bend_radius == pytest.approx(expected.min_bend_radius, rel=1e-6)
         assert abs(shape.max_twist) == pytest.approx(np.abs(expected.twist).max(), rel=1e-6)
@@ -133,7 +133,7 @@ def test_other_ends(ends):
         expected = solve_equilibrium(model, p, rest, held)
         shape = compiled.solve(held)
         assert np.abs(shape.points - expected.points).max() < 1e-8
-        assert shape.start_force == pytest.approx(expected.lam_start, abs=1e-7)
+        assert shape.start_force == pytest.approx(expected.start_force, abs=1e-7)
         np.testing.assert_allclose(shape.moments, expected.moments, atol=1e-8)
 
 

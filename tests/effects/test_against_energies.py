@@ -353,7 +353,7 @@ def test_an_equilibrium_is_stationary_in_the_rods_energy(name, where):
         ]
         tangents = np.array([turn.as_matrix()[..., 0] for turn in turns])
         beyond = 1 - (np.arange(N)[:, None] + GAUSS) / N
-        force = beyond[..., None] * own.mass * own.gravity - flat(eq.lam)
+        force = beyond[..., None] * own.mass * own.gravity - flat(eq.end_force)
         tension = np.einsum("k,ikd,ikd->i", WEIGHTS, tangents, force)
         rod = replace(rod, axial=own.compliance * tension)
     # Elements turn by d = 0.7: the model's three Gauss points leave d^6 / 2e6 of way and work.
@@ -378,7 +378,7 @@ def test_an_equilibrium_is_stationary_in_the_rods_energy(name, where):
     multipliers = np.linalg.lstsq(ways, -force, rcond=None)[0]
     np.testing.assert_allclose(force + ways @ multipliers, 0.0, atol=1e-6)
     d = model.node.dimension
-    np.testing.assert_allclose(multipliers[:d], eq.lam, atol=1e-5)
+    np.testing.assert_allclose(multipliers[:d], eq.end_force, atol=1e-5)
     if len(multipliers) > 3:
         moments = [own.clamps[k].apply(multipliers[3 + 3 * k : 6 + 3 * k]) for k in (0, 1)]
         used = slice(2, 3) if planar else slice(None)
@@ -544,7 +544,7 @@ def test_a_helix_of_a_softening_section(element, ratio):
     inside = np.array([GJ * twist, *(moment * direction)])
     # |k| rounded over d = 0.008: of the moment SOFTNESS d.
     rounding = SOFTNESS * 0.008 * moment
-    np.testing.assert_allclose(eq.lam, -rod.frames[-1].apply(force), atol=twist * rounding)
+    np.testing.assert_allclose(eq.end_force, -rod.frames[-1].apply(force), atol=twist * rounding)
     np.testing.assert_allclose(eq.moments[1], -rod.frames[-1].apply(inside), atol=rounding)
 
 
@@ -641,7 +641,7 @@ def test_a_softening_cable_converges_to_its_boundary_value_problem(where, elemen
 
     near = solved(32, "arc")
     rod = rod_of(near.x, pose.start, LENGTH / 32)
-    exact = boundary_value(where, slope, rod, rod.strains - REST[where], flat(near.lam))
+    exact = boundary_value(where, slope, rod, rod.strains - REST[where], flat(near.end_force))
     errors = []
     # Finer ones show the kink of |k| where the bend changes its sign: 3e-6 m.
     for n in (8, 16):
@@ -649,4 +649,4 @@ def test_a_softening_cable_converges_to_its_boundary_value_problem(where, elemen
         at = exact.sol(np.linspace(0.0, LENGTH, n + 1))[:d]
         errors.append(np.abs(eq.points - at.T).max())
     assert np.log2(errors[0] / errors[1]) > order, errors
-    np.testing.assert_allclose(eq.lam, -exact.y[10 : 10 + d, -1], rtol=0.03, atol=0.01)
+    np.testing.assert_allclose(eq.end_force, -exact.y[10 : 10 + d, -1], rtol=0.03, atol=0.01)

@@ -111,7 +111,7 @@ def test_a_fit_stays_finite(name, where, has):
         points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(12, len(gravity)))
         item = MeasuredPose.of_points(pose, points)
         if name == "mass_error":
-            item = item.with_readings({"end_force": shape.equilibrium.lam})
+            item = item.with_readings({"end_force": shape.equilibrium.end_force})
         measured.append(item)
     try:
         fit = fit_model(model, measured, Tolerances(), NOISE, decades=(0,))

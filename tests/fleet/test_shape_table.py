@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tiny_sessions import write_session
 
-from dlo_casadi.api import predict
+from dlo_casadi import predict
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData
@@ -78,9 +78,9 @@ def test_rows_are_predictions_in_the_order_of_the_grid(parameters, tmp_path, cap
         nodes = np.reshape(row["points"], (-1, 2))
         # Points are in single precision: 6e-8 of half a metre.
         assert nodes == pytest.approx(shape.curve.nodes, abs=1e-7)
-        assert row["energy"] == pytest.approx(shape.equilibrium.energy, rel=1e-8)
+        assert row["energy"] == pytest.approx(shape.energy, rel=1e-8)
         force = [row["force_on_end_x"], row["force_on_end_y"]]
-        assert force == pytest.approx(shape.equilibrium.lam, rel=1e-6, abs=1e-8)
+        assert force == pytest.approx(shape.end_force, rel=1e-6, abs=1e-8)
 
 
 def test_the_command_writes_parquet_alone(tmp_path, capsys):

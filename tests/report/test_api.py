@@ -86,7 +86,7 @@ def test_plots_are_figures_that_leave_pyplot_alone(result):
     drawn = [line for line in lines if len(line.get_xdata()) > 100]
     assert len(drawn) == len(result.poses)
     assert "held out of the fit" in {line.get_label() for line in lines}
-    assert isinstance(result.predict((0.3, -0.1)).plot(), Figure)
+    assert isinstance(result.cable.solve((0.3, -0.1)).plot(), Figure)
     assert dict(mpl.rcParams) == before
 
 
@@ -97,8 +97,8 @@ def test_fit_prints_its_report_and_nothing_else(written):
 
 def test_a_result_predicts_as_its_file_does(result, written):
     folder, _ = written
-    direct, from_file = result.predict((0.3, -0.1)), dlo.predict(folder, (0.3, -0.1))
-    assert np.array_equal(direct.points(), from_file.points())
+    direct, from_file = result.cable.solve((0.3, -0.1)), dlo.predict(folder, (0.3, -0.1))
+    assert np.array_equal(direct.points, from_file.points)
     assert str(direct) == str(from_file)
     text = str(direct)
     assert "end: (0.3, -0.1) m" in text

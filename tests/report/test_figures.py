@@ -2,24 +2,20 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
-from dlo_casadi.effects import CableData
-from dlo_casadi.equilibrium.fitted_cable import FittedCable
-from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report import figures, figures_poses
-from dlo_casadi.report.canvas import save_figure
 from dlo_casadi.report.photographs import write_overlays
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.words import compared
 from dlo_casadi.session.outcome import EffectParameter, FoundEffect, PoseInput
+from dlo_casadi.show.style import save_figure
 
 PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"
 CANDIDATES = tuple(
@@ -183,17 +179,16 @@ def test_a_photograph_that_is_gone_is_left_out(outcome, tmp_path):
 def test_a_prediction_is_drawn(tmp_path, end):
     points = np.stack([np.linspace(0, 0.4, 21), -0.25 * np.linspace(0, 1, 21)], axis=1)
     force = np.array([0.0, -1.0])
-    shape = SimpleNamespace(
-        cable=FittedCable(CableModel(CableData(0.8, 0.05, 0.01, 0.02, name="rope")), *[None] * 3),
-        pose=HeldPose((0.0, 0.0), end),
-        equilibrium=SimpleNamespace(
-            lam_start=force, lam=0 * force, energy=1.0, min_bend_radius=0.1, stable=end is None
-        ),
-        points=lambda: points,
-        band=lambda: np.linspace(0.0, 0.01, 21),
-        other_side=end and SimpleNamespace(points=lambda: -points),
+    drawing = draw_shape(
+        points,
+        {"start": force} | ({"end": 0 * force} if end else {}),
+        band=np.linspace(0.0, 0.01, 21),
+        other=-points if end else None,
+        title="rope: predicted shape",
+        remark="energy 1 J",
+        alarming=end is not None,
     )
-    save_figure(tmp_path / "shape.png", figures_poses.prediction_figure(shape))
+    save_figure(tmp_path / "shape.png", drawing)
 
     assert drawn(tmp_path / "shape.png")[1] > 0.005
 
@@ -217,7 +212,7 @@ def with_readings(outcome):
 def test_all_names_lie_on_the_page(outcome, tmp_path, monkeypatch, count, size):
     pages = []
     monkeypatch.setattr(
-        figures_poses.canvas, "save_figure", lambda path, drawing: pages.append(drawing)
+        figures_poses.style, "save_figure", lambda path, drawing: pages.append(drawing)
     )
     pose = replace(outcome.poses[0], points=size * outcome.poses[0].points)
     shape = outcome.stages[-1].shapes[pose.name]

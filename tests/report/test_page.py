@@ -31,8 +31,8 @@ from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.photographs import PHOTOGRAPHS, photograph_of
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.tables import stage_rows
-from dlo_casadi.report.words import millimetres
 from dlo_casadi.session.outcome import ParameterEstimate
+from dlo_casadi.show.text import millimetres
 
 HOSTILE = "<img src=x onerror=alert(1)></script>"
 PROPOSAL = NextPose(

@@ -10,13 +10,13 @@ import pytest
 from small_sessions import BENCH, CONFIGS, small
 
 from dlo_casadi.api import predict
+from dlo_casadi.cable.file import load, parameters_hash
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.effects import BendingSoftening, ImageDistortion, RestCurvatureDrift
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.io.parameters import load_parameters, parameters_hash
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.report.documents import final_rest, fit_dict, parameters_text
 from dlo_casadi.session.fitting import declared_model, minimum_by_ipopt
@@ -58,7 +58,7 @@ def test_a_cable_in_space_is_rebuilt_exactly(outcome, tmp_path):
         "end_orientation": None,
     }
 
-    cable = load_parameters(path)
+    cable = load(path)
     assert cable.model == fit.model
     assert np.array_equal(cable.p, fit.p)
     assert np.array_equal(cable.rest, fit.rest)
@@ -73,7 +73,7 @@ def test_a_cable_in_space_is_rebuilt_exactly(outcome, tmp_path):
         change(damaged)
         (tmp_path / "damaged.yaml").write_text(dump_yaml(damaged))
         with pytest.raises(ConfigError, match=message):
-            load_parameters(tmp_path / "damaged.yaml")
+            load(tmp_path / "damaged.yaml")
 
 
 def as_file(fit, outcome, path):
@@ -82,11 +82,11 @@ def as_file(fit, outcome, path):
 
 
 def test_prediction_from_the_file_equals_prediction_from_the_fit(outcome, file):
-    model, p, rest, _ = load_parameters(file)
+    cable = load(file)
     fit = outcome.fit
     poses = [item.pose for item in fit.problem.measured]
 
-    ours = predict_poses(model, p, rest, poses)
+    ours = predict_poses(cable.model, cable.p, cable.rest, poses)
     theirs = predict_poses(fit.model, fit.p, fit.rest, poses)
     gap = max(
         np.abs(a.curve.nodes - b.curve.nodes).max() for a, b in zip(ours, theirs, strict=True)
@@ -95,7 +95,8 @@ def test_prediction_from_the_file_equals_prediction_from_the_fit(outcome, file):
 
 
 def test_the_model_is_rebuilt_exactly(outcome, file):
-    model, p, rest, metadata = load_parameters(file)
+    cable = load(file)
+    model, p, rest, metadata = cable.model, cable.p, cable.rest, cable.metadata
 
     assert model == outcome.fit.model
     assert np.array_equal(p, outcome.fit.p)
@@ -112,11 +113,11 @@ def test_equal_results_give_equal_bytes(outcome):
 
 
 def test_a_folder_of_results_will_do(file):
-    assert load_parameters(file.parent).metadata.path == file
+    assert load(file.parent).metadata.path == file
 
 
 def test_covariance_is_in_si_units(outcome, file):
-    metadata, fit = load_parameters(file).metadata, outcome.fit
+    metadata, fit = load(file).metadata, outcome.fit
 
     assert metadata.names == fit.problem.unknowns.names
     for name in fit.model.names:
@@ -132,7 +133,7 @@ def test_covariance_is_in_si_units(outcome, file):
 
 def test_the_fitted_stiffness_agrees_with_the_bench_truth(file):
     truth = read_yaml(BENCH.parent / "bench_truth" / "short_clean" / "truth.yaml")
-    low, high = load_parameters(file).metadata.interval_95
+    low, high = load(file).metadata.interval_95
     stiffness = truth["bending_stiffness"]
 
     assert low < stiffness < high
@@ -143,7 +144,8 @@ def test_effects_keep_what_they_were_made_with(outcome, tmp_path):
     fit, measured = fitted("overhang", ImageDistortion(center=(0.2, -0.05)))
     path = as_file(fit, outcome, tmp_path / "parameters.yaml")
 
-    model, p, rest, metadata = load_parameters(path)
+    cable = load(path)
+    model, p, rest, metadata = cable.model, cable.p, cable.rest, cable.metadata
     assert model == fit.model
     assert model.effects[-1].center == (0.2, -0.05)
     assert not metadata.edited
@@ -158,7 +160,7 @@ def test_effects_keep_what_they_were_made_with(outcome, tmp_path):
 
 def test_the_next_pose_finds_the_cable_as_the_last_one_left_it(outcome, tmp_path):
     fit, measured = fitted("drift", RestCurvatureDrift())
-    rest = load_parameters(as_file(fit, outcome, tmp_path / "parameters.yaml")).rest
+    rest = load(as_file(fit, outcome, tmp_path / "parameters.yaml")).rest
 
     # The second route: pose by pose, kappa_0 += rate (kappa - kappa_0), from the fitted shapes.
     rate, expected = fit.value("rest_curvature_drift.rate"), fit.rest
@@ -190,7 +192,7 @@ def test_a_file_changed_by_hand_is_noticed(file, tmp_path):
     edited = tmp_path / "parameters.yaml"
     edited.write_text(dump_yaml(document))
 
-    assert load_parameters(edited).metadata.edited
+    assert load(edited).metadata.edited
 
 
 def damaged(file, tmp_path, change):
@@ -246,7 +248,7 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
     path = damaged(file, tmp_path, change)
 
     with pytest.raises(ConfigError, match=re.escape(message)) as caught:
-        load_parameters(path)
+        load(path)
     assert str(path) in str(caught.value)
 
 
@@ -289,7 +291,7 @@ def test_a_value_that_cannot_be_computed_with_is_named_with_its_line(
     file, tmp_path, change, message
 ):
     with pytest.raises(ConfigError, match=re.escape(message)) as caught:
-        load_parameters(damaged(file, tmp_path, change))
+        load(damaged(file, tmp_path, change))
     assert "Try: the file as a fit has written it." in str(caught.value)
     key = re.findall(r"\w+", message.split()[0])[-1]
     listed = re.findall(rf"line (\d+): {re.escape(message)}", str(caught.value))  # one of several
@@ -316,7 +318,8 @@ def test_values_at_their_bounds_are_read_as_they_were_written(outcome, tmp_path,
         path = tmp_path / "parameters.yaml"
         path.write_text(dump_yaml(document))
 
-        model, p, _, metadata = load_parameters(path)
+        cable = load(path)
+        model, p, metadata = cable.model, cable.p, cable.metadata
         assert dict(zip(model.names, p, strict=True)) == values  # every digit
         assert not metadata.edited
 
@@ -328,14 +331,14 @@ def test_a_fit_that_ends_at_a_bound_can_be_read(outcome, tmp_path):
     assert point is not None
     fit = Fit(fit.problem, point, converged=True)
     assert fit.value("bending_softening.softness") == 0.0
-    assert np.array_equal(load_parameters(as_file(fit, outcome, tmp_path / "p.yaml")).p, fit.p)
+    assert np.array_equal(load(as_file(fit, outcome, tmp_path / "p.yaml")).p, fit.p)
 
 
 def test_a_missing_file_is_a_clear_error(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
-        load_parameters(tmp_path / "parameters.yaml")
+        load(tmp_path / "parameters.yaml")
 
 
 def test_a_configuration_is_no_parameter_file():
     with pytest.raises(ConfigError, match=r"the parameters\.yaml in the results folder of a fit"):
-        load_parameters(Path(small("short_clean").path))
+        load(Path(small("short_clean").path))

@@ -14,9 +14,10 @@ from dlo_casadi.report.page import page_data
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.tables import describe, stage_rows, unidentified
 from dlo_casadi.report.terminal import print_summary
-from dlo_casadi.report.words import plus_minus, separation_text, structure_lines
+from dlo_casadi.report.words import separation_text, structure_lines
 from dlo_casadi.session.outcome import ParameterEstimate
 from dlo_casadi.session.pose_shape import BranchShape
+from dlo_casadi.show.text import plus_minus
 
 
 def said(outcome):

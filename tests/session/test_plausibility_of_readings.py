@@ -139,7 +139,7 @@ def test_a_session_whose_readings_have_the_other_sign():
         model, model.nominal, np.zeros(model.chain.n_rests), [conditions(x) for x in declared]
     )
     poses = tuple(
-        pose.model_copy(update={"end_force": tuple(-one.equilibrium.lam)})
+        pose.model_copy(update={"end_force": tuple(-one.equilibrium.end_force)})
         for pose, one in zip(declared, found, strict=True)
     )
     experiment = config.experiment.model_copy(update={"poses": poses})

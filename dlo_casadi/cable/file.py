@@ -16,6 +16,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from dlo_casadi.cable.fitted_cable import FittedCable
+from dlo_casadi.cable.metadata import Metadata
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.problems import Problem, show
 from dlo_casadi.config.sections import Boundary, ElementName
@@ -35,7 +37,6 @@ from dlo_casadi.config.values import (
 )
 from dlo_casadi.effects import EFFECTS, NUISANCES, CableData, Effect, known_effect
 from dlo_casadi.effects.cable import Parameter
-from dlo_casadi.equilibrium.fitted_cable import FittedCable, Metadata
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import ConfigError, DloError, counted
 from dlo_casadi.model.cable_model import CableModel
@@ -149,7 +150,7 @@ class ParametersFile(OpenSection):
     versions: dict[str, Any] | None = None
 
 
-def load_parameters(path: str | Path) -> FittedCable:
+def load(path: str | Path) -> FittedCable:
     """Read parameters.yaml and rebuild the model exactly.
 
     Parameters
@@ -157,17 +158,16 @@ def load_parameters(path: str | Path) -> FittedCable:
     path : str or Path
         The file, or the folder of results that holds it.
 
-    Returns
-    -------
-    (model, p, rest, metadata)
-        See `FittedCable`.
-
     Raises
     ------
     ConfigError
-        If the file is no parameters.yaml of this schema, or if a value in it lies outside of its
-        bounds; the message names the key.
+        If there is no such file, it is no parameters.yaml of this schema, or a value in it lies
+        outside of its bounds; the message names the key.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ConfigError(
+            f"{path!r} is no path.\n  Try: the parameters.yaml or the results folder of a fit."
+        )
     source = Path(path)
     if os.path.isdir(source):
         source = source / FILE

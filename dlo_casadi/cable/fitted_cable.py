@@ -1,0 +1,409 @@
+"""A fitted cable with the uncertainty of its parameters, and its shape in one pose."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.curve import CableCurve
+from dlo_casadi.cable.held import held_pose
+from dlo_casadi.cable.metadata import Metadata
+from dlo_casadi.cable.picture import draw_shape
+from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.pose import Branch, HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import (
+    EDGE,
+    Tipping,
+    displacements,
+    sides_of,
+    spread_across,
+    tipping_of,
+)
+from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.node import Frame, Heading
+from dlo_casadi.show.text import html_table, millimetres, vector
+
+# Points of a shape.
+_POINTS = 101
+# Distances [m] between a fixture and the cable that a table shows.
+_SHOWN = 5e-6
+
+
+@dataclass(frozen=True, eq=False)
+class FittedCable:
+    """A fitted cable: its model with the fitted values, and what is known of their errors.
+
+    From `Result.cable`, or `dlo_casadi.load` of a folder of results.
+
+    Parameters
+    ----------
+    model : CableModel
+    p : (n_parameters,)
+        In the order of `model.names` (SI).
+    rest : (n_rests,) [1/m]
+        Rest curvature before the next pose; in space the rest strains: the twist of all cells,
+        then k_y, then k_z.
+    metadata : Metadata
+    """
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    metadata: Metadata
+
+    @property
+    def name(self) -> str:
+        """What the cable is called."""
+        return self.model.cable.name
+
+    @property
+    def length(self) -> float:
+        """Length [m] as declared."""
+        return self.model.cable.length
+
+    def solve(
+        self,
+        end: ArrayLike | None = None,
+        *,
+        start: ArrayLike | None = None,
+        start_heading: float | None = None,
+        end_heading: float | None = None,
+        start_orientation: ArrayLike | None = None,
+        end_orientation: ArrayLike | None = None,
+        turns: float = 0.0,
+        branch: Branch | None = None,
+    ) -> "Shape":
+        """Predict the shape of the cable in a pose.
+
+        Of several equilibria this is the stable one of lowest energy, unless `branch` or `turns`
+        name one. Where it is unknown which of two sides is the lower one, `other_side` has the
+        other.
+
+        Parameters
+        ----------
+        end : (d,) [m]
+            Where the end is held, d = 2 or 3 in space; None for a free end.
+        start : (d,) [m], optional
+            Where the start is held; by default where all poses of the session had it, or the
+            origin.
+        start_heading, end_heading : float [rad], optional
+            Directions of clamped ends in a plane, continuous along the cable; those that all poses
+            of the session shared by default.
+        start_orientation, end_orientation : (4,), optional
+            Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the
+            cable; those that all poses of the session shared by default.
+        turns : float
+            In space, the number of full turns to which the twist shall be nearest, see `Pose`. A
+            cable may shed two of them over a loop; that is an error.
+        branch : "ccw" or "cw", optional
+            In a plane, which way the cable turns from start to end.
+
+        Raises
+        ------
+        EquilibriumError
+            If the pose has no equilibrium, e.g. because the end is out of reach, or none is found
+            on the branch.
+        DloError
+            If the ends are not held as the cable's boundary asks, or are no finite numbers.
+        """
+        asked = {"start": start, "end": end, "turns": turns, "branch": branch}
+        asked |= {"start_heading": start_heading, "end_heading": end_heading}
+        asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
+        pose = held_pose(self.model, self.metadata.fixtures, asked)
+        try:
+            eq = solve_equilibrium(self.model, self.p, self.rest, pose)
+        except EquilibriumError as error:
+            # The solver's advice is about a configuration, and there is none here.
+            happened = error.message.partition("\n  Try:")[0]
+            other = "headings or branch" if pose.node is Heading else "orientations, fewer turns"
+            raise EquilibriumError(
+                f"{happened}\n  Try: an end in metres, nearer to the start; other {other}.",
+                p_des=error.p_des,
+            ) from None
+        beyond, known = eq.other_side, self.metadata.uncertainty
+        if beyond is None:
+            return self._shape(pose, eq)
+        near = tipping_of(self.model, self.p, self.rest, pose, eq, beyond, known)
+        if not near.either:
+            return self._shape(pose, eq)
+        own, others = sides_of(self.model, pose, eq, beyond)
+        other_side = self._shape(others, beyond)
+        return replace(self._shape(own, eq), other_side=other_side, tipping=near)
+
+    def compile(self, *, flags: Sequence[str] = ("-O2",)) -> CompiledSolver:
+        """The cable as C, compiled and loaded: thousands of shapes a second.
+
+        Parameters
+        ----------
+        flags : sequence of str
+            Of the compiler.
+
+        Raises
+        ------
+        DloError
+            If there is no C compiler.
+        """
+        return CompiledSolver(self.model, self.p, self.rest, flags=flags)
+
+    def with_mesh(self, n: int | None = None, element: str | None = None) -> Self:
+        """The same cable on another mesh.
+
+        Raises
+        ------
+        DloError
+            If its rest shape has changed from pose to pose: it is known on the fit's mesh alone.
+        """
+        if n is None and element is None:
+            return self
+        if self.model.has_state:
+            raise DloError(
+                f"{self.name!r} has a rest shape that changed from pose to pose, which is known on "
+                "the fit's elements alone: leave out the number and the kind of elements"
+            )
+        model = self.model.with_mesh(n or self.model.n, element)
+        return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
+
+    def _shape(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
+        model = plain = self.model
+        effects = tuple(x for x in model.effects if not isinstance(x, MeasurementEffect))
+        if effects != model.effects:  # the true curve is that without the effects of the camera
+            plain = replace(model, effects=effects, priors={})
+        kept = [name in plain.names for name in model.names]
+        curve, seen = (
+            CableCurve.of(
+                self.length,
+                assembly_of(one).curve(eq.shapes, Inputs.of(p, self.rest, pose.vector[None]))[0],
+            )
+            for one, p in ((plain, self.p[kept]), (model, self.p))
+        )
+        return Shape(self, pose, eq, curve, seen)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A fitted cable in one pose; in a notebook a short table, `print` gives the same as text.
+
+    Parameters
+    ----------
+    cable : FittedCable
+        The fitted cable.
+    pose : HeldPose
+        How its ends are held; with the `turns` or the `branch` of this shape where the cable may
+        hang on either of two sides.
+    equilibrium : Equilibrium
+        Nodes, reactions, energy and stability.
+    curve : CableCurve
+        The cable itself, at any arc length: `curve.at(s)`.
+    seen : CableCurve
+        The same curve as measured by the session's camera.
+    other_side : Shape or None
+        The same pose on the other side: with a free end fallen to the other side, between two
+        clamps in space twisted the other way round. None unless it is uncertain, by the parameters
+        and fixtures, which side is the lower one, and the pose does not name its side.
+    tipping : Tipping or None
+        Then, the angle of the clamp from where both sides are equally low.
+    """
+
+    cable: FittedCable
+    pose: HeldPose
+    equilibrium: Equilibrium
+    curve: CableCurve
+    seen: CableCurve
+    other_side: Self | None = None
+    tipping: Tipping | None = None
+
+    @property
+    def s(self) -> FloatArray:
+        """Arc lengths (101,) [m] of `points` and `frames`, evenly spaced from start to end."""
+        return np.linspace(0.0, self.curve.length, _POINTS)
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """Points (101, d) [m] along the cable, at `s`; elsewhere `curve.at`."""
+        return self.curve.at(self.s)
+
+    @cached_property
+    def frames(self) -> FloatArray:
+        """Material frames (101, d, d) at `s`: columns are the tangent and the section's axes.
+
+        In a plane the second column is to the left. In space the roll about the tangent is
+        interpolated between the nodes.
+        """
+        tangents = self.curve.at(self.s, 1)
+        tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+        if not self.cable.model.in_space:
+            return np.stack([tangents, tangents[:, ::-1] * (-1.0, 1.0)], axis=2)
+        x = Frame.interpolated(self.s, self.cable.model.chain.places, self.equilibrium.x)
+        y = Rotation.from_quat(x).apply([0.0, 1.0, 0.0])
+        y -= (y * tangents).sum(axis=1, keepdims=True) * tangents
+        y /= np.linalg.norm(y, axis=1, keepdims=True)
+        return np.stack([tangents, y, np.cross(tangents, y)], axis=2)
+
+    @property
+    def start_force(self) -> FloatArray:
+        """Force (d,) [N] of the cable on whatever holds its start."""
+        return self.equilibrium.start_force
+
+    @property
+    def end_force(self) -> FloatArray:
+        """Force (d,) [N] of the cable on whatever holds its end; zero at a free end."""
+        return self.equilibrium.end_force
+
+    @property
+    def start_moment(self) -> FloatArray:
+        """Moment [N m] of the cable on its start clamp, about the world's axes (3,).
+
+        In a plane one number (), counter-clockwise; zero at a pin.
+        """
+        return np.asarray(self.equilibrium.moments[0])
+
+    @property
+    def end_moment(self) -> FloatArray:
+        """Moment [N m] of the cable on its end clamp, as `start_moment`."""
+        return np.asarray(self.equilibrium.moments[1])
+
+    @property
+    def energy(self) -> float:
+        """Potential energy [J]."""
+        return self.equilibrium.energy
+
+    @property
+    def min_bend_radius(self) -> float:
+        """Smallest radius of curvature [m] along the cable."""
+        return self.equilibrium.min_bend_radius
+
+    @property
+    def stable(self) -> bool:
+        """Whether the cable would stay there: the energy has a strict minimum."""
+        return self.equilibrium.stable
+
+    @cached_property
+    def band(self) -> FloatArray:
+        """Half width (101,) [m] at `s` of the band across the cable with 90 % of new repeats.
+
+        First order in the parameters' errors, the fixtures' scatter and the scatter of repeats.
+        """
+        cable, s = self.cable, self.s
+        known = cable.metadata.uncertainty
+        curve, moved = displacements(
+            cable.model, cable.p, cable.rest, self.pose, self.equilibrium, known, s
+        )
+        return np.asarray(EDGE * np.linalg.norm(spread_across(curve, s, moved), axis=1))
+
+    def plot(self) -> Figure:
+        """The shape with the forces of the cable on its fixtures; in a plane with its band."""
+        other = self.other_side
+        state = "stable" if self.stable else "NOT stable"
+        radius = millimetres(self.min_bend_radius)
+        forces = {"start": self.start_force}
+        if self.pose.end is not None:
+            forces["end"] = self.end_force
+        return draw_shape(
+            self.points,
+            forces,
+            band=None if self.cable.model.in_space else self.band,
+            other=None if other is None else other.points,
+            title=f"{self.cable.name}: predicted shape",
+            remark=f"energy {self.energy:.4g} J, smallest bend radius {radius}, {state}",
+            alarming=not self.stable,
+        )
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Quantities of the shape, and their values as text."""
+        rows, pose, points = [], self.pose, self.points
+        for side, at, reached in (("start", pose.start, points[0]), ("end", pose.end, points[-1])):
+            if at is None:
+                rows.append((side, "free"))
+                continue
+            rows.append((side, vector(at, "g", "m")))
+            if math.dist(at, reached) > _SHOWN:
+                place = vector(reached, ".5f", "m")
+                said = f"{place}: fixture errors of the fit included"
+                rows.append((f"{side} of the cable", said))
+            force, moment = getattr(self, f"{side}_force"), getattr(self, f"{side}_moment")
+            rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
+            if getattr(self.cable.model, side) == "clamped":
+                said = vector(moment, ".4g", "N m") if moment.ndim else f"{moment:.4g} N m"
+                rows.append((f"moment of the cable on its {side}", said))
+        rows.append(("energy", f"{self.energy:.6g} J"))
+        rows.append(("smallest bend radius", millimetres(self.min_bend_radius)))
+        rows.append(("stable", "yes" if self.stable else "NO: the cable would not stay there"))
+        other, near = self.other_side, self.tipping
+        if other is not None and near is not None:
+            rows.append(("this side", f"`{self._side}`"))
+            said = (
+                f"`{other._side}`: {other.energy:.6g} J, up to "
+                f"{millimetres(self._apart(other))} away; equally low with the clamp turned by "
+                f"{near.angle:.2g} rad (known to {near.std:.2g} rad)"
+            )
+            rows.append(("also stable", said))
+        return rows
+
+    def __str__(self) -> str:
+        lines = [f"  {name}: {value}" for name, value in self.rows()]
+        return "\n".join([f"{self.cable.name}: predicted shape", *lines])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return html_table(f"{self.cable.name}: predicted shape", self.rows())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything a program may want to know, as plain data in SI units."""
+        pose = self.pose
+        return {
+            "cable": self.cable.name,
+            "model_hash": self.cable.metadata.model_hash,
+            "length": self.cable.length,
+            "start": list(pose.start),
+            "end": None if pose.end is None else list(pose.end),
+            **pose.directions,
+            "branch": pose.branch,
+            "status": self.equilibrium.status.name.lower(),
+            "stable": self.stable,
+            "energy": self.energy,
+            "force_on_start": self.start_force.tolist(),
+            "force_on_end": self.end_force.tolist(),
+            "moment_on_start": self.start_moment.tolist(),
+            "moment_on_end": self.end_moment.tolist(),
+            "min_bend_radius": self.min_bend_radius,
+            "points": self.points.tolist(),
+            "band_90": self.band.tolist(),
+            "other_side": self._other_side_as_dict(),
+        }
+
+    def _other_side_as_dict(self) -> dict[str, Any] | None:
+        """The other side as plain data, with its greatest distance [m] from this one."""
+        other, near = self.other_side, self.tipping
+        if other is None or near is None:
+            return None
+        shape = other.as_dict()
+        del shape["other_side"]
+        return {
+            "tipping": near.angle,
+            "tipping_std": near.std,
+            "greatest_distance": self._apart(other),
+            **shape,
+        }
+
+    def _apart(self, other: "Shape") -> float:
+        """Greatest distance [m] of points at equal arc lengths."""
+        return float(np.linalg.norm(other.points - self.points, axis=1).max())
+
+    @property
+    def _side(self) -> str:
+        """What tells the side on which the cable hangs, as in a configuration."""
+        turns, branch = self.pose.turns, self.pose.branch
+        return f"turns: {turns:g}" if self.cable.model.in_space else f"branch: {branch}"

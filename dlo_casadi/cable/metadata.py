@@ -1,0 +1,59 @@
+"""What is known of a fitted cable beside its model."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.spread import Uncertainty
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """Contents of a parameters.yaml beside the model.
+
+    Parameters
+    ----------
+    path : Path
+    names : tuple of str
+        Fitted parameters, in the order of `covariance`.
+    covariance : (N, N)
+        In the products of the parameters' units.
+    uncertainty : Uncertainty
+        The same with the scatter from pose to pose.
+    std : dict
+        Standard deviation of each parameter by name [SI]; 0 where it was not fitted.
+    coefficients : (n_coefficients,) [1/m]
+        Of the rest curvature before the first pose; in space about the axis y, then about z.
+    fixtures : dict
+        Those of `start` [m] and `start_heading`, `end_heading` [rad], in space `start_orientation`,
+        `end_orientation`, that are the same in all poses of the session.
+    identifiable : bool or None
+        Whether the shapes determine the bending stiffness.
+    interval_95 : (float or None, float or None) or None [N m^2]
+        Of the bending stiffness; None in it = unbounded.
+    model_hash : str
+        As written; see `parameters_hash`.
+    edited : bool
+        Whether the model is no longer the one that was written.
+    config : str
+        Name of the configuration.
+    versions : dict
+    document : dict
+        The whole file.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    covariance: FloatArray
+    uncertainty: Uncertainty
+    std: dict[str, float]
+    coefficients: FloatArray
+    fixtures: dict[str, Any]
+    identifiable: bool | None
+    interval_95: tuple[float | None, float | None] | None
+    model_hash: str
+    edited: bool
+    config: str
+    versions: dict[str, str]
+    document: dict[str, Any]

@@ -1,0 +1,61 @@
+"""The picture of one shape: the cable, and what it does to its fixtures."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.show import style
+
+# Distance of a number from its arrow's tip, as a share of the arrow.
+_BEYOND = 0.2
+
+
+def draw_shape(
+    points: FloatArray,
+    forces: Mapping[str, FloatArray],
+    *,
+    band: FloatArray | None,
+    other: FloatArray | None,
+    title: str,
+    remark: str,
+    alarming: bool,
+) -> Figure:
+    """Draw a shape (K, d) [m] with the forces (d,) [N] on its ends "start" and "end".
+
+    `band` (K,) [m] are half widths about a shape in a plane, `other` (K, d) [m] is the shape on
+    the other side.
+    """
+    largest = max(float(np.linalg.norm(force)) for force in forces.values())
+    reach = 0.25 * float(np.ptp(points, axis=0).max()) / max(largest, 1e-12)
+    with style.styled((7.0, 6.0)) as drawing:
+        axes: Any = drawing.add_subplot(projection="3d" if points.shape[1] == 3 else None)
+        if band is not None:
+            outline = style.band_outline(points, band)
+            label = "90 % of next hangings"
+            axes.fill(*outline.T, color=style.BLUE, alpha=0.15, lw=0, label=label)
+        axes.plot(*points.T, color=style.BLUE, lw=2.5, label="cable")
+        if other is not None:
+            axes.plot(*other.T, "--", color=style.BLUE, lw=1.5, label="on the other side")
+        for side, force in forces.items():
+            at, marker = (points[0], "s") if side == "start" else (points[-1], "o")
+            axes.plot(*at[:, None], marker, color=style.BLACK, ms=7, label=side)
+            size = float(np.linalg.norm(force))
+            if size <= 1e-3 * largest or largest == 0:
+                continue
+            axes.plot(*style.arrow(at, reach * force).T, color=style.VERMILLION, lw=1.8)
+            beyond = at + (1 + _BEYOND) * reach * force
+            paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
+            number = axes.text(*beyond, f"{size:.3g} N", ha="center", va="center", bbox=paper)
+            number.set_color(style.VERMILLION)
+            axes.plot(*beyond[:, None], alpha=0)  # a text does not count for the axes' limits
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.12)
+        axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})
+        axes.plot([], [], color=style.VERMILLION, label="force of the cable on its fixtures")
+        drawing.legend(loc="outside lower center", ncols=4)
+        axes.set_title(remark, color=style.VERMILLION if alarming else style.GREY)
+        drawing.suptitle(title, fontsize=12)
+    return drawing

@@ -1,0 +1,1 @@
+"""How numbers and figures look, whatever they are of."""

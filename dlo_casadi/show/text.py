@@ -1,0 +1,35 @@
+"""Numbers as text with their units, and rows as a table of HTML."""
+
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+
+
+def millimetres(value: float | None, nothing: str = "-") -> str:
+    """A length [m] as text in mm, with three digits; a dash for none."""
+    return nothing if value is None else f"{1e3 * value:.3g} mm"
+
+
+def vector(components: Iterable[float], form: str, unit: str) -> str:
+    """Components of a vector in brackets, and their unit."""
+    return f"({', '.join(format(x, form) for x in components)}) {unit}"
+
+
+def plus_minus(value: float, std: float) -> str:
+    """A value with the digits that its standard deviation leaves: two of the latter."""
+    if not std > 0:
+        return f"{value:.4g}"
+    decimals = 1 - math.floor(math.log10(std))
+    if std >= 10 * abs(value) or not 0 <= decimals <= 7:
+        return f"{value:.2g} ± {std:.2g}"
+    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+
+
+def html_table(title: str, rows: Sequence[Sequence[str]], remarks: Iterable[str] = ()) -> str:
+    """HTML table with everything escaped; the remarks below it."""
+    columns = max(map(len, rows))
+    full = [[*row, *[""] * (columns - len(row))] for row in rows]
+    cells = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in full]
+    body = "".join(f"<tr>{row}</tr>" for row in cells)
+    below = "".join(f"<div>{escape(remark.strip())}</div>" for remark in remarks)
+    return f"<div><b>{escape(title)}</b><table>{body}</table>{below}</div>"
