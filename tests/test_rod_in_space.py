@@ -97,7 +97,7 @@ def test_a_planar_load_gives_the_numbers_of_the_plane():
     found = solved(m, pose((0.5, 0.1, 0.0), (0.0, 0.0, -0.9), (0.0, 0.0, 1.2)))
     np.testing.assert_allclose(found.points[:, :2], flat.points, atol=1e-9)
     np.testing.assert_allclose(found.points[:, 2], 0.0, atol=1e-9)
-    np.testing.assert_allclose(found.lam[:2], flat.lam, atol=1e-9)
+    np.testing.assert_allclose(found.end_force[:2], flat.end_force, atol=1e-9)
     np.testing.assert_allclose(found.moments[:, 2], flat.moments, atol=1e-9)
     assert found.energy == pytest.approx(flat.energy, abs=1e-11)
 
@@ -135,7 +135,7 @@ def test_a_helix_under_moments_alone():
     found = solved(m, place)
     np.testing.assert_allclose(found.curvature.reshape((2, -1))[0], bend, rtol=1e-6)
     np.testing.assert_allclose(found.energy, EI / 2 * (twist**2 + bend**2) * LENGTH, rtol=1e-7)
-    np.testing.assert_allclose(found.lam, 0.0, atol=1e-7)
+    np.testing.assert_allclose(found.end_force, 0.0, atol=1e-7)
     # On the end clamp the cable acts with minus its moment.
     moment = steps[1].apply([EI * twist, EI * bend, 0.0])
     np.testing.assert_allclose(np.abs(found.moments[1]), np.abs(moment), atol=1e-6)
