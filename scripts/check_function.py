@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.effects import EFFECTS, BoundaryEffect, Cable, Effect
+from dlo_casadi.effects import EFFECTS, BoundaryEffect, CableData, Effect
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.symbolic import pose_of, shape_function
 from dlo_casadi.model.cable_model import CableModel
@@ -35,7 +35,7 @@ POSES = {
 
 def model_of(effect: type[Effect] | None, dimension: int) -> tuple[CableModel, FloatArray]:
     """A cable with one effect, and its parameters."""
-    cable = Cable(0.8, 0.05, 0.005, 0.01, torsional_stiffness=0.008 if dimension == 3 else None)
+    cable = CableData(0.8, 0.05, 0.005, 0.01, torsional_stiffness=0.008 if dimension == 3 else None)
     held = effect is None or not issubclass(effect, BoundaryEffect) or "clamp" in effect.name
     model = CableModel(
         cable,
@@ -70,7 +70,7 @@ def errors(effect: type[Effect] | None, dimension: int) -> tuple[float, ...]:
     told = dict(zip(function.name_out(), map(np.array, function(pose, p)), strict=True))
     pairs = [
         (told["points"].T, eq.points),
-        (told["end_force"].ravel(), eq.lam),
+        (told["end_force"].ravel(), eq.end_force),
         (told["end_moment"].ravel(), np.reshape(eq.moments, (2, -1))[1]),
         (told["energy"].item(), eq.energy),
         (told["min_bend_radius"].item(), eq.min_bend_radius),

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects import Setup
+from dlo_casadi.effects import CableData, Setup
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.canvas import BLACK, BLUE, GREY, WIDTH, line_of, styled
@@ -23,8 +24,8 @@ from dlo_casadi.report.scene import seen
 
 PICTURES = Path(__file__).parents[1] / "docs/pages/effects"
 LENGTH, ELEMENTS = 0.8, 40
-IN_PLANE = dlo.effects.Cable(LENGTH, 0.1, 0.008, 0.02, straight=True)
-IN_SPACE = dlo.effects.Cable(LENGTH, 0.1, 0.008, 0.02, straight=True, torsional_stiffness=0.015)
+IN_PLANE = CableData(LENGTH, 0.1, 0.008, 0.02, straight=True)
+IN_SPACE = CableData(LENGTH, 0.1, 0.008, 0.02, straight=True, torsional_stiffness=0.015)
 # A camera [m] that does not stand before the middle of the cable, so that its rays are oblique.
 CAMERA = (0.9, 0.3, 1.2)
 
@@ -84,18 +85,18 @@ SHOWN = {
 }
 
 
-def poses_in_plane(clamped: bool) -> list[dlo.Pose]:
+def poses_in_plane(clamped: bool) -> list[HeldPose]:
     """Three poses between pins, or clamps."""
     ends = ((0.62, 0.05), (0.3, 0.12), (0.45, -0.35))
     held = {"start_heading": 0.0, "end_heading": 0.0} if clamped else {}
-    return [dlo.Pose((0.0, 0.0), end, camera_center=CAMERA, **held) for end in ends]
+    return [HeldPose((0.0, 0.0), end, camera_center=CAMERA, **held) for end in ends]
 
 
-def poses_in_space() -> list[dlo.Pose]:
+def poses_in_space() -> list[HeldPose]:
     """Three poses between clamps; the end clamp is turned about the vertical."""
     held = (((0.55, 0.1, 0.0), 40), ((0.25, 0.3, 0.1), 90), ((0.45, 0.15, -0.3), 60))
     return [
-        dlo.Pose(
+        HeldPose(
             (0.0, 0.0, 0.0),
             end,
             start_orientation=(0.0, 0.0, 0.0, 1.0),

@@ -132,7 +132,7 @@ def test_c_compiles_and_runs(bench, tmp_path, monkeypatch):
     ]
     subprocess.run([*command, "-o", "program", "-lm"], cwd=tmp_path, check=True)
     said = subprocess.run([tmp_path / "program"], check=True, capture_output=True, text=True)
-    force = dlo.predict("results/cable", end=(0.3, -0.1)).equilibrium.lam
+    force = dlo.predict("results/cable", end=(0.3, -0.1)).end_force
     assert said.stdout == f"end force {force[0]:.3f} {force[1]:.3f} N\n"
 
 

@@ -9,7 +9,7 @@ import pytest
 from dlo_casadi.effects import (
     AxialStretch,
     BendingSoftening,
-    Cable,
+    CableData,
     ClampAngle,
     ClampRotation,
     ImageScale,
@@ -35,7 +35,7 @@ def cable(in_space: bool, plain: bool = False):
     turned = ClampRotation() if in_space else ClampAngle()
     effects = (BendingSoftening(), AxialStretch(), LumpedMass(), turned)
     model = CableModel(
-        Cable(0.8, 0.05, 0.005, 0.01, torsional_stiffness=0.008 if in_space else None),
+        CableData(0.8, 0.05, 0.005, 0.01, torsional_stiffness=0.008 if in_space else None),
         n=6 if in_space else 10,
         start="clamped",
         end="clamped",
@@ -69,7 +69,7 @@ def test_values_and_both_derivatives_with_an_effect_of_each_kind(in_space):
     known = solve_equilibrium(model, p, rest, pose_of(model, pose))
     assert found["status"] == 0
     np.testing.assert_allclose(found["points"].T, known.points, atol=1e-12)
-    np.testing.assert_allclose(found["end_force"].ravel(), known.lam, atol=1e-12)
+    np.testing.assert_allclose(found["end_force"].ravel(), known.end_force, atol=1e-12)
     np.testing.assert_allclose(found["end_moment"].ravel(), known.moments[1], atol=1e-12)
     assert found["energy"] == pytest.approx(known.energy, abs=1e-12)
     assert found["min_bend_radius"] == pytest.approx(known.min_bend_radius, rel=1e-12)
@@ -104,7 +104,7 @@ def test_what_has_no_equilibrium_is_nan_with_its_derivatives_and_raises_nothing(
 
 
 def test_a_joint_at_its_bound_is_no_root_of_the_equations():
-    model = CableModel(Cable(0.8, 0.05, 0.005, 1e-4), n=4, element="link", n_rest=0)
+    model = CableModel(CableData(0.8, 0.05, 0.005, 1e-4), n=4, element="link", n_rest=0)
     function = shape_function(model, model.nominal, np.zeros(model.chain.n_rests))
     pose = np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0])
     found = solve_equilibrium(
@@ -116,7 +116,7 @@ def test_a_joint_at_its_bound_is_no_root_of_the_equations():
 
 
 def test_the_branch_asked_for():
-    model = CableModel(Cable(0.8, 0.05, 0.005, 0.01), n=6, n_rest=0)
+    model = CableModel(CableData(0.8, 0.05, 0.005, 0.01), n=6, n_rest=0)
     rest, pose = np.zeros(model.chain.n_rests), np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
     for branch, sign in (("ccw", -1), ("cw", 1)):
         points = np.array(shape_function(model, model.nominal, rest, branch=branch)(pose)[0])
@@ -125,7 +125,7 @@ def test_the_branch_asked_for():
 
 def test_a_cable_between_ball_joints_may_roll_and_has_derivatives_all_the_same():
     model = CableModel(
-        Cable(0.8, 0.05, 0.005, 0.01, torsional_stiffness=0.008), n=6, gravity=(0.0, 0.0, -9.81)
+        CableData(0.8, 0.05, 0.005, 0.01, torsional_stiffness=0.008), n=6, gravity=(0.0, 0.0, -9.81)
     )
     function = shape_function(model, model.nominal, np.zeros(model.chain.n_rests))
     u = ca.MX.sym("u", 15)

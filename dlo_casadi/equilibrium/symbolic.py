@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import SIGNS, Branch, Pose
+from dlo_casadi.equilibrium.pose import SIGNS, Branch, HeldPose
 from dlo_casadi.equilibrium.solve import out_of_reach, solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
@@ -45,7 +45,7 @@ def pose_size(model: CableModel) -> int:
     return EndConditions.size(model.node) + int(model.in_space)
 
 
-def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None) -> Pose:
+def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None) -> HeldPose:
     """The pose whose numbers are laid out as dlo_pose; what is not held is left out."""
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last, turns = np.split(numbers, np.cumsum([d, d, c, c]))
@@ -58,7 +58,7 @@ def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None
         else:
             held[f"{side}_heading"] = float(frame[0])
     both = model.start == model.end == "clamped"
-    return Pose(
+    return HeldPose(
         start=tuple(start.tolist()),
         end=None if model.end == "free" else tuple(end.tolist()),
         turns=float(turns[0]) if model.in_space and both else 0.0,
