@@ -234,7 +234,7 @@ def generate(
         for mark, value in _values(case, prefix, digest).items()
     }
     own = [f"{case.name}_{part}" for part in ("descent", "guesses", "shape")]
-    sources = ("common", case.name, "newton", *own, "shape", "clearance", "interface")
+    sources = ("common", case.name, "newton", *own, "shape", "clearance", "interface", "casadi")
     found = {
         f"{prefix}_solver.h": template("solver.h.in"),
         f"{prefix}_solver.hpp": template("solver.hpp.in"),

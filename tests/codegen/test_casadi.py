@@ -1,0 +1,95 @@
+"""The compiled solver in CasADi: value and Jacobian of `shape_function`, without Python."""
+
+import shutil
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from dlo_casadi.codegen import generate
+from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.effects import Cable, ClampCompliance, ClampRotation
+from dlo_casadi.equilibrium.symbolic import shape_function
+from dlo_casadi.model.cable_model import CableModel
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+STRICT = ("-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+# As dlo_pose, neither end at the origin; quaternions of any length.
+POSES = {
+    "plane": np.array([0.1, 0.2, 0.5, 0.1, 0.3, -0.4]),
+    "space": np.array([0.1, 0.2, 0, 0.5, 0.1, 0.1, 0.1, 0, 0, 1.2, 0.1, 0.2, 0, 0.9, 0]),
+}
+
+
+def cable(where, **options):
+    """Model, parameters and rest strains."""
+    flat = where == "plane"
+    model = CableModel(
+        Cable(0.8, 0.05, 0.005, 0.01, torsional_stiffness=None if flat else 0.008),
+        n=6,
+        element="arc",
+        gravity=(0.0, -9.81) if flat else (0.0, 0.0, -9.81),
+        n_rest=0,
+        **options,
+    )
+    rest = np.zeros((len(model.node.strains), model.chain.n_cells))
+    rest[-1] = 0.5
+    return model, model.nominal + [0.0 if q.log else 0.5 * q.scale for q in model.parameters], rest
+
+
+@pytest.mark.parametrize(
+    ("where", "branch", "options"),
+    [
+        ("plane", None, {"start": "clamped", "end": "clamped", "effects": (ClampCompliance(),)}),
+        ("plane", "cw", {}),
+        ("space", None, {"start": "clamped", "end": "clamped", "effects": (ClampRotation(),)}),
+    ],
+    ids=["plane, clamps that give way", "plane, a branch", "space"],
+)
+def test_external_is_the_function_and_its_jacobian(tmp_path, where, branch, options):
+    model, p, rest = cable(where, **options)
+    library = compile_library(generate(model, p, rest.ravel(), "wire"), tmp_path, STRICT)
+    name = f"wire_cable_{branch}" if branch else "wire_cable"
+    external, pose = ca.external(name, str(library)), POSES[where]
+    function = shape_function(model, p, rest.ravel(), branch=branch)
+    names, common = function.name_out(), external.name_out()
+    assert common == [name for name in names if name != "curvature"]
+    known = dict(zip(names, function(pose), strict=True))
+    slopes = dict(zip(names, function.jacobian()(pose, *function(pose)), strict=True))
+    found = external(pose)
+    for name, value, slope in zip(common, found, external.jacobian()(pose, *found), strict=True):
+        np.testing.assert_allclose(np.array(value), np.array(known[name]), atol=1e-9)
+        expected = np.array(slopes[name])
+        scale = max(float(np.abs(expected).max()), 1.0)
+        np.testing.assert_allclose(np.array(slope), expected, atol=1e-8 * scale)
+    again = ca.Function.deserialize(external.serialize())
+    np.testing.assert_array_equal(np.array(again(pose)[0]), np.array(found[0]))
+
+    far = pose.copy()
+    far[model.node.dimension] = 2.0
+    *outs, status = external(far)
+    *slopes_far, of_status = external.jacobian()(far, *outs, status)
+    assert status == 1
+    assert all(np.isnan(np.array(out)).all() for out in (*outs, *slopes_far))
+    assert not np.array(of_status).any()
+
+
+def test_an_optimiser_needs_no_python(tmp_path):
+    """The same optimum as of `shape_function`, with an approximate Hessian."""
+    model, p, rest = cable("plane", start="clamped", end="clamped")
+    library = compile_library(generate(model, p, rest.ravel()), tmp_path, STRICT)
+    options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+    ends = []
+    for function, hessian in (
+        (ca.external("dlo_cable", str(library)), "limited-memory"),
+        (shape_function(model, p, rest.ravel()), "exact"),
+    ):
+        end = ca.MX.sym("end", 2)
+        energy = function(ca.vertcat(0, 0, end, 0.3, -0.4))[3]
+        problem = {"x": end, "f": energy, "g": ca.sumsqr(end)}
+        solver = ca.nlpsol(
+            "solver", "ipopt", problem, options | {"ipopt.hessian_approximation": hessian}
+        )
+        ends.append(np.array(solver(x0=[0.3, -0.4], lbg=0.25, ubg=0.25)["x"]).ravel())
+        assert solver.stats()["success"]
+    np.testing.assert_allclose(*ends, atol=1e-6)
