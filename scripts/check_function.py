@@ -1,4 +1,4 @@
-"""Values and derivatives of `shape_function` with every effect, in the plane and in space.
+"""Values and derivatives of `CasadiCable.function` with every effect, in the plane and in space.
 
     python scripts/check_function.py [EFFECT ...]
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.effects import EFFECTS, BoundaryEffect, CableData, Effect
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.symbolic import pose_of, shape_function
+from dlo_casadi.equilibrium.symbolic import CasadiCable, pose_of
 from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
@@ -65,7 +65,7 @@ def errors(effect: type[Effect] | None, dimension: int) -> tuple[float, ...]:
     (model, p), pose = model_of(effect, dimension), np.array(POSES[dimension])
     rest = np.random.default_rng(1).normal(scale=0.5, size=model.chain.n_rests)
     rest[: -model.chain.n_cells * len(model.node.curvatures)] = 0.0
-    function = shape_function(model, p, rest, parameters=True)
+    function = CasadiCable(model, p, rest).function(parameters=True)
     eq = solve_equilibrium(model, p, rest, pose_of(model, pose))
     told = dict(zip(function.name_out(), map(np.array, function(pose, p)), strict=True))
     pairs = [

@@ -18,7 +18,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.equilibrium import NEARBY
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.symbolic import equations, initial, pose_of, shape_function
+from dlo_casadi.equilibrium.symbolic import CasadiCable, pose_of
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 
@@ -64,7 +64,7 @@ def along(function, at, direction, step):
 @BOTH
 def test_values_and_both_derivatives_with_an_effect_of_each_kind(in_space):
     (model, p, rest), pose = cable(in_space), POSES[in_space]
-    function = shape_function(model, p, rest, parameters=True)
+    function = CasadiCable(model, p, rest).function(parameters=True)
     found = dict(zip(function.name_out(), map(np.array, function(pose, p)), strict=True))
     known = solve_equilibrium(model, p, rest, pose_of(model, pose))
     assert found["status"] == 0
@@ -90,7 +90,7 @@ def test_values_and_both_derivatives_with_an_effect_of_each_kind(in_space):
 @BOTH
 def test_what_has_no_equilibrium_is_nan_with_its_derivatives_and_raises_nothing(in_space):
     model, p, rest = cable(in_space, plain=True)
-    function = shape_function(model, p, rest)
+    function = CasadiCable(model, p, rest).function()
     slopes = function.jacobian()
     far, lost = POSES[in_space].copy(), POSES[in_space].copy()
     far[model.node.dimension], lost[0] = 2.0, np.nan
@@ -105,7 +105,7 @@ def test_what_has_no_equilibrium_is_nan_with_its_derivatives_and_raises_nothing(
 
 def test_a_joint_at_its_bound_is_no_root_of_the_equations():
     model = CableModel(CableData(0.8, 0.05, 0.005, 1e-4), n=4, element="link", n_rest=0)
-    function = shape_function(model, model.nominal, np.zeros(model.chain.n_rests))
+    function = CasadiCable(model, model.nominal, np.zeros(model.chain.n_rests)).function()
     pose = np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0])
     found = solve_equilibrium(
         model, model.nominal, np.zeros(model.chain.n_rests), pose_of(model, pose)
@@ -119,7 +119,8 @@ def test_the_branch_asked_for():
     model = CableModel(CableData(0.8, 0.05, 0.005, 0.01), n=6, n_rest=0)
     rest, pose = np.zeros(model.chain.n_rests), np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
     for branch, sign in (("ccw", -1), ("cw", 1)):
-        points = np.array(shape_function(model, model.nominal, rest, branch=branch)(pose)[0])
+        function = CasadiCable(model, model.nominal, rest).function(branch=branch)
+        points = np.array(function(pose)[0])
         assert sign * points[1, 3] > 0.1
 
 
@@ -127,7 +128,7 @@ def test_a_cable_between_ball_joints_may_roll_and_has_derivatives_all_the_same()
     model = CableModel(
         CableData(0.8, 0.05, 0.005, 0.01, torsional_stiffness=0.008), n=6, gravity=(0.0, 0.0, -9.81)
     )
-    function = shape_function(model, model.nominal, np.zeros(model.chain.n_rests))
+    function = CasadiCable(model, model.nominal, np.zeros(model.chain.n_rests)).function()
     u = ca.MX.sym("u", 15)
     energy = ca.Function("energy", [u], [*ca.hessian(function(u)[3], u), function(u)[1]])
     pose = np.concatenate([SPACE[:6], np.zeros(9)])  # orientations of pins are ignored
@@ -141,7 +142,7 @@ def test_a_cable_between_ball_joints_may_roll_and_has_derivatives_all_the_same()
 def test_mapped_and_optimised_beside_other_constraints():
     """Where the energy is lowest at a distance, the force on the end is along the chord."""
     model, p, _ = cable(False, plain=True)
-    function = shape_function(model, p, np.zeros(model.chain.n_rests))
+    function = CasadiCable(model, p, np.zeros(model.chain.n_rests)).function()
     several = np.tile(PLANE, (3, 1)) + 0.01 * np.arange(3)[:, None]
     points = np.hstack([np.array(function(pose)[0]) for pose in several])
     np.testing.assert_array_equal(np.array(function.map(3)(several.T)[0]), points)
@@ -162,8 +163,8 @@ def test_mapped_and_optimised_beside_other_constraints():
 @BOTH
 def test_equations_lead_an_optimiser_to_the_same_equilibrium(in_space):
     (model, p, rest), pose = cable(in_space), POSES[in_space]
-    system = equations(model, p, rest)
-    x, multipliers = initial(model, p, rest, pose)
+    system = CasadiCable(model, p, rest).equations()
+    x, multipliers = CasadiCable(model, p, rest).initial(pose)
     there = dict(zip(system.name_out(), system(x, multipliers, pose), strict=True))
     assert float(ca.norm_inf(there["residual"])) < 1e-12
     moved = pose + 0.03 * np.eye(len(pose))[model.node.dimension]
@@ -175,7 +176,7 @@ def test_equations_lead_an_optimiser_to_the_same_equilibrium(in_space):
         x0=np.concatenate([x.ravel("F"), multipliers]), lbg=0, ubg=0
     )
     told = ca.Function("told", [u], found)(solved["x"])
-    expected = shape_function(model, p, rest)(moved)[:-1]
+    expected = CasadiCable(model, p, rest).function()(moved)[:-1]
     for value, known in zip(told[-len(expected) :], expected, strict=True):
         np.testing.assert_allclose(np.array(value), np.array(known), atol=1e-9)
     assert model.node.same(np.array(solved["x"][: x.size]).reshape(x.T.shape), x.T, NEARBY * 4)
@@ -190,9 +191,9 @@ def test_equations_lead_an_optimiser_to_the_same_equilibrium(in_space):
 )
 def test_what_is_unknown_is_refused(options, words):
     with pytest.raises(DloError, match=words):
-        shape_function(*cable(False, plain=True), **options)
+        CasadiCable(*cable(False, plain=True)).function(**options)
 
 
 def test_a_pose_of_another_size_is_refused():
     with pytest.raises(DloError, match="pose: 6 numbers as in dlo_pose of the C header, found 15"):
-        initial(*cable(False, plain=True), SPACE)
+        CasadiCable(*cable(False, plain=True)).initial(SPACE)

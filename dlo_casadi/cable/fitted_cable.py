@@ -29,9 +29,9 @@ from dlo_casadi.equilibrium.spread import (
     spread_across,
     tipping_of,
 )
+from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
-from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.show.text import html_table, millimetres, vector
 
@@ -42,10 +42,11 @@ _SHOWN = 5e-6
 
 
 @dataclass(frozen=True, eq=False)
-class FittedCable:
+class FittedCable(CasadiCable):
     """A fitted cable: its model with the fitted values, and what is known of their errors.
 
-    From `Result.cable`, or `dlo_casadi.load` of a folder of results.
+    From `Result.cable`, or `dlo_casadi.load` of a folder of results. Its `function` and `equations`
+    are for CasADi problems of one's own.
 
     Parameters
     ----------
@@ -58,9 +59,6 @@ class FittedCable:
     metadata : Metadata
     """
 
-    model: CableModel
-    p: FloatArray
-    rest: FloatArray
     metadata: Metadata
 
     @property

@@ -18,6 +18,7 @@ Griewank and Walther, Evaluating Derivatives, 2008, chapter 15 (implicit functio
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
@@ -67,125 +68,6 @@ def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None
     )
 
 
-def shape_function(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    parameters: bool | Sequence[str] = False,
-    branch: Branch | None = None,
-) -> ca.Function:
-    """The equilibrium as a differentiable CasADi function of the pose.
-
-    (pose) -> (points, end_force, end_moment, energy, min_bend_radius, status), for `ca.Opti`,
-    `ca.nlpsol`, rockit. First and second derivatives are exact.
-
-    Parameters
-    ----------
-    p, rest
-        As in `solve_equilibrium`.
-    parameters : bool or names
-        Whether the model's parameters, or which of them, are a second input: `parameters`, in the
-        order of `model.names` or as named, SI. They replace those in p.
-    branch : "ccw" or "cw", optional
-        In a plane, which way the cable turns; by default it is the stable equilibrium of lowest
-        energy, which may jump from one pose to the next.
-
-    Returns
-    -------
-    casadi.Function
-        pose : as dlo_pose in the C header. In a plane (6,): start, end [m], start heading, end
-        heading [rad]. In space (15,): start, end [m], their quaternions (x, y, z, w), turns; a
-        quaternion may have any length but zero. What the boundary does not hold is ignored.
-        points : (dimension, n + 1) [m], nodes from start to end.
-        end_force : (dimension,) [N] of the cable on whatever holds its end.
-        end_moment : (increment,) [N m] of the cable on its end clamp, world axes; zero at a pin.
-        energy : [J]
-        min_bend_radius : [m], see `Equilibrium`. Its derivative is that of the tightest place, with
-        a kink where that jumps to another place.
-        curvature : (n_cells + 2,) [1/m] at the start, in the middle of all cells and at the end;
-        the largest is 1 / min_bend_radius. An optimiser bounds these, which have no kinks.
-        status : 0 for a stable equilibrium; all other outputs and their derivatives are NaN unless
-        it is 0. Else the number of the reason in dlo_status of the C header: 1 out of reach, 2 none
-        found, 3 a number is not finite, 4 none that is stable.
-
-    Raises
-    ------
-    DloError
-        If a parameter or the branch is unknown. The function itself raises nothing.
-
-    Notes
-    -----
-    It can be mapped (`.map(n)`) and embedded, and lives as long as the process: CasADi's graphs do
-    not keep Python's objects alive. For the same reason it is not serialised; the generated C is,
-    by `casadi.external`.
-    """
-    if branch is not None and (model.in_space or branch not in SIGNS):
-        raise DloError(f"branch must be 'ccw' or 'cw', in a plane, or None, found {branch!r}")
-    inputs, known = _inputs(model, p, parameters)
-    pose = inputs["pose"]
-    x, multipliers, status, there = _search(model, rest.tobytes(), branch)(pose, known)
-    x, multipliers = _chord(model, rest)(x, multipliers, pose, known)
-    symbols = _symbols(model, rest, x, multipliers, pose, known)
-    outputs = {name: there * out for name, out in _outputs(model, symbols).items()}
-    return _function("cable", inputs, outputs | {"status": status})
-
-
-def equations(
-    model: CableModel, p: FloatArray, rest: FloatArray, parameters: bool | Sequence[str] = False
-) -> ca.Function:
-    """The equations of an equilibrium, for transcribing poses in an optimiser of one's own.
-
-    (x, multipliers, pose) -> (residual, energy, points, ...): every stationary point of the energy,
-    stable or not, is a root. There are as many equations as unknowns; `initial` gives a first guess
-    of these. Bounds are not needed: neighbouring headings differ by less than pi/2, components of
-    quaternions lie in [-1, 1].
-
-    Parameters
-    ----------
-    p, rest, parameters
-        As in `shape_function`.
-
-    Returns
-    -------
-    casadi.Function
-        x : (coordinates, n_nodes), in a plane headings [rad], in space quaternions (x, y, z, w).
-        multipliers : (n_border,), see `CableModel.border_names`: of the end conditions [N, N m],
-        then places [m] and multipliers [N] of springs.
-        pose : as in `shape_function`.
-        residual : all equations in one column: `balance`, `conditions` and `lengths`.
-        balance : (increment, n_nodes) [N m], moments at the nodes.
-        conditions : (n_border,), names as of the multipliers: of the end position [m], of clamps
-        [rad], of springs [m, N].
-        lengths : (n_nodes,) squares of the quaternions' lengths less one; empty in a plane.
-        points, end_force, end_moment, energy, min_bend_radius, curvature : as in `shape_function`,
-        where the residual is zero.
-
-    Raises
-    ------
-    DloError
-        If a parameter is unknown.
-    """
-    inputs, known = _inputs(model, p, parameters)
-    count, b = model.chain.n_nodes, model.node.increment
-    x = ca.MX.sym("x", model.node.coordinates, count)
-    multipliers = ca.MX.sym("multipliers", model.n_border)
-    squares = ca.sum1(x**2).T
-    unit = x / ca.repmat(ca.sqrt(squares).T, 4, 1) if model.in_space else x
-    symbols = _symbols(model, rest, unit, multipliers, inputs["pose"], known)
-    forces, conditions = ca.vertsplit(
-        balance(model, symbols), [0, b * count, b * count + model.n_border]
-    )
-    lengths = squares - 1 if model.in_space else ca.MX(0, 1)
-    outputs = {
-        "residual": ca.vertcat(forces, conditions, lengths),
-        "balance": ca.reshape(forces, b, count),
-        "conditions": conditions,
-        "lengths": lengths,
-    }
-    inputs = {"x": x, "multipliers": multipliers, **inputs}
-    return _function("equations", inputs, outputs | _outputs(model, symbols))
-
-
 class Unknowns(NamedTuple):
     """Unknowns of the equations of one pose: `x` (coordinates, n_nodes), `multipliers`."""
 
@@ -193,26 +75,174 @@ class Unknowns(NamedTuple):
     multipliers: FloatArray
 
 
-def initial(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    pose: ArrayLike,
-    branch: Branch | None = None,
-) -> Unknowns:
-    """Unknowns of `equations` at the stable equilibrium of a pose, laid out as there.
+@dataclass(frozen=True, eq=False)
+class CasadiCable:
+    """A cable whose parameters have values, for CasADi problems of one's own.
 
-    Raises
-    ------
-    EquilibriumError
-        If the pose has no equilibrium.
+    Parameters
+    ----------
+    model : CableModel
+    p : (n_parameters,)
+        In the order of `model.names` (SI).
+    rest : (n_rests,) [1/m]
+        Rest strains of the cells: `model.rest_basis @ coefficients`.
     """
-    numbers = np.asarray(pose, float).ravel()
-    if len(numbers) != pose_size(model):
-        size = counted(pose_size(model), "number")
-        raise DloError(f"pose: {size} as in dlo_pose of the C header, found {len(numbers)}")
-    found = solve_equilibrium(model, p, rest, pose_of(model, numbers, branch))
-    return Unknowns(found.x.T, found.multipliers)
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+
+    def function(
+        self, *, parameters: bool | Sequence[str] = False, branch: Branch | None = None
+    ) -> ca.Function:
+        """The shape as a differentiable function of the pose, for CasADi problems of one's own.
+
+        (pose[, parameters]) -> (points, end_force, end_moment, energy, min_bend_radius, curvature,
+        status), with exact first and second derivatives: for `ca.Opti` with IPOPT, `.map(n)`, any
+        graph. The result is the stable equilibrium of lowest energy, which may jump from one pose
+        to the next, unless `branch` or the pose's turns name one.
+
+        Parameters
+        ----------
+        parameters : bool or sequence of str
+            Whether the model's parameters, or those of them with these names, are a second input
+            `parameters` (SI), in the order of `model.names` or of the names, in place of the fitted
+            values.
+        branch : "ccw" or "cw", optional
+            In a plane, which way the cable turns from start to end.
+
+        Returns
+        -------
+        casadi.Function
+            pose : as dlo_pose in the C header. In a plane (6,): start x, y, end x, y [m], start
+            heading, end heading [rad]. In space (15,): start, end [m], their quaternions (x, y, z,
+            w) of any length but zero, turns. What the boundary does not hold is ignored.
+
+            points : (d, n + 1) [m], element boundaries from start to end.
+            end_force : (d,) [N] of the cable on whatever holds its end.
+            end_moment : (1,) or (3,) [N m] of the cable on its end clamp, world axes; zero at pins.
+            energy : [J]
+            min_bend_radius : [m]. Where the tightest place jumps along the cable, it has a kink at
+            which IPOPT stalls: as a constraint, bound the curvature instead.
+            curvature : (n_cells + 2,) [1/m], not negative: at the start, in the middle of each cell
+            and at the end. `curvature <= 1 / radius` is `min_bend_radius >= radius`, and smooth.
+            status : 0 for a stable equilibrium; otherwise all other outputs and their derivatives
+            are NaN, and it is the reason, a dlo_status of the C header: 1 out of reach, 2 none
+            found, 3 a number is not finite, 4 none that is stable.
+
+        Raises
+        ------
+        DloError
+            If a parameter or the branch is unknown. The function itself raises nothing.
+
+        Notes
+        -----
+        Derivatives are those of the implicit function theorem, see the module. The
+        search runs in Python, so that the function cannot be serialised and lives until the
+        process ends; the generated C can, see `casadi.external` in its header.
+        """
+        if branch is not None and (self.model.in_space or branch not in SIGNS):
+            raise DloError(f"branch must be 'ccw' or 'cw', in a plane, or None, found {branch!r}")
+        inputs, p = self._inputs(parameters)
+        pose = inputs["pose"]
+        search = _search(self.model, self.rest.tobytes(), branch)
+        x, multipliers, status, there = search(pose, p)
+        x, multipliers = _chord(self.model, self.rest)(x, multipliers, pose, p)
+        symbols = _symbols(self.model, self.rest, x, multipliers, pose, p)
+        outputs = {name: there * out for name, out in _outputs(self.model, symbols).items()}
+        return _function("cable", inputs, outputs | {"status": status})
+
+    def equations(self, *, parameters: bool | Sequence[str] = False) -> ca.Function:
+        """The equations of an equilibrium, to transcribe many poses in one problem of one's own.
+
+        (x, multipliers, pose[, parameters]) -> (residual, balance, conditions, lengths, points,
+        ...): as many equations as unknowns, every stationary point of the energy a root, stable or
+        not. `initial` gives a first guess. The unknowns need no bounds.
+
+        Parameters
+        ----------
+        parameters : bool or sequence of str
+            As in `function`.
+
+        Returns
+        -------
+        casadi.Function
+            x : (1, n_nodes) headings [rad], in space (4, n_nodes) quaternions (x, y, z, w).
+            multipliers : (n_border,), named by `model.border_names`: of the end conditions [N,
+            N m]; of springs their places [m] and multipliers [N].
+            pose : as in `function`.
+
+            residual : (n_equations,), the next three in one column.
+            balance : (1 or 3, n_nodes) [N m], of moments at the nodes.
+            conditions : (n_border,), named as the multipliers: end position [m], clamps [rad].
+            lengths : (n_nodes,) squares of the quaternions' lengths less one; (0,) in a plane.
+            points, end_force, end_moment, energy, min_bend_radius, curvature : as of `function`,
+            true where the residual is zero.
+
+        Raises
+        ------
+        DloError
+            If a parameter is unknown.
+
+        Notes
+        -----
+        Between ball joints in space a cable that is straight at rest may roll about its axis: the
+        equations are then singular.
+        """
+        (inputs, p), node, k = self._inputs(parameters), self.model.node, self.model.n_border
+        x = ca.MX.sym("x", node.coordinates, self.model.chain.n_nodes)
+        multipliers = ca.MX.sym("multipliers", k)
+        unit, lengths = x, ca.MX(0, 1)
+        if self.model.in_space:
+            squares = ca.sum1(x**2)
+            unit, lengths = x / ca.repmat(ca.sqrt(squares), node.coordinates, 1), squares.T - 1
+        symbols = _symbols(self.model, self.rest, unit, multipliers, inputs["pose"], p)
+        rows = balance(self.model, symbols)
+        outputs = {
+            "residual": ca.vertcat(rows, lengths),
+            "balance": ca.reshape(rows[: rows.numel() - k], node.increment, -1),
+            "conditions": rows[rows.numel() - k :],
+            "lengths": lengths,
+        }
+        inputs = {"x": x, "multipliers": multipliers, **inputs}
+        return _function("equations", inputs, outputs | _outputs(self.model, symbols))
+
+    def initial(self, pose: ArrayLike, *, branch: Branch | None = None) -> Unknowns:
+        """Unknowns `x`, `multipliers` of `equations` at the stable equilibrium of a pose.
+
+        Parameters
+        ----------
+        pose : (6,) or (15,)
+            As of `function`.
+        branch : "ccw" or "cw", optional
+            In a plane, which way the cable turns from start to end.
+
+        Raises
+        ------
+        EquilibriumError
+            If the pose has no equilibrium.
+        DloError
+            If it has another number of numbers.
+        """
+        numbers = np.asarray(pose, float).ravel()
+        if len(numbers) != pose_size(self.model):
+            size = counted(pose_size(self.model), "number")
+            raise DloError(f"pose: {size} as in dlo_pose of the C header, found {len(numbers)}")
+        held = pose_of(self.model, numbers, branch)
+        found = solve_equilibrium(self.model, self.p, self.rest, held)
+        return Unknowns(found.x.T, found.multipliers)
+
+    def _inputs(self, parameters: bool | Sequence[str]) -> tuple[dict[str, Any], Any]:
+        """Symbols of the pose and of the parameters asked for, and all parameters."""
+        known = self.model.names
+        names = known if parameters is True else tuple(parameters or ())
+        for name in names:
+            if name not in known:
+                raise DloError(f"no parameter {name!r}; there are {', '.join(known)}")
+        pose, own = ca.MX.sym("pose", pose_size(self.model)), ca.MX.sym("parameters", len(names))
+        p = ca.MX(ca.DM(self.p))
+        p[[known.index(name) for name in names]] = own
+        return {"pose": pose} | ({"parameters": own} if names else {}), p
 
 
 # ---- expressions ---------------------------------------------------------------------------------
@@ -222,20 +252,6 @@ def _function(name: str, inputs: dict[str, Any], outputs: dict[str, Any]) -> ca.
     return ca.Function(
         name, [*inputs.values()], [*outputs.values()], [*inputs], [*outputs], {"cse": True}
     )
-
-
-def _inputs(
-    model: CableModel, p: FloatArray, parameters: bool | Sequence[str]
-) -> tuple[dict[str, Any], Any]:
-    """Symbols of the pose and of the parameters asked for, and all parameters."""
-    names = model.names if parameters is True else tuple(parameters or ())
-    for name in names:
-        if name not in model.names:
-            raise DloError(f"no parameter {name!r}; there are {', '.join(model.names)}")
-    pose, own = ca.MX.sym("pose", pose_size(model)), ca.MX.sym("parameters", len(names))
-    known = ca.MX(ca.DM(p))
-    known[[model.names.index(name) for name in names]] = own
-    return {"pose": pose} | ({"parameters": own} if names else {}), known
 
 
 def _symbols(

@@ -1,4 +1,4 @@
-"""The compiled solver in CasADi: value and Jacobian of `shape_function`, without Python."""
+"""The compiled solver in CasADi: value and Jacobian of `CasadiCable.function`, without Python."""
 
 import shutil
 
@@ -8,8 +8,8 @@ import pytest
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.compiled import compile_library
-from dlo_casadi.effects import Cable, ClampCompliance, ClampRotation
-from dlo_casadi.equilibrium.symbolic import shape_function
+from dlo_casadi.effects import CableData, ClampCompliance, ClampRotation
+from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
@@ -25,7 +25,7 @@ def cable(where, **options):
     """Model, parameters and rest strains."""
     flat = where == "plane"
     model = CableModel(
-        Cable(0.8, 0.05, 0.005, 0.01, torsional_stiffness=None if flat else 0.008),
+        CableData(0.8, 0.05, 0.005, 0.01, torsional_stiffness=None if flat else 0.008),
         n=6,
         element="arc",
         gravity=(0.0, -9.81) if flat else (0.0, 0.0, -9.81),
@@ -51,7 +51,7 @@ def test_external_is_the_function_and_its_jacobian(tmp_path, where, branch, opti
     library = compile_library(generate(model, p, rest.ravel(), "wire"), tmp_path, STRICT)
     name = f"wire_cable_{branch}" if branch else "wire_cable"
     external, pose = ca.external(name, str(library)), POSES[where]
-    function = shape_function(model, p, rest.ravel(), branch=branch)
+    function = CasadiCable(model, p, rest.ravel()).function(branch=branch)
     names, common = function.name_out(), external.name_out()
     assert common == [name for name in names if name != "curvature"]
     known = dict(zip(names, function(pose), strict=True))
@@ -75,14 +75,14 @@ def test_external_is_the_function_and_its_jacobian(tmp_path, where, branch, opti
 
 
 def test_an_optimiser_needs_no_python(tmp_path):
-    """The same optimum as of `shape_function`, with an approximate Hessian."""
+    """The same optimum as of `CasadiCable.function`, with an approximate Hessian."""
     model, p, rest = cable("plane", start="clamped", end="clamped")
     library = compile_library(generate(model, p, rest.ravel()), tmp_path, STRICT)
     options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
     ends = []
     for function, hessian in (
         (ca.external("dlo_cable", str(library)), "limited-memory"),
-        (shape_function(model, p, rest.ravel()), "exact"),
+        (CasadiCable(model, p, rest.ravel()).function(), "exact"),
     ):
         end = ca.MX.sym("end", 2)
         energy = function(ca.vertcat(0, 0, end, 0.3, -0.4))[3]
