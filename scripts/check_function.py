@@ -4,13 +4,21 @@
 
 For each effect, at values away from those at which it vanishes: the outputs against
 `solve_equilibrium`, their Jacobian, and the Hessian of a random sum of them, against differences of
-fourth order, by all numbers of the pose and by all parameters. Exit code 1 above 1e-9, 1e-6, 1e-5.
+fourth order, by all numbers of the pose and by all parameters. Without names also: where to hold
+the end of a cable in space so that it pulls least and bends no tighter than 50 mm, from ten starts,
+against a grid of shapes; and the time of `casadi.external` beside that of the bare C. Exit code 1
+above 1e-9, 1e-6, 1e-5, 40 iterations, or 1.3 times the bare C.
 """
 
 import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from ctypes import CDLL, c_size_t, c_void_p
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -18,6 +26,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from dlo_casadi.codegen import CompiledSolver, generate
+from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.effects import EFFECTS, BoundaryEffect, CableData, Effect
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.symbolic import CasadiCable, pose_of
@@ -25,6 +35,7 @@ from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]
 
+GRAVITY, SQRT_HALF = (0.0, 0.0, -9.81), 0.5**0.5
 # Largest error of values, and of first and second derivatives relative to the largest of them.
 MOST = (1e-9, 1e-6, 1e-5)
 POSES = {
@@ -42,7 +53,7 @@ def model_of(effect: type[Effect] | None, dimension: int) -> tuple[CableModel, F
         n=10,
         start="clamped" if held else "pinned",
         end="clamped" if held else "pinned",
-        gravity=(0.0, -9.81) if dimension == 2 else (0.0, 0.0, -9.81),
+        gravity=(0.0, -9.81) if dimension == 2 else GRAVITY,
         effects=() if effect is None else (effect(),),
         n_rest=0,
     )
@@ -89,6 +100,73 @@ def errors(effect: type[Effect] | None, dimension: int) -> tuple[float, ...]:
     return tuple(found)
 
 
+def held_best(starts: int = 10) -> bool:
+    """Example hold_the_end in space: whether all starts lead to one end, no worse than a grid's."""
+    data = CableData(0.5, 0.015, 0.003, 2e-5, torsional_stiffness=1.5e-5)
+    model = CableModel(data, n=20, start="clamped", end="clamped", gravity=GRAVITY, n_rest=0)
+    cable = CasadiCable(model, model.nominal, np.zeros(model.chain.n_rests))
+    low, high, radius = np.array([0.03, -0.1, 0.0]), np.array([0.3, 0.1, 0.1]), 0.05
+    down, up = [0.0, SQRT_HALF, 0.0, SQRT_HALF], [0.1, -SQRT_HALF, 0.2, SQRT_HALF]
+    shape, found = cable.function(), []
+    for first in np.random.default_rng(0).uniform(low, high, (starts, 3)):
+        problem = ca.Opti()
+        end = problem.variable(3)
+        there = shape.convert_out(shape(ca.vertcat(0, 0, 0, end, down, up, 0)))
+        pull = ca.norm_2(there["end_force"])
+        problem.minimize(pull)
+        problem.subject_to(there["curvature"] <= 1 / radius)
+        problem.subject_to(problem.bounded(low, end, high))
+        problem.set_initial(end, first)
+        problem.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes"})
+        begun = perf_counter()
+        done = problem.solve()
+        found.append([*done.value(end), done.value(pull), done.stats()["iter_count"]])
+        numbers = ", ".join(f"{number:.6f}" for number in found[-1][:3])
+        print(
+            f"end ({numbers}) m, pull {found[-1][3]:.7f} N, {found[-1][4]:.0f} iterations, "
+            f"{perf_counter() - begun:.1f} s",
+            flush=True,
+        )
+    ends, pulls, counts = np.split(np.array(found), [3, 4], axis=1)
+    grid = np.stack(np.meshgrid(*map(np.linspace, low, high, (28, 21, 11))), axis=-1).reshape(-1, 3)
+    still = np.tile([*down, *up, 0.0], (len(grid), 1))
+    solver = CompiledSolver(model, cable.p, cable.rest)
+    shapes, statuses = solver.solve_many(np.hstack([np.zeros_like(grid), grid, still]))
+    allowed = (statuses == 0) & (shapes["min_bend_radius"] >= radius)
+    best = float(np.linalg.norm(shapes["end_force"][allowed], axis=1).min())
+    print(f"lowest pull of {allowed.sum()} of {len(grid)} shapes of a grid: {best:.7f} N")
+    same = np.ptp(ends, axis=0).max() < 1e-4 and np.ptp(pulls) < 1e-7
+    return bool(same and counts.max() <= 40 and pulls.max() <= best)
+
+
+def slowdown(dimension: int, calls: int = 3000) -> float:
+    """Median time of a call by `casadi.external`, through buffers, over that of the bare C."""
+    model, p = model_of(None, dimension)
+    rest, pose = np.zeros(model.chain.n_rests), np.array(POSES[dimension])
+    with TemporaryDirectory() as folder:
+        library = compile_library(generate(model, p, rest), Path(folder))
+        bare, workspace = CDLL(str(library)).dlo_solve, generate(model, p, rest).workspace
+        function = ca.external("dlo_cable", str(library))
+    work, shape = np.zeros(workspace), np.zeros(100 * workspace)
+    places = [c_void_p(array.ctypes.data) for array in (pose, shape, work)]
+    buffer: Any
+    buffer, run = function.buffer()
+    buffer.set_arg(0, memoryview(pose))
+    outs = [np.zeros(function.nnz_out(k)) for k in range(function.n_out())]
+    for k, out in enumerate(outs):
+        buffer.set_res(k, memoryview(out))
+    times = []
+    for _ in range(calls):
+        begun = perf_counter()
+        bare(places[0], 0, None, places[1], places[2], c_size_t(workspace))
+        between = perf_counter()
+        run()
+        times.append((between - begun, perf_counter() - between))
+    alone, inside = np.median(times, axis=0)
+    print(f"{dimension}D: C {1e6 * alone:.1f} us, by casadi.external {1e6 * inside:.1f} us")
+    return float(inside / alone)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Print a line for each effect."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -106,6 +184,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             texts = "  ".join(f"{error:.1e}" for error in found)
             where = {2: "plane", 3: "space"}[dimension]
             print(f"{name:22s} {where}  {texts}{'  BAD' * wrong}", flush=True)
+    if not asked:
+        bad |= not held_best()
+        bad |= max(map(slowdown, (2, 3))) > 1.3
     return int(bad)
 
 

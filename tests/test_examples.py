@@ -1,0 +1,39 @@
+"""Scripts in scripts/examples: what they claim, in less time than they take themselves."""
+
+import importlib.util
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "scripts" / "examples"
+
+
+def example(name):
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_examples_are_short():
+    long = [f.name for f in EXAMPLES.glob("*.py") if len(f.read_text().splitlines()) >= 80]
+    assert long == []
+
+
+def test_the_end_is_held_best_from_any_side_and_against_other_places():
+    script = example("hold_the_end")
+    shape, (low, high) = script.cable().function(), np.array([script.LOW, script.HIGH])
+    ends, pulls, counts = zip(
+        *(script.best_end(shape, first) for first in ([0.05, 0.01], [0.28, 0.18])), strict=True
+    )
+    np.testing.assert_allclose(*ends, atol=1e-5)
+    assert max(counts) <= 40
+    for x, y in np.random.default_rng(0).uniform(low, high, (30, 2)):
+        found = shape.convert_out(shape([0, 0, x, y, script.DOWN, script.UP]))
+        if float(found["min_bend_radius"]) >= script.RADIUS:
+            assert float(ca.norm_2(found["end_force"])) > pulls[0]
+    at = shape.convert_out(shape([0, 0, *ends[0], script.DOWN, script.UP]))
+    assert float(at["min_bend_radius"]) == pytest.approx(script.RADIUS, rel=1e-4)
