@@ -145,6 +145,7 @@ class ParametersFile(OpenSection):
     covariance: Annotated[_Covariance, checked(lambda found: found.complaint)]
     scatter: _Scatter | None = None
     fixtures: dict[str, Any] | None = None
+    explains: bool | None = None
     model_hash: Name
     config: Name | None = None
     versions: dict[str, Any] | None = None
@@ -285,6 +286,7 @@ def metadata_of(document: dict[str, Any], source: Path) -> Metadata:
         fixtures=file.fixtures or {},
         identifiable=stiffness.identifiable,
         interval_95=stiffness.interval_95,
+        explains=file.explains,
         model_hash=file.model_hash,
         edited=parameters_hash(document) != file.model_hash,
         config=str(file.config),

@@ -32,6 +32,8 @@ class Metadata:
         Whether the shapes determine the bending stiffness.
     interval_95 : (float or None, float or None) or None [N m^2]
         Of the bending stiffness; None in it = unbounded.
+    explains : bool or None
+        Whether the model explains the shapes it was fitted to; None where that was not judged.
     model_hash : str
         As written; see `parameters_hash`.
     edited : bool
@@ -52,6 +54,7 @@ class Metadata:
     fixtures: dict[str, Any]
     identifiable: bool | None
     interval_95: tuple[float | None, float | None] | None
+    explains: bool | None
     model_hash: str
     edited: bool
     config: str

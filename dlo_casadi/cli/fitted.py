@@ -83,6 +83,11 @@ def predict(chosen: argparse.Namespace) -> None:
     notes = []
     if shape.cable.metadata.edited:
         notes.append("note: the model in this file was changed after it had been fitted")
+    if shape.cable.metadata.explains is False:
+        notes.append(
+            "note: the model does not explain the shapes it was fitted to (verdict: unexplained); "
+            "the prediction may be farther off than its band"
+        )
     if shape.cable.metadata.identifiable is False:
         notes.append(
             "note: the shapes did not determine the bending stiffness; the shape is more certain "

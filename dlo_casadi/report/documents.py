@@ -130,7 +130,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
         curvature = {"s": rest.s, **own}
     kept = ("value", "std", "unit", "interval_95", "identifiable")
     return {
-        **fields_of(stage, "name", "rmse_fit", "rmse_held_out"),
+        **fields_of(stage, "name", "explains", "rmse_fit", "rmse_held_out"),
         "force_rmse_fit": stage.readings_fit.force,
         "force_rmse_held_out": stage.readings_held_out.force,
         "moment_rmse_fit": stage.readings_fit.moment,
@@ -238,6 +238,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
             }
     if config.cable.youngs_modulus is not None:
         document["cable"]["youngs_modulus"] = config.cable.youngs_modulus
+    document["explains"] = outcome.stages[-1].explains
     document["fixtures"] = shared_fixtures(config)
     document["model_hash"] = parameters_hash(document)
     document["config"] = config.name

@@ -94,7 +94,7 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         after = shown[-1].stage
         stiffness = after.parameters.get("bending_stiffness")
         if stiffness is not None:
-            value, interval, remark = tables.describe(stiffness)
+            value, interval, remark = tables.describe(stiffness, after.explains)
             rows.append(("bending stiffness", value, f"95 %: {interval}" if interval else remark))
         role, key = "held-out poses", "rmse_held_out"
         if after.rmse_held_out is None:
@@ -144,7 +144,9 @@ def parameter_rows(outcome: Outcome) -> list[dict[str, str]]:
     for name, value, interval, remark in tables.fitted_rows(outcome):
         found = outcome.stages[-1].parameters[name]
         doubt = "unknown" if found.identifiable is False else "bound" if found.at_bound else ""
-        rows.append((name, value, interval or symmetric_interval(found), remark, doubt))
+        if outcome.stages[-1].explains is not False:
+            interval = interval or symmetric_interval(found)
+        rows.append((name, value, interval, remark, doubt))
     rows += [(*row, "") for row in tables.rest_rows(outcome)]
     return [dict(zip(keys, row, strict=True)) for row in rows]
 

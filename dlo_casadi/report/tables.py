@@ -14,8 +14,16 @@ from dlo_casadi.show.text import html_table
 Row = tuple[str, str, str, str]
 
 
-def describe(estimate: ParameterEstimate) -> tuple[str, str, str]:
-    """Value, interval and remark: no number where the data do not tell one."""
+NO_FIT = "of a model that does not fit"
+
+
+def describe(estimate: ParameterEstimate, explains: bool | None = None) -> tuple[str, str, str]:
+    """Value, interval and remark: no number where the data do not tell one.
+
+    `explains`: of the stage; without a model that fits there is neither std nor interval.
+    """
+    if explains is False:
+        return (f"{estimate.value:.4g}{_after(estimate.unit)}", "", NO_FIT)
     if estimate.identifiable is False:
         return (unidentified(estimate), "", "not identifiable from these shapes")
     unit, interval = _after(estimate.unit), ""
@@ -39,7 +47,8 @@ def unidentified(estimate: ParameterEstimate) -> str:
 
 def fitted_rows(outcome: Outcome) -> list[Row]:
     """Parameters of the last stage."""
-    return [(name, *describe(found)) for name, found in outcome.stages[-1].parameters.items()]
+    stage = outcome.stages[-1]
+    return [(name, *describe(x, stage.explains)) for name, x in stage.parameters.items()]
 
 
 def rest_rows(outcome: Outcome) -> list[Row]:
@@ -97,6 +106,8 @@ def footnotes(outcome: Outcome) -> list[str]:
     lines, found = [], outcome.stages[-1].parameters
     stiffness, twisting = found.get("bending_stiffness"), found.get("torsional_stiffness")
     gravity = outcome.config.experiment.gravity
+    if outcome.stages[-1].explains is False:
+        return ["The model does not explain what was measured: its numbers have no intervals."]
     if stiffness is not None and stiffness.identifiable is False:
         bound = unidentified(stiffness)
         known = f"EI {bound}" if bound[0] in "<>" else f"EI: {bound}"

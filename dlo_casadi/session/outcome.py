@@ -101,6 +101,9 @@ class Stage:
         Measured held-out poses without a prediction.
     readings_fit, readings_held_out : ReadingErrors
         As rmse_fit and rmse_held_out, of forces and moments on the fixtures.
+    explains : bool or None
+        Whether the model explains what was measured; None where that was not judged. Where it does
+        not, its parameters have no intervals.
     """
 
     name: StageName
@@ -116,6 +119,7 @@ class Stage:
     unpredicted: tuple[str, ...] = ()
     readings_fit: ReadingErrors = ReadingErrors()
     readings_held_out: ReadingErrors = ReadingErrors()
+    explains: bool | None = None
 
     @property
     def other_branch(self) -> dict[str, BranchShape]:

@@ -181,19 +181,31 @@ def fit_session(
 
 def judged(outcome: Outcome) -> Outcome:
     """An outcome with what is said of its fit, and its verdict if that stands."""
-    fit, stages = outcome.fit, outcome.stages
+    fit, stages, verdict = outcome.fit, outcome.stages, outcome.verdict
     doubts = remarks.doubts_of(stages, outcome.poses, fit)
     declared = outcome.config.experiment.measurement.std
     said = remarks.fit_warnings(fit, outcome.discretization.error, declared)
     said += remarks.worse_than_simpler(stages)
     if outcome.hidden_weight is not None:
         said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))
+    if verdict is not None:
+        verdict = "unexplained" if doubts else verdict
+        stages = (*stages[:-1], _told(stages[-1], verdict != "unexplained"))
     return replace(
         outcome,
-        verdict="unexplained" if outcome.verdict and doubts else outcome.verdict,
+        verdict=verdict,
+        stages=stages,
         doubts=doubts,
         warnings=(*outcome.warnings, *said, *remarks.branch_warnings(stages)),
     )
+
+
+def _told(stage: Stage, explains: bool) -> Stage:
+    """A stage of which it is known if its model explains the data: without intervals if not."""
+    found = stage.parameters
+    if not explains:
+        found = {name: replace(estimate, interval_95=None) for name, estimate in found.items()}
+    return replace(stage, parameters=found, explains=explains)
 
 
 def close_the_loop(

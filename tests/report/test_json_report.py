@@ -76,6 +76,7 @@ def test_every_key_of_the_schema_is_there(outcome):
     for entry in report["stages"]:
         assert set(entry) == {
             "name",
+            "explains",
             "rmse_fit",
             "rmse_held_out",
             "force_rmse_fit",

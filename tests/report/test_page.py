@@ -32,6 +32,7 @@ from dlo_casadi.report.photographs import PHOTOGRAPHS, photograph_of
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.tables import stage_rows
 from dlo_casadi.session.outcome import ParameterEstimate
+from dlo_casadi.show import style
 from dlo_casadi.show.text import millimetres
 
 HOSTILE = "<img src=x onerror=alert(1)></script>"
@@ -401,10 +402,10 @@ def luminance(color):
 
 def test_colours_have_a_contrast_of_four_and_a_half():
     """WCAG 2: (L1 + 0.05) / (L2 + 0.05) of the relative luminances."""
-    style = (Path(canvas.__file__).parent / "templates" / "page.css").read_text()
-    of_style = dict(re.findall(r"--([a-z]+): (#[0-9a-f]{6})", style))
+    sheet = (Path(canvas.__file__).parent / "templates" / "page.css").read_text()
+    of_style = dict(re.findall(r"--([a-z]+): (#[0-9a-f]{6})", sheet))
     of_charts = [
-        getattr(canvas, name)
+        getattr(style, name)
         for name in ("BLACK", "GREY", "ORANGE", "BLUE", "GREEN", "VERMILLION", "HELD_OUT")
     ]
     on_paper = [of_style[k] for k in ("ink", "soft", "before", "after", "held", "next", "good")]
