@@ -37,3 +37,19 @@ def test_the_end_is_held_best_from_any_side_and_against_other_places():
             assert float(ca.norm_2(found["end_force"])) > pulls[0]
     at = shape.convert_out(shape([0, 0, *ends[0], script.DOWN, script.UP]))
     assert float(at["min_bend_radius"]) == pytest.approx(script.RADIUS, rel=1e-4)
+
+
+def test_the_end_is_led_past_the_obstacles_with_less_pull_than_on_the_shortest_way():
+    """Six poses instead of twenty, from the same first guess."""
+    script = example("lead_the_end")
+    known = script.cable()
+    best = script.easiest(known, 6)
+    assert np.abs(best["residual"]).max() < 1e-6
+    shape = known.function(branch="ccw")
+    planned = [shape([0, 0, x, y, 0, 0])[1] for x, y in zip(script.X, script.Y, strict=True)]
+    assert best["pulls"].max() <= max(float(ca.norm_2(force)) for force in planned)
+    for end, points in zip(best["ends"].T, np.split(best["points"], 6, axis=1), strict=True):
+        np.testing.assert_allclose(np.array(shape([0, 0, *end, 0, 0])[0]), points, atol=1e-6)
+        for *center, radius in script.DISCS:
+            gaps = np.linalg.norm(points.T - center, axis=1) - radius
+            assert gaps.min() - known.model.cable.diameter / 2 >= script.GAP - 1e-6
