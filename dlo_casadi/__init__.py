@@ -7,14 +7,15 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from dlo_casadi.api import Result as Result
+    from dlo_casadi.api import Session as Session
     from dlo_casadi.api import fit as fit
     from dlo_casadi.api import predict as predict
     from dlo_casadi.cable import FittedCable as FittedCable
     from dlo_casadi.cable import Shape as Shape
     from dlo_casadi.cable import load as load
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
-    from dlo_casadi.config import Config as Config
-    from dlo_casadi.config import load_config as load_config
+    from dlo_casadi.config import Cable as Cable
+    from dlo_casadi.config import Pose as Pose
     from dlo_casadi.effects import EFFECTS as EFFECTS
     from dlo_casadi.errors import ConfigError as ConfigError
     from dlo_casadi.errors import DloError as DloError
@@ -22,19 +23,16 @@ if TYPE_CHECKING:
     from dlo_casadi.errors import EstimationError as EstimationError
     from dlo_casadi.errors import MeasurementError as MeasurementError
     from dlo_casadi.errors import VisionError as VisionError
-    from dlo_casadi.session import Outcome as Outcome
-    from dlo_casadi.session import run_session as run_session
 
 # Module -> its public names. They are imported when they are first asked for, so that the command
 # answers at once and an interrupt finds it ready.
 _PUBLIC = {
-    "api": "Result fit predict",
+    "api": "Result Session fit predict",
     "cable": "FittedCable Shape load",
     "codegen": "CompiledSolver",
-    "config": "Config load_config",
+    "config": "Cable Pose",
     "effects": "EFFECTS",
     "errors": "ConfigError DloError EquilibriumError EstimationError MeasurementError VisionError",
-    "session": "Outcome run_session",
 }
 _HOMES = {name: f"{__name__}.{home}" for home, names in _PUBLIC.items() for name in names.split()}
 

@@ -2,25 +2,27 @@
 
 import dlo_casadi as dlo
 
-result = dlo.fit("configs/cable.yaml")
+result = dlo.fit("configs/cable.yaml")  # or dlo.Session(cable, poses, ...).fit(), from arrays
 print(result)
 result.plot().savefig("poses.png")
 result.cable.solve(end=(0.3, -0.1)).points
 """
 
-import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.cable import FittedCable, Shape, load
-from dlo_casadi.config import Config, load_config
-from dlo_casadi.errors import ConfigError, DloError
+from dlo_casadi.config import Cable, Config, Pose, checked_config, is_photographed, load_as
+from dlo_casadi.config.problems import Arguments
+from dlo_casadi.config.values import plain
+from dlo_casadi.errors import DloError
 from dlo_casadi.report.documents import fitted_cable
 from dlo_casadi.report.figures_poses import outcome_figure
 from dlo_casadi.report.tables import outcome_html, outcome_text
@@ -67,61 +69,162 @@ class Result(Outcome):
         return fitted_cable(self)
 
 
-def fit(
-    config: str | Path | Config,
-    *,
-    diagnosis: bool | None = None,
-    progress: Progress | None = None,
-    executor: Executor | None = None,
-) -> Result:
-    """Fit a cable to its photographs or centre-lines.
+class Session(Config):
+    """A cable, how it was held and what was measured: all that a fit starts from.
+
+    A configuration file makes the same object: `Session.load("session.yaml")`.
 
     Parameters
     ----------
-    config : str, Path or Config
-        A configuration file, or what `load_config` has made of one.
-    diagnosis : bool, optional
-        Whether to search for missing effects; as the configuration says by default.
-    progress : Progress, optional
-        Told how far the run has come: an object with `step(name, done, total)` and
-        `message(text)`.
-    executor : Executor, optional
-        Runs independent tasks at the same time; by default they run in this process. In a script,
-        below `if __name__ == "__main__":`, `with open_executor(2, here=True) as executor` of
-        `dlo_casadi.runtime.parallel` opens one.
+    cable : Cable
+    poses : sequence of Pose
+        In the order in which they were taken.
+    gravity : (d,) [m/s^2]
+        Two numbers put the cable in a plane, three in space.
+    boundary : (str, str)
+        How start and end are held: pinned, clamped, or free (the end alone).
+    std : float [m], optional
+        Standard deviation of one coordinate of a point; estimated when absent.
+    force_std, moment_std : float [N], [N m], optional
+        Of one component of a reading; estimated when absent.
+    camera, board, reference : mapping, optional
+        Of photographs, as in a configuration.
+    tolerances, model, estimation, diagnosis : mapping, optional
+        As in a configuration: `diagnosis={"enabled": False}`.
 
-    Returns
-    -------
-    Result
-        Nothing is written; see `Result.write`.
+    Raises
+    ------
+    ConfigError
+        If the arguments cannot be used; the message lists every problem with the argument's name.
+
+    Examples
+    --------
+    >>> rope = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01)
+    >>> poses = [dlo.Pose((0, 0), (0.5, 0.1), points=points)]  # points (K, 2) [m]
+    >>> dlo.Session(rope, poses, gravity=(0, -9.81), boundary=("pinned", "pinned")).fit()
+    """
+
+    def __init__(
+        self,
+        cable: Cable,
+        poses: Sequence[Pose],
+        *,
+        gravity: ArrayLike,
+        boundary: Sequence[str],
+        std: float | None = None,
+        force_std: float | None = None,
+        moment_std: float | None = None,
+        camera: Mapping[str, Any] | None = None,
+        board: Mapping[str, Any] | None = None,
+        reference: Mapping[str, Any] | None = None,
+        tolerances: Mapping[str, float] | None = None,
+        model: Mapping[str, Any] | None = None,
+        estimation: Mapping[str, Any] | None = None,
+        diagnosis: Mapping[str, Any] | None = None,
+    ) -> None:
+        measurement = _given(std=std, force_std=force_std, moment_std=moment_std)
+        equipment = _given(camera=camera, board=board, reference=reference)
+        pictures = bool(equipment) or any(map(is_photographed, poses))
+        experiment = _given(
+            gravity=gravity,
+            boundary=boundary,
+            measurement={
+                "kind": "images" if pictures else "centerlines",
+                **measurement,
+                **equipment,
+            },
+            tolerances=tolerances,
+            poses=poses,
+        )
+        options = _given(model=model, estimation=estimation, diagnosis=diagnosis)
+        given = plain({"cable": cable, "experiment": experiment, **options})
+        checked = checked_config(Arguments(given), Config)
+        super().__init__(**{name: getattr(checked, name) for name in checked.model_fields_set})
+        self._warnings, self._skipped = checked.warnings, checked.skipped
+
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read and check a configuration file.
+
+        Raises
+        ------
+        ConfigError
+            If the file cannot be used; the message lists every problem with its line.
+        """
+        return load_as(cls, path)
+
+    def fit(
+        self,
+        *,
+        diagnosis: bool | None = None,
+        progress: Progress | None = None,
+        executor: Executor | None = None,
+    ) -> Result:
+        """Fit the cable to what was measured.
+
+        Parameters
+        ----------
+        diagnosis : bool, optional
+            Whether to search for missing effects; as the session says by default.
+        progress : Progress, optional
+            Told how far the run has come: an object with `step(name, done, total)` and
+            `message(text)`.
+        executor : Executor, optional
+            Runs independent tasks at the same time; by default they run in this process. In a
+            script, below `if __name__ == "__main__":`, `with open_executor(2, here=True) as
+            executor` of `dlo_casadi.runtime.parallel` opens one.
+
+        Returns
+        -------
+        Result
+            Nothing is written; see `Result.write`.
+
+        Raises
+        ------
+        DloError
+            If the executor is none.
+        MeasurementError
+            If no pose can be read, or if the lines contradict the session beyond doubt.
+        EstimationError
+            If no model of the declared cable comes near the measured shapes.
+        """
+        if executor is not None and not isinstance(executor, Executor):
+            raise DloError(
+                f"executor={executor!r} is no Executor.\n  Try: with "
+                "dlo_casadi.runtime.parallel.open_executor(2, here=True) as executor: ..."
+            )
+        session = self
+        if diagnosis is not None:
+            options = self.diagnosis.model_copy(update={"enabled": diagnosis})
+            session = self.model_copy(update={"diagnosis": options})
+        return _as(Result, run_session(session, progress, executor))
+
+
+def _given(**values: Any) -> dict[str, Any]:
+    """Those of the arguments that are not None."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def fit(path: str | Path, **options: Any) -> Result:
+    """Fit a cable to its photographs or centre-lines: `Session.load(path).fit(...)`.
+
+    Parameters
+    ----------
+    path : str or Path
+        A configuration file.
+    **options
+        See `Session.fit`.
 
     Raises
     ------
     ConfigError
         If the configuration cannot be used.
-    DloError
-        If the executor is none.
-    MeasurementError
-        If no pose can be read, or if the lines contradict the configuration beyond doubt.
-    EstimationError
-        If no model of the declared cable comes near the measured shapes.
+    DloError, MeasurementError, EstimationError
+        As `Session.fit`.
     """
-    if not isinstance(config, str | os.PathLike | Config):
-        raise ConfigError(
-            f"{config!r} is no configuration.\n"
-            '  Try: the path of a YAML file, such as "configs/cable.yaml".'
-        )
-    if executor is not None and not isinstance(executor, Executor):
-        raise DloError(
-            f"executor={executor!r} is no Executor.\n"
-            "  Try: with dlo_casadi.runtime.parallel.open_executor(2, here=True) as executor: ..."
-        )
-    if not isinstance(config, Config):
-        config = load_config(config)
-    if diagnosis is not None:
-        options = config.diagnosis.model_copy(update={"enabled": diagnosis})
-        config = replace(config, diagnosis=options)
-    return _as(Result, run_session(config, progress, executor))
+    return Session.load(path).fit(**options)
 
 
 def predict(

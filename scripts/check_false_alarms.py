@@ -49,7 +49,6 @@ from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_exe
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.fitting import declared_model, fit_declared
-from dlo_casadi.session.measure import conditions
 from dlo_casadi.session.stages import fit_stage
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -82,7 +81,7 @@ def hanging(config, generator):
         update={"tolerances": config.experiment.tolerances.model_copy(update=known)}
     )
     cable = config.cable.model_copy(update=own)
-    config = replace(config, cable=cable, experiment=experiment)
+    config = config.model_copy(update={"cable": cable, "experiment": experiment})
     model = declared_model(config).model.with_mesh(40)
     p = model.nominal.copy()
     p[0] = stiffness
@@ -126,7 +125,7 @@ def simulate(config, generator):
         s = np.sort(generator.uniform(0.01, 0.99, 200)) * cable.length
         factor = np.linalg.cholesky(noise.covariance(s, np.ones(len(s))))
         points = seen.curve.at(s) + factor @ generator.standard_normal((len(s), 2))
-        own = conditions(pose)
+        own = pose.held
         measured.append(MeasuredPose.of_points(own, points, held_out=pose.role == "held_out"))
     return measured, stiffness
 
@@ -138,7 +137,7 @@ def spatial(config, generator, hidden=None):
     torsion = bending * generator.uniform(0.5, 0.9)
     prior = bending * np.exp(generator.uniform(-0.7, 0.7))
     own = {"length": length, "mass": mass, "bending_stiffness": prior, "torsional_stiffness": None}
-    config = replace(config, cable=config.cable.model_copy(update=own))
+    config = config.model_copy(update={"cable": config.cable.model_copy(update=own)})
     model = declared_model(config).model.with_mesh(24)
     p = model.nominal.copy()
     for k, q in enumerate(model.parameters):
@@ -263,7 +262,7 @@ def run_one(index: int, seed: int, kind: str) -> dict:
     config = load_config(ROOT / "configs" / "markers_in_space.yaml" if space else path)
     plain = config.experiment.measurement.model_copy(update={"std": None})
     experiment = config.experiment.model_copy(update={"measurement": plain})
-    config = replace(config, experiment=experiment)
+    config = config.model_copy(update={"experiment": experiment})
     generator = generator_of(seed, index)
     torsion = np.nan
     if scatter:

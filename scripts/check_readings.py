@@ -45,7 +45,6 @@ from dlo_casadi.io.files import write_file
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model, fit_declared
-from dlo_casadi.session.measure import conditions
 from dlo_casadi.show.style import BLUE, GREY, VERMILLION, save_figure, styled
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -71,7 +70,7 @@ def measured_with(config: Config, readings: tuple[str, ...], number: int) -> Con
         update={"std": STD, "force_std": FORCE_STD, "moment_std": MOMENT_STD}
     )
     update = {"poses": tuple(poses), "measurement": measurement}
-    return replace(config, experiment=config.experiment.model_copy(update=update))
+    return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})
 
 
 def simulate(config: Config, generator, hidden: dict[str, dict[str, float]], factor: float = 1.0):
@@ -97,7 +96,7 @@ def simulate(config: Config, generator, hidden: dict[str, dict[str, float]], fac
         return None
     measured = []
     for pose, seen in zip(config.experiment.poses, found, strict=True):
-        own = conditions(pose)
+        own = pose.held
         s = np.linspace(0.01, 0.99, 60) * cable.length
         points = seen.curve.at(s) + STD * generator.standard_normal((len(s), 2))
         item = MeasuredPose.of_points(own, points, held_out=pose.role == "held_out")
@@ -125,7 +124,7 @@ def load_bench() -> Config:
     config = load_config(ROOT / "configs" / "cable.yaml")
     other = load_config(ROOT / "tests" / "data" / "bench" / "short_clean" / "session.yaml")
     experiment = config.experiment.model_copy(update={"measurement": other.experiment.measurement})
-    return replace(config, experiment=experiment)
+    return config.model_copy(update={"experiment": experiment})
 
 
 def inside(interval, value: float) -> bool:
@@ -155,7 +154,7 @@ def mass(generator) -> dict:
     """A mass that is not declared."""
     config = load_bench()
     unknown = config.cable.model_copy(update={"mass": None})
-    config = measured_with(replace(config, cable=unknown), ("end_force",), 3)
+    config = measured_with(config.model_copy(update={"cable": unknown}), ("end_force",), 3)
     measured, stiffness = drawn(config, generator, factor=1.1)
     fit, _ = fit_declared(config, declared_model(config), measured)
     found = profile_intervals(fit)
@@ -179,12 +178,12 @@ def told(generator, hidden, wrong: str, readings, number: int, held: str, other:
             for pose in config.experiment.poses
         )
         update = {"boundary": boundary, "poses": poses}
-        as_held = replace(config, experiment=config.experiment.model_copy(update=update))
+        as_held = config.model_copy(
+            update={"experiment": config.experiment.model_copy(update=update)}
+        )
         if name == right:
             measured, _ = drawn(as_held, generator, hidden)
-        items = [
-            replace(item, pose=conditions(pose)) for item, pose in zip(measured, poses, strict=True)
-        ]
+        items = [replace(item, pose=pose.held) for item, pose in zip(measured, poses, strict=True)]
         declared = declared_model(as_held)
         effect = EFFECTS[name]
         model = declared.model

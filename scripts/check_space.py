@@ -31,7 +31,6 @@ from dlo_casadi.config import load_config
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.session import run_session
-from dlo_casadi.session.measure import conditions
 from dlo_casadi.session.outcome import Outcome
 
 # Name of a hidden effect in truth.yaml -> that of the program, and true values of its parameters.
@@ -91,7 +90,7 @@ def off_truth(outcome: Outcome, truth: dict[str, Any], folder: Path) -> str:
             for name in ("twist", "k_y", "k_z")
         ]
     )
-    found = predict_poses(model, p, rest, [conditions(x) for x in outcome.config.experiment.poses])
+    found = predict_poses(model, p, rest, [x.held for x in outcome.config.experiment.poses])
     s = np.linspace(0.0, model.cable.length, 201)
     ideal = {
         item.name: apart(one.curve.at(s), shapes[item.name])

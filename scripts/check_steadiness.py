@@ -18,7 +18,7 @@ import argparse
 import os
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +80,7 @@ def variants(
     experiment, measurement = config.experiment, config.experiment.measurement
 
     def changed(**parts: Any) -> Config:
-        return replace(config, experiment=experiment.model_copy(update=parts))
+        return config.model_copy(update={"experiment": experiment.model_copy(update=parts)})
 
     for name, factor in (("x 3", FACTOR), ("/ 3", 1 / FACTOR)):
         if "std" in changes:
@@ -93,10 +93,16 @@ def variants(
         if "prior" in changes:
             prior = factor * config.cable.prior_bending_stiffness
             cable = {"bending_stiffness": prior, "youngs_modulus": None}
-            yield f"prior EI {name}", replace(config, cable=config.cable.model_copy(update=cable))
+            yield (
+                f"prior EI {name}",
+                config.model_copy(update={"cable": config.cable.model_copy(update=cable)}),
+            )
         if "mesh" in changes:
             n = max(2 * round(factor * base.n / 2), 4)
-            yield f"{n} elements", replace(config, model=config.model.model_copy(update={"n": n}))
+            yield (
+                f"{n} elements",
+                config.model_copy(update={"model": config.model.model_copy(update={"n": n})}),
+            )
     fitted = [k for k, pose in enumerate(experiment.poses) if pose.role == "fit"]
     if "poses" in changes and len(fitted) > 1:
         for k in fitted[:: -(-len(fitted) // poses)]:
@@ -130,7 +136,7 @@ def check(session: Path, changes: list[str], poses: int, diagnosed: bool, jobs: 
     config = load_config(session)
     estimation = config.estimation.model_copy(update={"algorithm1": False})
     diagnosis = config.diagnosis.model_copy(update={"enabled": diagnosed})
-    config = replace(config, estimation=estimation, diagnosis=diagnosis)
+    config = config.model_copy(update={"estimation": estimation, "diagnosis": diagnosis})
     base, bad = run(config), 0
     print(f"{session.parent.name} | as it is | {base.text()}", flush=True)
     names, listed = zip(*variants(config, base, changes, poses), strict=True)

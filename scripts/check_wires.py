@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -55,7 +54,7 @@ def main() -> None:
                 for i, pose in enumerate(config.experiment.poses)
             )
             experiment = config.experiment.model_copy(update={"poses": poses})
-            outcome = run_session(replace(config, experiment=experiment))
+            outcome = run_session(config.model_copy(update={"experiment": experiment}))
             row = {"floor": floor(measured, k, config.cable.length)}
             for stage in outcome.stages:
                 row[stage.name] = stage.rmse_held_out

@@ -19,9 +19,9 @@ TITLES = {
 
 def draw_camera_steps() -> None:
     """The four pictures of `dlo check --show` for a photograph with a card before the cable."""
-    config = dlo.load_config(ROOT / "tests/data/bench/orange/session.yaml")
-    pose = config.experiment.poses[1]
-    pictures = draw_steps(config, pose)
+    session = dlo.Session.load(ROOT / "tests/data/bench/orange/session.yaml")
+    pose = session.experiment.poses[1]
+    pictures = draw_steps(session, pose)
     drawing = Figure(figsize=(9, 6.4), layout="constrained")
     for axes, (name, title) in zip(drawing.subplots(2, 2).ravel(), TITLES.items(), strict=True):
         axes.imshow(pictures[f"{pose.name}_{name}"][..., ::-1])

@@ -13,7 +13,6 @@ from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.session.measure import conditions
 
 # Waves of the rest curvature along the cable.
 WAVES = 4
@@ -50,7 +49,7 @@ def random_session(
     places = model.chain.cells.mean(axis=1) / length
     waves: NDArray[np.floating] = np.cos(np.pi * np.arange(WAVES)[:, None] * places)
     rest = generator.normal(0, curvature, WAVES) @ waves * 2 * np.pi / length
-    poses = [conditions(pose) for pose in config.experiment.poses]
+    poses = [pose.held for pose in config.experiment.poses]
     found = [item for item in predict_poses(model, p, rest, poses) if item is not None]
     if len(found) < len(poses) or not all(item.equilibrium.stable for item in found):
         return None

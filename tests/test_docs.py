@@ -15,7 +15,7 @@ import dlo_casadi as dlo
 from dlo_casadi.cli import COMMANDS, main
 from dlo_casadi.config import dump_yaml, read_yaml
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.sections import File
+from dlo_casadi.config.sections import Config
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs/pages"
@@ -110,7 +110,7 @@ def test_yaml_is_a_configuration_or_a_part_of_one(page, tmp_path):
         part = read_yaml(tmp_path / "part.yaml")
         experiment = whole["experiment"] | part.get("experiment", {})
         (tmp_path / "whole.yaml").write_text(dump_yaml(whole | part | {"experiment": experiment}))
-        Document.read(tmp_path / "whole.yaml").checked(File)
+        Document.read(tmp_path / "whole.yaml").checked(Config)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")

@@ -19,8 +19,9 @@ import numpy as np
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.cable.metadata import Metadata
 from dlo_casadi.config.document import Document
+from dlo_casadi.config.options import ElementName
 from dlo_casadi.config.problems import Problem, show
-from dlo_casadi.config.sections import Boundary, ElementName
+from dlo_casadi.config.sections import Boundary
 from dlo_casadi.config.values import (
     STIFFNESS,
     Elements,
@@ -268,7 +269,7 @@ def _beyond(q: Parameter, row: _Value) -> str:
     return f"{row.value:.12g} {q.unit} lies outside of its bounds {bounds}"
 
 
-def metadata_of(document: dict[str, Any], source: Path) -> Metadata:
+def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
     """Contents of a document beside the model."""
     file = ParametersFile.model_validate(document)
     names, stiffness = file.covariance.names, file.parameters["bending_stiffness"]

@@ -14,7 +14,8 @@ class Metadata:
 
     Parameters
     ----------
-    path : Path
+    path : Path or None
+        The file, or the session's.
     names : tuple of str
         Fitted parameters, in the order of `covariance`.
     covariance : (N, N)
@@ -45,7 +46,7 @@ class Metadata:
         The whole file.
     """
 
-    path: Path
+    path: Path | None
     names: tuple[str, ...]
     covariance: FloatArray
     uncertainty: Uncertainty

@@ -5,7 +5,6 @@ import multiprocessing
 import os
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK
@@ -75,7 +74,9 @@ def diagnose(chosen: argparse.Namespace) -> None:
 
 
 def _with_diagnosis(config: Config, enabled: bool) -> Config:
-    return replace(config, diagnosis=config.diagnosis.model_copy(update={"enabled": enabled}))
+    return config.model_copy(
+        update={"diagnosis": config.diagnosis.model_copy(update={"enabled": enabled})}
+    )
 
 
 def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:

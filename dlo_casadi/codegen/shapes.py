@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.config import Pose as DeclaredPose
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.symbolic import pose_size
 from dlo_casadi.errors import DloError, counted
@@ -221,7 +222,7 @@ def _record(*fields: list[Any]) -> np.dtype[Any]:
 
 
 def pose_table(
-    model: CableModel, poses: Sequence[HeldPose] | FloatArray, branch: object = None
+    model: CableModel, poses: Sequence[HeldPose | DeclaredPose] | FloatArray, branch: object = None
 ) -> tuple[FloatArray, int]:
     """Poses (m, k) laid out as dlo_pose, and the C solver's number of their branch.
 
@@ -255,6 +256,8 @@ def _branch_number(branch: object) -> int:
 
 
 def _row(model: CableModel, pose: object) -> FloatArray:
+    if isinstance(pose, DeclaredPose):
+        pose = pose.held
     if not isinstance(pose, HeldPose):
         raise DloError(f"a Pose belongs here, found {pose!r}\n  Try: dlo_casadi.Pose(start, end)")
     if pose.end is None and model.end != "free":

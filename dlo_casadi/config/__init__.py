@@ -5,12 +5,14 @@ reported at once, each with its line.
 """
 
 from dlo_casadi.config.document import dump_yaml, read_yaml
-from dlo_casadi.config.load import declared_setup, load_config, wrong_effects
-from dlo_casadi.config.sections import (
-    Config,
-    DeclaredEffect,
-    EstimationOptions,
-    Pose,
-    SkippedPose,
+from dlo_casadi.config.load import (
+    checked_config,
+    declared_setup,
+    is_photographed,
+    load_as,
+    load_config,
+    wrong_effects,
 )
-from dlo_casadi.config.values import Camera, Centerlines, Images
+from dlo_casadi.config.measuring import Camera, Centerlines, Images
+from dlo_casadi.config.options import DeclaredEffect, EstimationOptions
+from dlo_casadi.config.sections import Cable, Config, Pose, SkippedPose

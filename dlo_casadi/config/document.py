@@ -1,15 +1,14 @@
 """YAML text <-> plain data. The only module that imports yaml."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import yaml
-from pydantic import BaseModel, ValidationError
 
-from dlo_casadi.config.problems import Place, Problem, did_you_mean, explain, show
+from dlo_casadi.config.problems import Place, Source, did_you_mean, show
 from dlo_casadi.errors import ConfigError
 
 # A file of so many bytes takes PyYAML some five seconds; a session of a thousand poses has 80,000.
@@ -21,9 +20,6 @@ _DEEPEST = 30
 # No text: control characters beside tab and line breaks, which a terminal obeys, and halves of
 # surrogate pairs, except those that stand for the bytes of a file's name that is not UTF-8.
 _NO_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udc7f\udd00-\udfff]")
-
-
-Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_yaml(path: str | Path) -> Any:
@@ -132,12 +128,17 @@ _Dumper.add_implicit_resolver(f"{_TAG}float", _FLOAT, list("-+.0123456789"))
 
 
 @dataclass(frozen=True)
-class Document:
+class Document(Source):
     """A YAML file: its data, and the node tree that knows the lines."""
 
     source: Path
     root: yaml.Node
     data: Any
+
+    @property
+    def folder(self) -> Path:  # type: ignore[override]
+        """The folder of the file."""
+        return self.source.absolute().parent
 
     @classmethod
     def read(cls, source: Path) -> Self:
@@ -184,31 +185,9 @@ class Document:
                 break
         return line
 
-    def checked(self, model: type[Model], heading: str = "", remedy: str = "") -> Model:
-        """The data as an object of a model, or a ConfigError of all problems; see `error`."""
-        try:
-            return model.model_validate(
-                self.data, context={"folder": self.source.absolute().parent}
-            )
-        except ValidationError as error:
-            problems = explain(model, error.errors(), self.data)
-            raise self.error(problems, heading, remedy) from None
-
-    def error(
-        self, problems: Iterable[Problem], heading: str = "", remedy: str = ""
-    ) -> ConfigError:
-        """All problems as one error, in the order of their lines, under what they say together."""
-        most = 12
-        lines = sorted({(self.line(problem.place), problem.message) for problem in problems})
-        if len(lines) == 1:
-            line, message = lines[0]
-            said = ": ".join(filter(None, (heading, message)))
-            return ConfigError(said + remedy, self.source, line)
-        listed = [f"  line {line}: {message}" for line, message in lines[:most]]
-        if len(lines) > most:
-            listed.append(f"  ... and {len(lines) - most} more")
-        heading = heading or f"{len(lines)} problems"
-        return ConfigError("\n".join([heading, *listed]) + remedy, self.source)
+    def located(self, message: str, line: int | None = None) -> ConfigError:
+        """The error, with the file and the line."""
+        return ConfigError(message, self.source, line)
 
 
 def _read_bytes(source: Path) -> bytes:

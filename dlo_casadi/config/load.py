@@ -2,26 +2,23 @@
 
 import difflib
 import math
+import os
 import stat
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.problems import Place, Problem, did_you_mean, kind_of, show
-from dlo_casadi.config.sections import (
-    Cable,
-    Config,
-    DeclaredEffect,
-    Experiment,
-    File,
-    Pose,
-    SkippedPose,
-)
-from dlo_casadi.config.values import Range, Tolerances
+from dlo_casadi.config.measuring import Tolerances
+from dlo_casadi.config.options import DeclaredEffect
+from dlo_casadi.config.problems import Place, Problem, Source, did_you_mean, kind_of, show
+from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
+from dlo_casadi.config.values import Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS
+
+Kind = TypeVar("Kind", bound=Config)
 
 
 def load_config(path: str | Path) -> Config:
@@ -44,6 +41,16 @@ def load_config(path: str | Path) -> Config:
         cannot be reached or has no file is left out and noted in `Config.skipped`; that is an
         error only if no pose to fit remains.
     """
+    return load_as(Config, path)
+
+
+def load_as(kind: type[Kind], path: str | Path) -> Kind:
+    """`load_config` for a subclass of Config."""
+    if not isinstance(path, str | os.PathLike):
+        raise ConfigError(
+            f"{path!r} is no configuration.\n"
+            '  Try: the path of a YAML file, such as "configs/cable.yaml".'
+        )
     source = Path(path)
     document = Document.read(source)
     if not isinstance(document.data, dict):
@@ -51,14 +58,19 @@ def load_config(path: str | Path) -> Config:
         raise ConfigError(
             f"a mapping with cable: and experiment: belongs at the top, found {found}", file=source
         )
-    config = Config(source.absolute(), **dict(document.checked(File)))
+    return checked_config(document, kind).noted(path=source.absolute())
+
+
+def checked_config(source: Source, kind: type[Kind]) -> Kind:
+    """A configuration from a file or from arguments; raises ConfigError as `load_config`."""
+    config = source.checked(kind)
     if problems := [
         *_contradictions(config.experiment),
         *_weightless(config),
         *wrong_effects(config),
         *_impossible_values(config.experiment, config.cable.length),
     ]:
-        raise document.error(problems)
+        raise source.error(problems)
 
     poses = config.experiment.poses
     unreachable = _unreachable(poses, config.cable, config.experiment.tolerances)
@@ -71,20 +83,25 @@ def load_config(path: str | Path) -> Config:
             for i, pose in enumerate(poses)
             if pose.role == "fit"
         ]
-        raise document.error(lost, "no pose to fit is left")
+        raise source.error(lost, "no pose to fit is left")
     warnings = [*_oddities(config)]
     if n_fit == 1:
         warnings.append("only one pose to fit: what it tells cannot be checked on another one")
     skipped = [pose for pose in poses if pose.name in reasons]
-    return replace(
-        config,
-        experiment=config.experiment.model_copy(update={"poses": reachable}),
+    experiment = config.experiment.model_copy(update={"poses": reachable})
+    return config.model_copy(update={"experiment": experiment}).noted(
         warnings=tuple(warnings),
         skipped=tuple(SkippedPose(pose.name, reasons[pose.name], pose.role) for pose in skipped),
     )
 
 
 _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
+
+
+def is_photographed(pose: object) -> bool:
+    """Whether a file of the pose has the name of a picture."""
+    return isinstance(pose, Pose) and any(x.suffix.lower() in _IMAGE_ENDINGS for x in pose.paths)
+
 
 # Results are named after a pose, with up to forty characters more; file systems take 255 bytes.
 _LONGEST_NAME = 200
@@ -151,6 +168,13 @@ def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, st
         yield "a CSV is not a photograph; measurement kind: centerlines?", None
     if experiment.measurement.kind == "centerlines" and endings & _IMAGE_ENDINGS:
         yield "a photograph is not a CSV; measurement kind: images?", None
+    if pose.points is not None:
+        if len(pose.points[0]) != len(experiment.gravity):
+            axes = "[[x, y, z], ...]" if experiment.in_space else "[[x, y], ...]"
+            gravity = "three numbers" if experiment.in_space else "two numbers"
+            yield f"points: {axes} belong here ({gravity} of gravity)", "points"
+        if experiment.measurement.kind == "images" and not experiment.in_space:
+            yield "points are not a photograph; measurement kind: centerlines?", "points"
     if len(pose.files) > 1 and not experiment.in_space:
         yield "several photographs are of a cable in space; gravity: two numbers", "files"
 
@@ -231,7 +255,7 @@ def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) ->
 
 def _missing(poses: Iterable[Pose]) -> dict[str, str]:
     """Find poses of which no file exists."""
-    found = {pose.name: [_absent(path) for path in pose.paths] for pose in poses}
+    found = {pose.name: [_absent(path) for path in pose.paths] for pose in poses if pose.paths}
     return {name: "; ".join(reasons) for name, reasons in found.items() if all(reasons)}
 
 

@@ -1,13 +1,17 @@
-"""What is wrong with a file, and how to say it: place, reason, and what to try."""
+"""What is wrong with a file, or with arguments, and how to say it: place, reason, what to try."""
 
 import difflib
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple, get_args
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, get_args
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from dlo_casadi.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
 Place = tuple[str | int, ...]
 """Keys and indices that lead from the top of a file to a value."""
 
@@ -88,22 +92,73 @@ def _section_at(place: Place, sections: _Sections) -> type[BaseModel]:
     return sections[max(filter(leads, sections), key=len)][0]
 
 
-def _label(place: Place, data: Any) -> str:
-    """Name a place in words: cable.length, pose 4 (pose_04.jpg) end."""
-    words: list[str] = []
-    for part in place:
-        if isinstance(data, dict) and part in data:
-            data = data[part]
-            words.append(str(part))
-        elif isinstance(data, list) and isinstance(part, int) and part < len(data):
-            data = data[part]
-            if words == ["experiment", "poses"]:
-                file = data.get("file", data.get("files")) if isinstance(data, dict) else None
-                said = ", ".join(map(str, file)) if isinstance(file, list) else file
-                words = [f"pose {part + 1}" + (f" ({said})" if isinstance(said, str) else "")]
-            else:
-                words[-1] += f"[{part}]"
-    return ".".join(words) or "the top of the file"
+class Source:
+    """Data to be checked, and how to say where something in them is wrong."""
+
+    data: Any
+    folder: Path
+    """Where the files are that it names."""
+    hidden: tuple[str, ...] = ()
+    """Keys that are left out of the name of a place."""
+    top = "the top of the file"
+
+    def checked(self, model: type[Model], heading: str = "", remedy: str = "") -> Model:
+        """The data as an object of a model, or a ConfigError of all problems; see `error`."""
+        try:
+            return model.model_validate(self.data, context={"folder": self.folder})
+        except ValidationError as error:
+            raise self.error(explain(model, error.errors(), self), heading, remedy) from None
+
+    def error(
+        self, problems: Iterable[Problem], heading: str = "", remedy: str = ""
+    ) -> ConfigError:
+        """All problems as one error, in the order of their lines, under what they say together."""
+        most = 12
+        lines = sorted({(self.line(problem.place), problem.message) for problem in problems})
+        if len(lines) == 1:
+            line, message = lines[0]
+            said = ": ".join(filter(None, (heading, message)))
+            return self.located(said + remedy, line)
+        listed = [f"  {f'line {line}: ' if line else ''}{said}" for line, said in lines[:most]]
+        if len(lines) > most:
+            listed.append(f"  ... and {len(lines) - most} more")
+        heading = heading or f"{len(lines)} problems"
+        return self.located("\n".join([heading, *listed]) + remedy)
+
+    def line(self, place: Place) -> int:
+        """Line of a place in a file; 0 where there is none."""
+        return 0
+
+    def located(self, message: str, line: int | None = None) -> ConfigError:
+        """The error, with the file and the line where there are any."""
+        return ConfigError(message)
+
+    def label(self, place: Place) -> str:
+        """Name a place in words: cable.length, pose 4 (pose_04.jpg) end."""
+        data, words = self.data, []
+        for part in place:
+            if isinstance(data, dict) and part in data:
+                data = data[part]
+                words.append(str(part))
+            elif isinstance(data, list | tuple) and isinstance(part, int) and part < len(data):
+                data = data[part]
+                if words == ["experiment", "poses"]:
+                    file = data.get("file", data.get("files")) if isinstance(data, dict) else None
+                    said = ", ".join(map(str, file)) if isinstance(file, list) else file
+                    words = [f"pose {part + 1}" + (f" ({said})" if isinstance(said, str) else "")]
+                else:
+                    words[-1] += f"[{part}]"
+        return ".".join(word for word in words if word not in self.hidden) or self.top
+
+
+class Arguments(Source):
+    """Arguments of a call: a place is told by the argument's name alone."""
+
+    hidden = ("experiment", "measurement")
+    top = "the arguments"
+
+    def __init__(self, data: dict[str, Any]) -> None:
+        self.data, self.folder = data, Path()
 
 
 def _help(section: type[BaseModel], key: object) -> str:
@@ -157,8 +212,10 @@ _MESSAGES: dict[str, str] = {
 }
 
 
-def explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any) -> Iterator[Problem]:
-    """Say what pydantic found in a file of that model in the words of the file."""
+def explain(
+    model: type[BaseModel], errors: Sequence[ErrorDetails], source: Source
+) -> Iterator[Problem]:
+    """Say what pydantic found in a source of that model in the words of the source."""
     sections = _sections(model)
     suggested: set[Place] = set()
     for error in errors:
@@ -170,7 +227,7 @@ def explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any) -
     for error in errors:
         place, kind, found = error["loc"], error["type"], error["input"]
         context = error.get("ctx", {})
-        section, label, key = _section_at(place[:-1], sections), _label(place, data), place[-1]
+        section, label, key = _section_at(place[:-1], sections), source.label(place), place[-1]
         if found == PLACEHOLDER:
             text = f"{label} is still to be filled in{_help(section, key)}"
         elif kind == "missing" and isinstance(key, int):
@@ -188,7 +245,7 @@ def explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any) -
             ]
             if homes and "did you mean" not in hint:
                 hint = f"; it belongs into {' or '.join(homes)}"
-            text = f"unknown key {show(str(key))} in {_label(place[:-1], data)}{hint}"
+            text = f"unknown key {show(str(key))} in {source.label(place[:-1])}{hint}"
         elif kind in ("union_tag_invalid", "union_tag_not_found"):
             place = (*place, "kind")
             text = f"{label}: kind must be images or centerlines, found {show(context.get('tag'))}"
@@ -196,7 +253,7 @@ def explain(model: type[BaseModel], errors: Sequence[ErrorDetails], data: Any) -
             wrong = context["error"]
             for inner in getattr(wrong, "problems", (Problem((), str(wrong)),)):
                 at = (*place, *inner.place)
-                yield Problem(at, f"{_label(at, data)}: {inner.message}")
+                yield Problem(at, f"{source.label(at)}: {inner.message}")
             continue
         elif kind in _MESSAGES:
             words = {

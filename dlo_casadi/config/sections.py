@@ -3,40 +3,39 @@
 How was measured is in `measuring`.
 """
 
+import dataclasses
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from dlo_casadi.config.document import dump_yaml
+from dlo_casadi.config.measuring import Centerlines, Images, Tolerances
+from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
 from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, show
 from dlo_casadi.config.values import (
     STIFFNESS,
-    Centerlines,
-    Elements,
+    ArcLengths,
     Force,
     Gravity,
-    Images,
     Moment,
     Name,
     Number,
     Place,
+    Points,
     Positive,
     Quaternion,
-    RestCoefficients,
     Section,
-    Switch,
-    Tolerances,
+    checked,
     implausible_sizes,
     optional,
     within,
 )
-from dlo_casadi.errors import well_formed
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.errors import counted, well_formed
 from dlo_casadi.rod.ends import REACTIONS
-from dlo_casadi.thresholds import SIGNIFICANCE
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
 # a foam, to five times, which no metal of cables reaches.
@@ -110,17 +109,46 @@ class Boundary(Section):
     """End of the cable: pinned, clamped or free."""
 
 
+def _no_file_name(name: str) -> str:
+    """Why results cannot be named so; empty if they can."""
+    if name in (".", "..") or set(name) & set('/\\:*?"<>|\0') or name != name.strip():
+        return (
+            f"results are named after it: a file name without ending belongs here, found {name!r}"
+        )
+    return ""
+
+
+_as_boundary = BeforeValidator(
+    lambda value: (
+        dict(zip(("start", "end"), value, strict=True))
+        if isinstance(value, list | tuple) and len(value) == 2
+        else value
+    ),
+    json_schema_input_type=Boundary | tuple[str, str],
+)
+
+
 # pose_01_a -> pose_01: a digit, and letters after it.
 _TOLD_APART = re.compile(r"(.*[0-9])[-_. ]?[A-Za-z]+")
 
 
 class Pose(Section):
-    """One measured shape: where the ends were held, and the file or files that show it."""
+    """One shape: where the ends were held, and the file, the files or the points that show it.
+
+    From Python `start` and `end` may stand without their names: `Pose(start, end, points=...)`.
+    """
 
     file: Path | None = None
     """Photograph or CSV, found relative to the YAML; an absolute path once loaded."""
     files: tuple[Path, ...] = ()
     """Photographs from several places [a.jpg, b.jpg, ...] of a cable in space, instead of file."""
+    points: Points | None = None
+    """Points [[x, y], ...] along the cable [m], in space [[x, y, z], ...], instead of a file."""
+    at: ArcLengths | None = None
+    """Arc lengths [s, ...] [m] of the points from the start, which makes them markers."""
+    name: Annotated[Name, checked(_no_file_name)] = Field(default="", validate_default=True)
+    """What to call the pose; as its file without folder and ending, or by its number, when
+    absent."""
     start: Place
     """Where the start is held [x, y] [m], in space [x, y, z]."""
     end: Place | None = None
@@ -159,8 +187,8 @@ class Pose(Section):
 
     @property
     def shown_by(self) -> str:
-        """Names of its files, for messages."""
-        return ", ".join(path.name for path in self.paths)
+        """Names of its files, or its own, for messages."""
+        return ", ".join(path.name for path in self.paths) or self.name
 
     @property
     def photographs(self) -> dict[str, Path]:
@@ -168,21 +196,23 @@ class Pose(Section):
         return {well_formed(path.stem): path for path in self.paths}
 
     @property
-    def name(self) -> str:
-        """Name of the pose: its file without folder and ending.
-
-        Of photographs in `files` the first one's, without the letters after a number that tell
-        them apart: pose_01 of pose_01_a.jpg and pose_01_b.jpg.
-        """
-        first = next(iter(self.photographs))
-        found = _TOLD_APART.fullmatch(first) if self.files else None
-        return found[1] if found else first
-
-    @property
     def readings(self) -> dict[str, tuple[float, ...]]:
         """Forces and moments on the fixtures that were measured, by their keys."""
         found = {name: getattr(self, name) for name in REACTIONS}
         return {name: value for name, value in found.items() if value is not None}
+
+    @property
+    def held(self) -> HeldPose:
+        """How its ends are held."""
+        names = {item.name for item in dataclasses.fields(HeldPose)} & type(
+            self
+        ).model_fields.keys()
+        return HeldPose(**{name: getattr(self, name) for name in names})
+
+    def __init__(self, *ends: Any, **values: Any) -> None:
+        super().__init__(**dict(zip(("start", "end"), ends, strict=False)), **values)
+
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @field_validator("file", mode="before")
     @classmethod
@@ -199,20 +229,36 @@ class Pose(Section):
     def _all_absolute(cls, value: object, info: ValidationInfo) -> tuple[Path, ...]:
         if not isinstance(value, list | tuple) or not value:
             raise ValueError(f"file names [a.jpg, b.jpg] belong here, found {show(value)}")
-        if info.data.get("file") is not None:
-            raise ValueError("give file or files, found both")
         files = tuple(cls._absolute(item, info) for item in value)
         if len({well_formed(file.stem) for file in files}) < len(files):
             names = ", ".join(file.name for file in files)
             raise ValueError(f"each photograph needs a name of its own, found {names}")
         return files
 
+    @field_validator("name", mode="after")
+    @classmethod
+    def _named(cls, value: str, info: ValidationInfo) -> str:
+        """Of photographs in `files` the first one's name, without what tells them apart.
+
+        That is letters after a number: pose_01 of pose_01_a.jpg and pose_01_b.jpg.
+        """
+        files = info.data.get("files") or ()
+        paths = files or [file for file in [info.data.get("file")] if file is not None]
+        if value or not paths:
+            return value
+        first = well_formed(paths[0].stem)
+        found = _TOLD_APART.fullmatch(first) if files else None
+        return found[1] if found else first
+
     @model_validator(mode="after")
-    def _shown(self) -> Self:
-        if self.file is None and not self.files:
-            raise ValueError(
-                "'file' is missing: a photograph or CSV; or files: [a.jpg, b.jpg] of photographs"
-            )
+    def _shown_once(self) -> Self:
+        given = [key for key in ("file", "files", "points") if getattr(self, key)]
+        if len(given) > 1:
+            raise ValueError(f"give file, files or points, found {' and '.join(given)}")
+        if self.at is not None and len(self.at) != len(self.points or ()):
+            points = counted(len(self.points or ()), "point")
+            text = f"{counted(len(self.at), 'arc length')} for {points}: each point has one"
+            raise Contradiction(Problem(("at",), text))
         return self
 
 
@@ -222,8 +268,9 @@ class Experiment(Section):
     gravity: Gravity
     """Gravity in the board frame, such as [0.0, -9.81] [m/s^2]; three numbers put the cable in
     space."""
-    boundary: Boundary
-    """How the two ends are held: {start: pinned | clamped, end: pinned | clamped | free}."""
+    boundary: Annotated[Boundary, _as_boundary]
+    """How the two ends are held: {start: pinned | clamped, end: pinned | clamped | free}, or
+    [start, end]."""
     measurement: Annotated[Images | Centerlines, Field(discriminator="kind")]
     """What the files of the poses are: kind: images or kind: centerlines."""
     tolerances: Annotated[Tolerances, optional(Tolerances)] = Tolerances()
@@ -236,82 +283,20 @@ class Experiment(Section):
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
 
-
-# ---- how the fit goes about it ----------------------------------------------------------------
-
-ElementName = Literal["quadratic", "arc", "link"]
-
-
-class EffectParameter(Section):
-    """The declared value of an effect's parameter: an initial guess, or kept when fixed."""
-
-    value: Number
-    """Value in the parameter's own unit."""
-    fixed: Switch = False
-    """Whether the value is kept; otherwise it is where the fit starts."""
-
-
-_as_parameter = BeforeValidator(
-    lambda value: value if isinstance(value, Mapping | EffectParameter) else {"value": value},
-    json_schema_input_type=float | EffectParameter,
-)
-
-
-class DeclaredEffect(Section):
-    """An effect that is part of the model from the start."""
-
-    name: str
-    """Name of the effect, such as lumped_mass."""
-    parameters: dict[str, Annotated[EffectParameter, _as_parameter]] = Field(default={})
-    """Initial guess of each parameter by its name; {value: ..., fixed: true} keeps a value."""
-
-
-_as_effect = BeforeValidator(
-    lambda value: {"name": value} if isinstance(value, str) else value,
-    json_schema_input_type=str | DeclaredEffect,
-)
-
-
-class ModelOptions(Section):
-    """The declared model."""
-
-    n: Elements | None = None
-    """Number of elements; chosen from the data when absent."""
-    element: ElementName = "quadratic"
-    """quadratic (curvature changes in an element: fourth order), arc (it is constant: second
-    order, five times cheaper) or link (straight, as in the paper; in a plane only)."""
-    effects: tuple[Annotated[DeclaredEffect, _as_effect], ...] = ()
-    """Effects beside bending and weight."""
-
-
-class EstimationOptions(Section):
-    """How the parameters are estimated."""
-
-    algorithm1: Switch = True
-    """Whether the paper's loop runs as a baseline."""
-    algorithm1_n: Annotated[int, Field(strict=True, ge=2, le=200)] = 10
-    """Number of links in the paper's loop."""
-    algorithm1_inner: Literal["ipopt", "cobyla"] = "ipopt"
-    """Its inner minimisation: ipopt, or cobyla as in the paper (about 1 s a pose)."""
-    robust: Switch = False
-    """Whether outlying points weigh less."""
-    plausibility: Switch = True
-    """Whether contradictions of the configuration stop the fit, or leave out a single pose."""
-    rest_curvature_coefficients: RestCoefficients | None = None
-    """Number of coefficients of the rest curvature, 0 for a straight one; chosen from the data."""
-
-
-class DiagnosisOptions(Section):
-    """The search for missing effects."""
-
-    enabled: Switch = True
-    """Whether missing effects are searched for."""
-    exclude: tuple[str, ...] = ()
-    """Names of effects that are not tried."""
-    significance: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)] = SIGNIFICANCE
-    """Largest p-value with which an effect is added."""
-    max_effects: Annotated[int, Field(strict=True, ge=0)] = 4
-    """Largest number of effects that are added."""
+    @field_validator("poses")
+    @classmethod
+    def _shown(cls, poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
+        """Refuse a pose that nothing shows; name those without a file by their number."""
+        text = (
+            "'file' is missing: a photograph or CSV; or files: [a.jpg, b.jpg] of photographs; or "
+            "points: [[x, y], ...]"
+        )
+        if nothing := [k for k, x in enumerate(poses) if not x.paths and x.points is None]:
+            raise Contradiction(*(Problem((k,), text) for k in nothing))
+        return tuple(
+            pose if pose.name else pose.model_copy(update={"name": f"pose_{k:02d}"})
+            for k, pose in enumerate(poses, start=1)
+        )
 
 
 # ---- the whole -------------------------------------------------------------------------------
@@ -325,47 +310,8 @@ class SkippedPose(NamedTuple):
     role: Literal["fit", "held_out"]
 
 
-@dataclass(frozen=True)
-class Config:
-    """A checked configuration.
-
-    Parameters
-    ----------
-    path : Path
-        The YAML file, absolute.
-    cable, experiment, model, estimation, diagnosis
-        Its sections.
-    warnings : tuple of str
-        What looks odd but does not stop the fit.
-    skipped : tuple of SkippedPose
-        Poses that cannot be used. Those without an equilibrium (farther apart than the cable is
-        long) are not in `experiment.poses`; those whose file is missing stay there, because their
-        end conditions are part of the cable's history, but not in `measured_poses`.
-    """
-
-    path: Path
-    cable: Cable
-    experiment: Experiment
-    model: ModelOptions = field(default_factory=ModelOptions)
-    estimation: EstimationOptions = field(default_factory=EstimationOptions)
-    diagnosis: DiagnosisOptions = field(default_factory=DiagnosisOptions)
-    warnings: tuple[str, ...] = ()
-    skipped: tuple[SkippedPose, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Name of the configuration: its file without folder and ending."""
-        return well_formed(self.path.stem)
-
-    @property
-    def measured_poses(self) -> tuple[Pose, ...]:
-        """Poses with a file to read, in the order in which they were taken."""
-        skipped = {pose.name for pose in self.skipped}
-        return tuple(pose for pose in self.experiment.poses if pose.name not in skipped)
-
-
-class File(Section):
-    """What may stand at the top of a configuration."""
+class Config(Section):
+    """A session as it is declared: all that a fit starts from."""
 
     cable: Cable
     """The cable: length, mass, diameter, youngs_modulus or bending_stiffness."""
@@ -377,3 +323,62 @@ class File(Section):
     """How the parameters are estimated."""
     diagnosis: Annotated[DiagnosisOptions, optional(DiagnosisOptions)] = DiagnosisOptions()
     """The search for missing effects."""
+
+    _path: Path | None = None
+    _warnings: tuple[str, ...] = ()
+    _skipped: tuple[SkippedPose, ...] = ()
+
+    @property
+    def path(self) -> Path | None:
+        """The YAML file, absolute; None of a session from Python."""
+        return self._path
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What looks odd but does not stop the fit."""
+        return self._warnings
+
+    @property
+    def skipped(self) -> tuple[SkippedPose, ...]:
+        """Poses that cannot be used.
+
+        Those without an equilibrium (farther apart than the cable is long) are not in
+        `experiment.poses`; those whose file is missing stay there, because their end conditions
+        are part of the cable's history, but not in `measured_poses`.
+        """
+        return self._skipped
+
+    def __repr__(self) -> str:
+        poses = counted(len(self.experiment.poses), "pose")
+        return f"<{type(self).__name__} {self.name!r}: {poses}>"
+
+    def noted(self, **notes: Any) -> Self:
+        """The same with other `path`, `warnings` or `skipped`."""
+        noted = self.model_copy()
+        for name, value in notes.items():
+            setattr(noted, f"_{name}", value)
+        return noted
+
+    @property
+    def name(self) -> str:
+        """Name of the session: its file without folder and ending, or that of the cable."""
+        return well_formed(self.cable.name if self.path is None else self.path.stem)
+
+    @property
+    def text(self) -> str:
+        """The session as a configuration file, as far as it was declared.
+
+        Raises
+        ------
+        OSError
+            If its file cannot be read any more.
+        """
+        if self.path is None:
+            return dump_yaml(self.model_dump(exclude_unset=True))
+        return self.path.read_text(encoding="utf-8-sig", errors="replace")
+
+    @property
+    def measured_poses(self) -> tuple[Pose, ...]:
+        """Poses with something to read, in the order in which they were taken."""
+        skipped = {pose.name for pose in self.skipped}
+        return tuple(pose for pose in self.experiment.poses if pose.name not in skipped)

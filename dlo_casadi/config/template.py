@@ -9,7 +9,7 @@ from jinja2 import Template
 
 from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.problems import PLACEHOLDER
-from dlo_casadi.config.sections import File
+from dlo_casadi.config.sections import Config
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -55,7 +55,7 @@ def config_schema() -> dict[str, Any]:
     It knows keys, types, ranges and help; what concerns several values together only
     `load_config` checks.
     """
-    schema: dict[str, Any] = _plain(File.model_json_schema())
+    schema: dict[str, Any] = _plain(Config.model_json_schema())
     return {"$schema": DIALECT, **schema, "title": "Configuration of dlo_casadi"}
 
 

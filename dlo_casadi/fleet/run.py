@@ -4,7 +4,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 from dlo_casadi.config import load_config
@@ -196,7 +196,7 @@ def _fitted(job: Job, begin: float) -> Row:
     config = load_config(job.session.path)
     if not job.options.diagnosis:
         diagnosis = config.diagnosis.model_copy(update={"enabled": False})
-        config = replace(config, diagnosis=diagnosis)
+        config = config.model_copy(update={"diagnosis": diagnosis})
     if job.options.reports:
         # It imports the drawing libraries; without figures a worker starts in half the time.
         from dlo_casadi.report.writer import ResultsFolder

@@ -47,6 +47,52 @@ class MeasuredPoints:
     s: FloatArray | None = None
     count: FloatArray | float = 1.0
 
+    def in_order(
+        self,
+        start: Sequence[float],
+        end: Sequence[float] | None,
+        length: float,
+        name: str,
+        place: str = "at",
+    ) -> "MeasuredPoints":
+        """The points from start to end, as `read_points` returns them.
+
+        Raises
+        ------
+        MeasurementError
+            If they are no measurement of a cable of that length; the message begins with `name`
+            and calls the arc lengths `place`.
+        """
+        points, s = self.points, self.s
+        if s is not None:
+            order = np.argsort(s, kind="stable")
+            points, s = points[order], s[order]
+            twice = s[1:][np.diff(s) <= _SAME_POINT]
+            if len(twice):
+                raise MeasurementError(f"{place} {twice[0]:g} m stands twice", pose=name)
+            outside = s[(s < 0) | (s > length + _SAME_POINT)]
+            if len(outside):
+                raise MeasurementError(
+                    f"{place} {outside[0]:g} m is not between 0 and cable.length {length:g} m: "
+                    "arc length from the start, in metres?",
+                    pose=name,
+                )
+        else:
+            step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+            points = points[np.concatenate(([True], step > _SAME_POINT))]
+        if len(points) == 1:
+            raise MeasurementError("holds one point only; a pose takes two or more", pose=name)
+        along = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+        if along > _LONGEST:
+            raise MeasurementError(
+                f"the centre-line is {along:.4g} m long: are the points in metres? If "
+                "they are in millimetres, divide them by 1000",
+                pose=name,
+            )
+        if s is None and _runs_backwards(points, start, end):
+            points = points[::-1].copy()
+        return MeasuredPoints(points, s)
+
     def means(self, most: int) -> "MeasuredPoints":
         """Means of the points in at most `most` intervals of equal length.
 
@@ -104,35 +150,11 @@ def read_points(
     header, table = _parse(source, len(start))
     if len(table) == 0:
         raise MeasurementError("has a header but no points", pose=source.name)
-    s = None
     if header[0] == PLACE:
-        table = table[np.argsort(table[:, 0], kind="stable")]
-        s, points = table[:, 0], table[:, 1:]
-        twice = s[1:][np.diff(s) <= _SAME_POINT]
-        if len(twice):
-            raise MeasurementError(f"{PLACE} {twice[0]:g} m stands twice", pose=source.name)
-        outside = s[(s < 0) | (s > length + _SAME_POINT)]
-        if len(outside):
-            raise MeasurementError(
-                f"{PLACE} {outside[0]:g} m is not between 0 and cable.length {length:g} m: arc "
-                "length from the start, in metres?",
-                pose=source.name,
-            )
+        found = MeasuredPoints(table[:, 1:], table[:, 0])
     else:
-        step = np.linalg.norm(np.diff(table, axis=0), axis=1)
-        points = table[np.concatenate(([True], step > _SAME_POINT))]
-    if len(points) == 1:
-        raise MeasurementError("holds one point only; a pose takes two or more", pose=source.name)
-    along = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    if along > _LONGEST:
-        raise MeasurementError(
-            f"the centre-line is {along:.4g} m long: are the points in metres? If "
-            "they are in millimetres, divide them by 1000",
-            pose=source.name,
-        )
-    if s is None and _runs_backwards(points, start, end):
-        points = points[::-1].copy()
-    return MeasuredPoints(points, s)
+        found = MeasuredPoints(table)
+    return found.in_order(start, end, length, source.name, PLACE)
 
 
 def _runs_backwards(

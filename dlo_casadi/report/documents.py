@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -242,7 +241,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
     document["fixtures"] = shared_fixtures(config)
     document["model_hash"] = parameters_hash(document)
     document["config"] = config.name
-    document["config_hash"] = _file_hash(config.path)
+    document["config_hash"] = _hash(config)
     document["versions"] = dict(outcome.versions)
     return document
 
@@ -330,8 +329,10 @@ def shared_fixtures(config: Config) -> dict[str, Any]:
     return shared
 
 
-def _file_hash(path: Path) -> str | None:
+def _hash(config: Config) -> str | None:
+    """SHA-256 of the configuration; None where its file cannot be read any more."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        known = config.text.encode() if config.path is None else config.path.read_bytes()
     except OSError:
         return None
+    return hashlib.sha256(known).hexdigest()

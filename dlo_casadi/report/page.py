@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -225,11 +226,11 @@ def sentence(line: str) -> str:
 
 
 def configuration_text(config: Config) -> str:
-    """The configuration as it stands in its file."""
+    """The configuration as it stands in its file, or as a file would have it."""
     try:
-        return config.path.read_text(encoding="utf-8-sig", errors="replace")
+        return config.text
     except OSError as error:
-        return f"# {config.path.name} cannot be read any more: {error.strerror}"
+        return f"# {Path(error.filename).name} cannot be read any more: {error.strerror}"
 
 
 def units(text: str) -> str:

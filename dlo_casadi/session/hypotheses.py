@@ -72,7 +72,7 @@ class Session:
     def with_experiment(self, **values: object) -> Self:
         """Return the session with other values in its configuration's `experiment`."""
         experiment = self.config.experiment.model_copy(update=values)
-        return replace(self, config=replace(self.config, experiment=experiment))
+        return replace(self, config=self.config.model_copy(update={"experiment": experiment}))
 
 
 class Hypothesis(NamedTuple, Generic[T]):
@@ -227,7 +227,7 @@ def lines_of(config: Config, read: Sequence[PoseInput]) -> Lines:
         fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
         sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
         poses = [pose for pose in config.experiment.poses if pose.name not in sound]
-        doubtful = [pose for pose in poses if pose.paths[0].is_file()]
+        doubtful = [pose for pose in poses if pose.paths and pose.paths[0].is_file()]
         if len(doubtful) > 1:
             again = {pose.name: line_without_end(config, pose) for pose in doubtful}
             points |= {name: line for name, line in again.items() if line is not None}

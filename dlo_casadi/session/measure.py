@@ -3,16 +3,15 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
 from dlo_casadi import vision
 from dlo_casadi.config import Camera as DeclaredCamera
 from dlo_casadi.config import Config, Images, Pose
-from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.io.points import read_points
+from dlo_casadi.io.points import MeasuredPoints, read_points
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.pixels import ViewInput, pixel_std, pixels_of
 from dlo_casadi.sensing.sensors import line_or_markers
@@ -81,7 +80,7 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
 
 def _measured(pose: Pose, item: PoseInput, std: float) -> MeasuredPose:
     """A pose with its sensors; pixels have the standard deviation `std` [m] at weight one."""
-    held = replace(conditions(pose), camera_center=item.camera_center)
+    held = replace(pose.held, camera_center=item.camera_center)
     held_out = pose.role == "held_out"
     if item.views:
         found = [pixels_of(view, std, len(item.points) > 0) for view in item.views]
@@ -111,21 +110,27 @@ def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
         return None
 
 
-def conditions(pose: Pose) -> HeldPose:
-    """End conditions of a configured pose."""
-    names = [item.name for item in fields(HeldPose) if hasattr(pose, item.name)]
-    return HeldPose(**{name: getattr(pose, name) for name in names})
-
-
 def _reader(config: Config, pose: Pose) -> Callable[[Config, Pose], PoseInput]:
-    """How the files of a pose are read."""
+    """How a pose is read."""
+    if pose.points is not None:
+        return _read_points
     if config.experiment.measurement.kind != "images" or pose.paths[0].suffix.lower() == ".csv":
         return _read_csv
     return _read_views if config.experiment.in_space else _read_image
 
 
 def _read_csv(config: Config, pose: Pose) -> PoseInput:
-    read = read_points(pose.paths[0], pose.start, pose.end, config.cable.length)
+    return _thinned(pose, read_points(pose.paths[0], pose.start, pose.end, config.cable.length))
+
+
+def _read_points(config: Config, pose: Pose) -> PoseInput:
+    s = None if pose.at is None else np.array(pose.at)
+    found = MeasuredPoints(np.array(pose.points), s)
+    return _thinned(pose, found.in_order(pose.start, pose.end, config.cable.length, pose.name))
+
+
+def _thinned(pose: Pose, read: MeasuredPoints) -> PoseInput:
+    """Lines and markers as a fit compares them: means of neighbours where there are many."""
     kept = _kept(read.points)
     s = None if read.s is None else read.s[kept]
     means = read.means(MOST_POINTS) if len(read.points) > MOST_POINTS else None
@@ -208,7 +213,7 @@ def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
         If none of its photographs can be read.
     """
     reader = _reader(config, pose)
-    if reader is _read_csv:
+    if reader in (_read_csv, _read_points):
         return {}
     cable = _held(config, pose)
     drawn: dict[str, np.ndarray] = {}
@@ -341,10 +346,9 @@ def calibrated(config: Config, step: Callable[[str, int, int], None]) -> Config:
     own = {key: getattr(found.camera, key).tolist() for key in DeclaredCamera.model_fields}
     camera = DeclaredCamera.model_validate(own)
     measurement = config.experiment.measurement.model_copy(update={"camera": camera})
-    return replace(
-        config,
-        experiment=config.experiment.model_copy(update={"measurement": measurement}),
-        warnings=(*config.warnings, f"no camera is declared: {summary(found)}", *found.advice),
+    experiment = config.experiment.model_copy(update={"measurement": measurement})
+    return config.model_copy(update={"experiment": experiment}).noted(
+        warnings=(*config.warnings, f"no camera is declared: {summary(found)}", *found.advice)
     )
 
 

@@ -34,7 +34,6 @@ from dlo_casadi.session.hypotheses import (
     shown_pull,
     spread,
 )
-from dlo_casadi.session.measure import conditions
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import (
     BEYOND_EFFECTS,
@@ -220,7 +219,7 @@ def coarse_fit(session: Session, most: int = _POSES) -> Coarse:
         item = session.read[k]
         kept = spread(len(item.points), _POINTS)
         s = None if item.s is None else item.s[kept]
-        pose = conditions(session.declared[item.name])
+        pose = session.declared[item.name].held
         measured.append(MeasuredPose.of_points(pose, item.points[kept], s=s))
     model = declared_model(session.config).model
     model = replace(model, effects=(), priors={}, n=_MESH, n_rest=_REST)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +152,7 @@ def make_bases(folder: Path) -> Bases:
         place.mkdir()
         config = load_config(session.write(place))
         quick = config.estimation.model_copy(update={"plausibility": False})
-        outcome = run_session(replace(config, estimation=quick))
+        outcome = run_session(config.model_copy(update={"estimation": quick}))
         (place / "parameters.yaml").write_text(parameters_text(outcome), encoding="utf-8")
         parameters.append(read_yaml(place / "parameters.yaml"))
     return Bases(

@@ -21,7 +21,6 @@ from dlo_casadi.io.points import write_points
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.measure import conditions
 from matrix.cells import POSES, Cell
 
 # Pictures are drawn as the tests of the camera do.
@@ -104,7 +103,7 @@ def draw_session(cell: Cell, size: Size, generator: np.random.Generator, folder:
                 (folder / name).touch()
         config = load_config(path)
         model = declared_model(config).model.with_mesh(size.truth)
-        poses = [conditions(pose) for pose in config.experiment.poses]
+        poses = [pose.held for pose in config.experiment.poses]
         shapes = true_shapes(model, cell, stiffness, poses, generator)
         if shapes is None:
             continue

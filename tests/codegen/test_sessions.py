@@ -12,7 +12,6 @@ from dlo_casadi.effects import EFFECTS, ClampAngle
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.measure import conditions
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
@@ -58,7 +57,7 @@ def session(name, n):
             p += list(values)
     s, kappa = (np.array(truth["rest_curvature"][k]) for k in ("s", "kappa"))
     rest = np.interp(model.chain.cells.mean(axis=1), s, kappa)
-    return model, np.array(p), rest, [conditions(pose) for pose in config.experiment.poses]
+    return model, np.array(p), rest, [pose.held for pose in config.experiment.poses]
 
 
 @pytest.mark.parametrize("name", SESSIONS)

@@ -1,7 +1,5 @@
 """Folds, candidates and pulls of one session give the same digits in other processes."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from tiny_sessions import write_session
@@ -39,10 +37,11 @@ def test_a_whole_session(tmp_path, pool, name, tried, verdict):
     config = load_config(write_session(tmp_path / "cable", name))
     few = {tried, "rest_curvature_drift"}
     limits = {"enabled": True, "max_effects": 1, "exclude": tuple(sorted(set(EFFECTS) - few))}
-    config = replace(
-        config,
-        estimation=config.estimation.model_copy(update={"algorithm1": True}),
-        diagnosis=config.diagnosis.model_copy(update=limits),
+    config = config.model_copy(
+        update={
+            "estimation": config.estimation.model_copy(update={"algorithm1": True}),
+            "diagnosis": config.diagnosis.model_copy(update=limits),
+        }
     )
     both = [report_dict(run_session(config, executor=where)) for where in (None, pool)]
     for report in both:

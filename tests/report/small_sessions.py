@@ -1,6 +1,5 @@
 """Bench sessions on a coarse mesh, without the parts that take time."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -43,14 +42,15 @@ def some(session, names):
     config = load_config(CONFIGS / f"{session}.yaml")
     poses = tuple(pose for pose in config.experiment.poses if pose.name in names)
     experiment = config.experiment.model_copy(update={"poses": poses})
-    return quick(replace(config, experiment=experiment))
+    return quick(config.model_copy(update={"experiment": experiment}))
 
 
 def quick(config):
     """The same session on a coarse mesh, without the parts that take time."""
-    return replace(
-        config,
-        model=config.model.model_copy(update={"n": 20}),
-        estimation=config.estimation.model_copy(update={"algorithm1": False}),
-        diagnosis=config.diagnosis.model_copy(update={"enabled": False}),
+    return config.model_copy(
+        update={
+            "model": config.model.model_copy(update={"n": 20}),
+            "estimation": config.estimation.model_copy(update={"algorithm1": False}),
+            "diagnosis": config.diagnosis.model_copy(update={"enabled": False}),
+        }
     )

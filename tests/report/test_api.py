@@ -20,7 +20,7 @@ from dlo_casadi.cli import main
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.report import writer
 from dlo_casadi.report.terminal import candidate_table
-from dlo_casadi.session import Silent
+from dlo_casadi.session import Outcome, Silent
 
 
 @pytest.fixture(scope="module")
@@ -35,16 +35,15 @@ def test_a_fit_is_that_of_the_session(searched, outcome, monkeypatch):
     """Its outcome, whole; the diagnosis as asked for, else as configured."""
     listener, called = Silent(), []
 
-    def run(config, progress, executor):
-        called.append((config.diagnosis.enabled, progress))
+    def run(session, progress, executor):
+        called.append((session.diagnosis.enabled, progress))
         return outcome
 
     monkeypatch.setattr(api, "run_session", run)
-    config = small("short_clean")
-    result = dlo.fit(config, diagnosis=searched, progress=listener)
-    enabled = config.diagnosis.enabled if searched is None else searched
-    assert called == [(enabled, listener)]
-    assert isinstance(result, dlo.Outcome)
+    session = dlo.Session.load(small("short_clean").path)
+    result = session.fit(diagnosis=searched, progress=listener)
+    assert called == [(searched is not False, listener)]
+    assert isinstance(result, Outcome)
     for field in dataclasses.fields(outcome):
         assert getattr(result, field.name) is getattr(outcome, field.name)
 
@@ -71,7 +70,7 @@ def test_text_says_what_was_found(result):
 
 def test_a_notebook_gets_a_table_with_everything_escaped(result):
     cable = result.config.cable.model_copy(update={"name": "<script>&"})
-    shown = dataclasses.replace(result, config=dataclasses.replace(result.config, cable=cable))
+    shown = dataclasses.replace(result, config=result.config.model_copy(update={"cable": cable}))
     html = shown._repr_html_()
     assert "<table><tr><td>bending_stiffness</td>" in html
     assert "&lt;script&gt;&amp;" in html
@@ -108,7 +107,7 @@ def test_a_result_predicts_as_its_file_does(result, written):
 
 def test_a_number_is_no_executor(outcome):
     with pytest.raises(dlo.DloError, match=r"executor=2 is no Executor.\n  Try: with dlo_casadi"):
-        dlo.fit(outcome.config, executor=2)
+        dlo.fit(outcome.config.path, executor=2)
 
 
 def test_a_result_writes_what_the_command_writes(result, tmp_path, monkeypatch):

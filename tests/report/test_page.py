@@ -50,7 +50,7 @@ def diagnosed(outcome, **changes):
     diagnosis = outcome.config.diagnosis.model_copy(update={"enabled": True})
     closed = replace(outcome.stage("batch"), name="closed")
     found = {
-        "config": replace(outcome.config, diagnosis=diagnosis),
+        "config": outcome.config.model_copy(update={"diagnosis": diagnosis}),
         "stages": (*outcome.stages, closed),
         "effects": (EFFECT,),
         "candidates": CANDIDATES,
@@ -151,7 +151,7 @@ def test_a_fixed_parameter_has_no_interval():
 
 def test_a_configuration_that_has_gone_is_said_to_be(outcome, tmp_path):
     assert configuration_text(outcome.config) == outcome.config.path.read_text()
-    text = configuration_text(replace(outcome.config, path=tmp_path / "gone.yaml"))
+    text = configuration_text(outcome.config.noted(path=tmp_path / "gone.yaml"))
     assert text == "# gone.yaml cannot be read any more: No such file or directory"
 
 
@@ -169,7 +169,7 @@ def hostile(outcome):
     name = HOSTILE.replace("/", "")
     cable = outcome.config.cable.model_copy(update={"name": HOSTILE})
     first, *others = outcome.config.experiment.poses
-    first = first.model_copy(update={"file": first.file.with_name(f"{name}.csv")})
+    first = first.model_copy(update={"file": first.file.with_name(f"{name}.csv"), "name": name})
     experiment = outcome.config.experiment.model_copy(update={"poses": (first, *others)})
     stages = tuple(
         replace(stage, shapes={name: stage.shapes.get("pose_01"), **stage.shapes})
@@ -177,7 +177,7 @@ def hostile(outcome):
         if stage.shapes
     )
     poses = (replace(outcome.poses[0], name=name, messages=(HOSTILE,)), *outcome.poses[1:])
-    config = replace(outcome.config, cable=cable, experiment=experiment)
+    config = outcome.config.model_copy(update={"cable": cable, "experiment": experiment})
     return replace(outcome, config=config, poses=poses, stages=stages, warnings=(HOSTILE,))
 
 
@@ -224,7 +224,9 @@ def test_a_photograph_that_has_gone_is_replaced_by_the_board(photographed, tmp_p
     declared = photographed.config.experiment.poses
     poses = (declared[0].model_copy(update={"file": tmp_path / "pose_01.jpg"}), *declared[1:])
     experiment = photographed.config.experiment.model_copy(update={"poses": poses})
-    gone = replace(photographed, config=replace(photographed.config, experiment=experiment))
+    gone = replace(
+        photographed, config=photographed.config.model_copy(update={"experiment": experiment})
+    )
     first, second = pictures(gone)[:2]
 
     assert (first.behind.photograph, bool(first.behind.grid), len(first.lines)) == ("", True, 3)

@@ -71,10 +71,10 @@ def test_a_failed_session_carries_what_was_read(outcome):
     """Of a configuration whose files have gone."""
     first, *others = outcome.config.experiment.poses
     gone = [first] + [p.model_copy(update={"role": "held_out"}) for p in others]
-    gone[0] = first.model_copy(update={"file": first.file.with_name("gone.csv")})
+    gone[0] = first.model_copy(update={"file": first.file.with_name("gone.csv"), "name": "gone"})
     experiment = outcome.config.experiment.model_copy(update={"poses": tuple(gone)})
     with pytest.raises(MeasurementError, match="no fit pose") as caught:
-        run_session(replace(outcome.config, experiment=experiment))
+        run_session(outcome.config.model_copy(update={"experiment": experiment}))
 
     assert [pose.name for pose in caught.value.poses] == [pose.name for pose in gone]
     assert "cannot be read" in caught.value.poses[0].problem

@@ -73,7 +73,9 @@ def test_without_gravity_a_reading_is_asked_for_and_no_weight(outcome):
     experiment = outcome.config.experiment.model_copy(update={"gravity": (0.0, 0.0)})
     unknown = with_stiffness(outcome, (None, None))
     assert "hang a known weight" in said(unknown)
-    text = said(replace(unknown, config=replace(outcome.config, experiment=experiment)))
+    text = said(
+        replace(unknown, config=outcome.config.model_copy(update={"experiment": experiment}))
+    )
     assert "Try: end_force or start_force of a pose: without gravity" in text
     assert "hang a known weight" not in text
 
@@ -86,8 +88,8 @@ def test_a_parameter_on_its_bound_says_so(outcome):
 
 def test_an_added_effect_is_told_with_its_rivals(outcome):
     closed = replace(outcome.stage("batch"), name="closed")
-    config = replace(
-        outcome.config, diagnosis=outcome.config.diagnosis.model_copy(update={"enabled": True})
+    config = outcome.config.model_copy(
+        update={"diagnosis": outcome.config.diagnosis.model_copy(update={"enabled": True})}
     )
     text = said(
         replace(
@@ -149,8 +151,8 @@ def test_poses_on_another_branch_have_a_row_and_a_fact(outcome):
 
 
 def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):
-    config = replace(
-        outcome.config, diagnosis=outcome.config.diagnosis.model_copy(update={"enabled": True})
+    config = outcome.config.model_copy(
+        update={"diagnosis": outcome.config.diagnosis.model_copy(update={"enabled": True})}
     )
     text = said(replace(outcome, config=config, verdict="unexplained", unexplained=LOAD))
 

@@ -1,7 +1,6 @@
 """The camera of a session from its own photographs."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -59,7 +58,7 @@ def test_photographs_from_one_direction_are_no_calibration():
         r"camera is missing.* focal length is known to .* % only, .* within \d+ degrees.* Try: .*"
     )
     with pytest.raises(MeasurementError, match=said + "30 to 90 degrees apart, or .*camera"):
-        calibrated(replace(config, experiment=bare), lambda *_: None)
+        calibrated(config.model_copy(update={"experiment": bare}), lambda *_: None)
 
 
 def test_too_few_photographs(session):
@@ -67,7 +66,7 @@ def test_too_few_photographs(session):
     poses = config.experiment.poses
     few = config.experiment.model_copy(update={"poses": (poses[1],)})
     with pytest.raises(MeasurementError, match=r"camera is missing.* needs 3 photographs .* are 2"):
-        calibrated(replace(config, experiment=few), lambda *_: None)
+        calibrated(config.model_copy(update={"experiment": few}), lambda *_: None)
 
 
 def test_a_session_without_photographs(capsys):

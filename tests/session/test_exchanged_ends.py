@@ -1,7 +1,5 @@
 """Start and end exchanged in sessions of clamped cables that few points far apart show."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.measure import conditions, read_inputs
+from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import find_suspicions
 
 LENGTH, NOISE = 0.8, 3e-4  # m
@@ -49,7 +47,7 @@ def session(tmp_path):
     p[0] = 0.02  # N m^2
     rest = np.full(model.chain.n_rests, 0.5)
     rng = np.random.default_rng(0)
-    shapes = predict_poses(model, p, rest, [conditions(x) for x in config.experiment.poses])
+    shapes = predict_poses(model, p, rest, [x.held for x in config.experiment.poses])
     for pose, shape in zip(poses, shapes, strict=True):
         points = shape.curve.at(SHOWN) + NOISE * rng.standard_normal((len(SHOWN), 2))
         write_points(tmp_path / pose["file"], points)
@@ -63,7 +61,9 @@ def exchanged(config, keys):
         pairs = [(f"start{key}", f"end{key}") for key in keys]
         update = {a: getattr(pose, b) for pair in pairs for a, b in (pair, pair[::-1])}
         poses.append(pose.model_copy(update=update))
-    return replace(config, experiment=config.experiment.model_copy(update={"poses": tuple(poses)}))
+    return config.model_copy(
+        update={"experiment": config.experiment.model_copy(update={"poses": tuple(poses)})}
+    )
 
 
 def suspected(config):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,9 @@ def test_a_declared_mesh_is_kept_and_its_error_told():
     coarse = config.model.model_copy(update={"n": 6})
     estimation = config.estimation.model_copy(update={"algorithm1": False})
     diagnosis = config.diagnosis.model_copy(update={"exclude": tuple(EFFECTS)})
-    config = replace(config, model=coarse, estimation=estimation, diagnosis=diagnosis)
+    config = config.model_copy(
+        update={"model": coarse, "estimation": estimation, "diagnosis": diagnosis}
+    )
     outcome = run_session(config)
     assert outcome.discretization.n == 6
     (warning,) = [text for text in outcome.warnings if "mesh" in text]

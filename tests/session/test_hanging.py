@@ -1,6 +1,5 @@
 """Gravity held against the lines of cables between ball joints in space, drawn from the model."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from dlo_casadi.io.points import write_points
 from dlo_casadi.session import plausibility
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hypotheses import Session, load_over_stiffness, shown_pull
-from dlo_casadi.session.measure import conditions, read_inputs
+from dlo_casadi.session.measure import read_inputs
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LENGTH, STIFFNESS, NOISE = 0.8, 0.02, 3e-4  # m, N m^2, m
@@ -50,7 +49,7 @@ def curved(tmp_path_factory):
     rest = np.zeros(model.chain.n_rests)
     rest[len(rest) // 3 : 2 * len(rest) // 3] = 2.0
     rng = np.random.default_rng(0)
-    poses = [conditions(pose) for pose in config.experiment.poses]
+    poses = [pose.held for pose in config.experiment.poses]
     for name, shape in zip(names, predict_poses(model, p, rest, poses), strict=True):
         points = shape.curve.at(np.linspace(0.01, 0.99, 40) * LENGTH)
         write_points(folder / name, points + NOISE * rng.standard_normal(points.shape))
@@ -58,8 +57,8 @@ def curved(tmp_path_factory):
 
 
 def under(config, gravity):
-    return replace(
-        config, experiment=config.experiment.model_copy(update={"gravity": tuple(gravity)})
+    return config.model_copy(
+        update={"experiment": config.experiment.model_copy(update={"gravity": tuple(gravity)})}
     )
 
 

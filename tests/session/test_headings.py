@@ -1,7 +1,5 @@
 """Headings of clamps against the directions of the lines, on arcs of known ends."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -90,7 +88,10 @@ def test_the_heading_of_a_pinned_side_is_not_used(tmp_path):
     assert wrong_directions(Session(config, inputs))
     boundary = config.experiment.boundary.model_copy(update={"start": "pinned"})
     experiment = config.experiment.model_copy(update={"boundary": boundary})
-    assert wrong_directions(Session(replace(config, experiment=experiment), inputs)) == ()
+    assert (
+        wrong_directions(Session(config.model_copy(update={"experiment": experiment}), inputs))
+        == ()
+    )
 
 
 def test_one_wrong_heading_leaves_its_pose_out(tmp_path):

@@ -13,7 +13,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.fitting import declared_model, fit_declared
-from dlo_casadi.session.measure import MOST_POINTS, conditions, measured_poses, read_inputs
+from dlo_casadi.session.measure import MOST_POINTS, measured_poses, read_inputs
 from dlo_casadi.session.stages import fit_stage
 
 STD, MANY = 3e-4, 2000
@@ -60,7 +60,7 @@ def test_many_points_tell_what_all_of_them_do(tmp_path, marked):
     every = fit_of(
         config,
         [
-            MeasuredPose.of_points(conditions(pose), points, s=s)
+            MeasuredPose.of_points(pose.held, points, s=s)
             for pose, (points, s) in zip(config.experiment.poses, all_points, strict=True)
         ],
     )

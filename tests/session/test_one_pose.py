@@ -8,7 +8,6 @@ from dlo_casadi.config import load_config
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.session import run_session
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.measure import conditions
 
 NOISE = 3e-4
 # Boundary, length [m], mass [kg], EI [N m^2], waves of the rest curvature [turns], poses: the first
@@ -72,7 +71,7 @@ def session(folder, boundary, cable, waves, ends, seed):
     places = model.chain.cells.mean(axis=1) / length
     cosines = np.cos(np.pi * np.arange(3)[:, None] * places)
     rest = 2 * np.pi / length * (waves @ cosines)
-    found = predict_poses(model, p, rest, [conditions(pose) for pose in config.experiment.poses])
+    found = predict_poses(model, p, rest, [pose.held for pose in config.experiment.poses])
     rng = np.random.default_rng(seed)
     s = np.linspace(0.02, 0.98, 150) * length
     for pose, prediction in zip(poses, found, strict=True):

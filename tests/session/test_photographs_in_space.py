@@ -1,7 +1,6 @@
 """Photographs from several places on their way through a session."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -103,7 +102,7 @@ def test_a_camera_of_another_picture_size_is_told(config):
     camera = Camera(matrix=((540.0, 0.0, 321.0), (0.0, 540.0, 237.0), (0.0, 0.0, 1.0)))
     measurement = config.experiment.measurement.model_copy(update={"camera": camera})
     experiment = config.experiment.model_copy(update={"poses": (only,), "measurement": measurement})
-    (item,) = read_inputs(replace(config, experiment=experiment), lambda *_: None)
+    (item,) = read_inputs(config.model_copy(update={"experiment": experiment}), lambda *_: None)
     assert "pose_01_b: camera.matrix, with its principal point at (321, 237)" in item.problem
     assert "is not that of this picture of 1280 x 960 px" in item.problem
     assert not item.readable

@@ -43,7 +43,7 @@ def posed(config, change):
     """The configuration with poses changed: change(pose) -> new values."""
     poses = tuple(pose.model_copy(update=change(pose)) for pose in config.experiment.poses)
     experiment = config.experiment.model_copy(update={"poses": poses})
-    return replace(config, experiment=experiment)
+    return config.model_copy(update={"experiment": experiment})
 
 
 def oriented(config, change, sides=("start", "end")):
@@ -154,7 +154,7 @@ def test_files_out_of_step(session):
 def test_gravity_is_held_against_the_load_that_the_shapes_show(session, gravity):
     config, inputs = session[0], session[1][::3]
     experiment = config.experiment.model_copy(update={"gravity": gravity})
-    (found,) = find_suspicions(replace(config, experiment=experiment), inputs)
+    (found,) = find_suspicions(config.model_copy(update={"experiment": experiment}), inputs)
     assert "does not hang along gravity" in found.message
     assert "with gravity (0, 0, -9.81) m/s^2" in found.message
 

@@ -15,7 +15,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.session.clamps import Compared, misread
 from dlo_casadi.session.fitting import declared_model, straight
-from dlo_casadi.session.measure import conditions, read_inputs
+from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import find_suspicions
 
 ROOT = Path(__file__).parents[2]
@@ -136,12 +136,12 @@ def test_a_session_whose_readings_have_the_other_sign():
     model = straight(declared_model(config).model).with_mesh(10)
     declared = config.experiment.poses
     found = predict_poses(
-        model, model.nominal, np.zeros(model.chain.n_rests), [conditions(x) for x in declared]
+        model, model.nominal, np.zeros(model.chain.n_rests), [x.held for x in declared]
     )
     poses = tuple(
         pose.model_copy(update={"end_force": tuple(-one.equilibrium.end_force)})
         for pose, one in zip(declared, found, strict=True)
     )
     experiment = config.experiment.model_copy(update={"poses": poses})
-    said = find_suspicions(replace(config, experiment=experiment), inputs)
+    said = find_suspicions(config.model_copy(update={"experiment": experiment}), inputs)
     assert any("end_force" in x.message and "other sign" in x.message for x in said), said

@@ -15,7 +15,6 @@ from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.measure import conditions
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 CLEAN = DATA / "bench" / "clean" / "session.yaml"
@@ -41,7 +40,7 @@ def photographed(config, cameras) -> tuple[MeasuredPose, ...]:
         rays = np.column_stack([curve, np.full(len(curve), DISTANCE)]) - camera
         seen = camera - rays * (camera[2] / rays[:, 2:])
         points = seen[:, :2] + STD * rng.standard_normal(curve.shape)
-        ends = replace(conditions(pose), camera_center=tuple(camera))
+        ends = replace(pose.held, camera_center=tuple(camera))
         measured.append(MeasuredPose.of_points(ends, points, held_out=pose.role == "held_out"))
     return tuple(measured)
 
@@ -70,7 +69,7 @@ def test_without_a_calibrated_camera_it_is_no_candidate(config):
 def test_a_configuration_that_was_changed_by_hand_is_checked_again(config):
     options = config.diagnosis.model_copy(update={"exclude": ("stand_off",)})
     with pytest.raises(ConfigError, match=r"diagnosis\.exclude: no effect is called 'stand_off'"):
-        declared_model(replace(config, diagnosis=options))
+        declared_model(config.model_copy(update={"diagnosis": options}))
 
 
 def test_it_cannot_be_declared_without_a_calibrated_camera(tmp_path):

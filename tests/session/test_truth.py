@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import runpy
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -46,7 +45,9 @@ def test_stiffness_and_effects_are_those_of_the_truth(name):
     config = load_config(ROOT / "tests" / "data" / "bench" / name / "session.yaml")
     true = true_effects(name)
     effects = tuple(declared_effect(*item) for item in true.items())
-    config = replace(config, model=config.model.model_copy(update={"effects": effects}))
+    config = config.model_copy(
+        update={"model": config.model.model_copy(update={"effects": effects})}
+    )
     measured = measured_poses(config, read_inputs(config, lambda *_: None))
     declared = declared_model(config)
     fit = fit_model(
