@@ -7,6 +7,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from dlo_casadi.effects import EFFECTS
+
 EXAMPLES = Path(__file__).parents[1] / "scripts" / "examples"
 
 
@@ -53,3 +55,33 @@ def test_the_end_is_led_past_the_obstacles_with_less_pull_than_on_the_shortest_w
         for *center, radius in script.DISCS:
             gaps = np.linalg.norm(points.T - center, axis=1) - radius
             assert gaps.min() - known.model.cable.diameter / 2 >= script.GAP - 1e-6
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+    """Scripts beside an example can be imported."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+
+
+def test_points_of_a_new_pose_lie_in_the_band(simulated, tmp_path):
+    script = example("fit_arrays")
+    result = script.main(tmp_path / "picture.png")
+    low, high = result.stages[-1].parameters["bending_stiffness"].interval_95
+    assert low < example("simulated_rod").EI < high
+    assert high - low < 0.1 * low
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_what_the_next_pose_tells_is_foreseen(simulated, tmp_path):
+    before, foreseen, fitted = example("next_pose").main(tmp_path / "picture.png", size=5)
+    assert fitted < 0.2 * before
+    assert foreseen == pytest.approx(fitted, rel=0.1)
+
+
+def test_an_effect_of_ones_own_is_found(simulated, tmp_path, monkeypatch):
+    script = example("own_effect")
+    monkeypatch.setitem(EFFECTS, "balloon", script.Balloon)  # and taken back
+    (effect,) = script.main(tmp_path / "picture.png").effects
+    assert effect.name == "balloon"
+    for name, true in (("lift", script.LIFT), ("position", script.PLACE)):
+        assert abs(effect.parameters[name].value - true) < 3 * effect.parameters[name].std
