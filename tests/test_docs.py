@@ -164,3 +164,11 @@ def test_every_public_name_has_its_entry():
         public = getattr(dlo, name)
         home = getattr(public, "__module__", None)
         assert home is None or {f"{home}.{name}", home} & objects, f"::: {home}.{name}"
+
+
+def test_every_example_is_shown():
+    shown = TEXTS["docs/pages/how-to/examples.md"]
+    names = {script.stem for script in (ROOT / "scripts/examples").glob("*.py")}
+    assert [
+        name for name in names - {"simulated_rod"} if f'"scripts/examples/{name}.py"' not in shown
+    ] == []

@@ -45,7 +45,7 @@ def draw(result: dlo.Result, shape: dlo.Shape, points: np.ndarray) -> Figure:
     above.plot(*shape.points.T, label="predicted")
     above.plot(*points.T, "k.", ms=4, label="measured, not fitted")
     above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="five fitted poses, a new one")
-    above.legend(frameon=False, fontsize=8, loc="lower right")
+    above.legend(frameon=False, fontsize=8, loc="upper left")
     for half, label in (
         (np.hypot(shape.band, 1.645 * NOISE), "holds 90 % of new points"),
         (shape.band, "holds 90 % of new shapes"),

@@ -118,7 +118,7 @@ def _seen(
 ) -> NodeCurve:
     """Curve of given headings."""
     given = Inputs.of(model.nominal, rest, pose.vector[None])
-    shapes = Shapes.declared(x[None], lam[None])
+    shapes = Shapes.declared(x.reshape(1, -1, 1), lam[None])
     return NodeCurve.of(published.LENGTH, assembly_of(model).curve(shapes, given)[0])
 
 
