@@ -172,3 +172,9 @@ def test_every_example_is_shown():
     assert [
         name for name in names - {"simulated_rod"} if f'"scripts/examples/{name}.py"' not in shown
     ] == []
+
+
+@pytest.mark.parametrize("page", [page for page in TEXTS if page != "README.md"])
+def test_lines_of_code_fit_on_a_page(page):
+    lines = "".join(blocks(TEXTS[page], r"\w*")).splitlines()
+    assert [line for line in lines if len(line) > 100] == []
