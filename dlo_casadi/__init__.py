@@ -10,9 +10,11 @@ if TYPE_CHECKING:
     from dlo_casadi.api import Session as Session
     from dlo_casadi.api import fit as fit
     from dlo_casadi.api import predict as predict
-    from dlo_casadi.cable import FittedCable as FittedCable
-    from dlo_casadi.cable import Shape as Shape
-    from dlo_casadi.cable import load as load
+    from dlo_casadi.cable.estimate import Covariance as Covariance
+    from dlo_casadi.cable.estimate import Estimate as Estimate
+    from dlo_casadi.cable.file import load as load
+    from dlo_casadi.cable.fitted_cable import FittedCable as FittedCable
+    from dlo_casadi.cable.fitted_cable import Shape as Shape
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Cable as Cable
     from dlo_casadi.config import Pose as Pose
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
 # answers at once and an interrupt finds it ready.
 _PUBLIC = {
     "api": "Result Session fit predict",
-    "cable": "FittedCable Shape load",
+    "cable.estimate": "Covariance Estimate",
+    "cable.file": "load",
+    "cable.fitted_cable": "FittedCable Shape",
     "codegen": "CompiledSolver",
     "config": "Cable Pose",
     "effects": "EFFECTS",

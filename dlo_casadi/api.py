@@ -18,14 +18,17 @@ from typing import Any, Self, TypeVar
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from dlo_casadi.cable import FittedCable, Shape, load
-from dlo_casadi.config import Cable, Config, Pose, checked_config, is_photographed, load_as
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimate import Covariance, Estimate
+from dlo_casadi.cable.file import load
+from dlo_casadi.cable.fitted_cable import FittedCable, Shape
+from dlo_casadi.config import Cable, Config, Pose, any_photographs, checked_config, load_as
 from dlo_casadi.config.problems import Arguments
 from dlo_casadi.config.values import plain
 from dlo_casadi.errors import DloError
 from dlo_casadi.report.documents import fitted_cable
 from dlo_casadi.report.figures_poses import outcome_figure
-from dlo_casadi.report.tables import outcome_html, outcome_text
+from dlo_casadi.report.tables import estimates_of, outcome_html, outcome_text, summary_text
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
 
@@ -49,6 +52,60 @@ class Result(Outcome):
     def plot(self) -> Figure:
         """All poses in one frame: measured points, and shapes predicted from their ends alone."""
         return outcome_figure(self)
+
+    @cached_property
+    def params(self) -> dict[str, Estimate]:
+        """All parameters of the last stage by name: value, std, interval_95, unit, fixed.
+
+        Those that are known within a tolerance, such as `length_error.length_difference`, stand
+        after the fitted ones. Intervals are profile likelihoods; a model that does not explain what
+        was measured has none.
+        """
+        return estimates_of(self)
+
+    @property
+    def covariance(self) -> Covariance:
+        """Covariance of all fitted parameters by their names, the residual's excess included."""
+        return Covariance(*self.fit.named_covariance)
+
+    @property
+    def residuals(self) -> dict[str, FloatArray]:
+        """Measured minus predicted points (K, d) [m] of each pose in the last stage.
+
+        Predicted from the ends of the pose alone; poses without points are absent.
+        """
+        shapes = self.stages[-1].shapes
+        return {name: shape.gap for name, shape in shapes.items() if len(shape.gap)}
+
+    def summary(self) -> str:
+        """Text on the whole fit: errors, all parameters, effects, strong correlations, warnings."""
+        return summary_text(self)
+
+    def to_dataframe(self) -> Any:
+        """`params` as a pandas.DataFrame, one row each.
+
+        Raises
+        ------
+        DloError
+            If pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            raise DloError(
+                "pandas is not installed.\n  Try: pip install pandas, or `params`."
+            ) from None
+        rows = [
+            {
+                "value": x.value,
+                "std": x.std,
+                **dict(zip(("low_95", "high_95"), x.interval_95 or (None, None), strict=True)),
+                "unit": x.unit,
+                "fixed": x.fixed,
+            }
+            for x in self.params.values()
+        ]
+        return DataFrame(rows, index=list(self.params))
 
     def write(self, folder: str | Path) -> Path:
         """Write report, parameters, centre-lines and figures, as `dlo fit` does.
@@ -124,7 +181,7 @@ class Session(Config):
     ) -> None:
         measurement = _given(std=std, force_std=force_std, moment_std=moment_std)
         equipment = _given(camera=camera, board=board, reference=reference)
-        pictures = bool(equipment) or any(map(is_photographed, poses))
+        pictures = bool(equipment) or any_photographs(poses)
         experiment = _given(
             gravity=gravity,
             boundary=boundary,

@@ -52,7 +52,7 @@ from scipy.special import stdtrit
 
 import dlo_casadi as dlo
 from dlo_casadi.api import Result
-from dlo_casadi.cable import Shape
+from dlo_casadi.cable.fitted_cable import Shape
 from dlo_casadi.cli import main as command
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import student_95, threshold

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import dlo_casadi as dlo
-from dlo_casadi.cable import load
+from dlo_casadi.cable.file import load
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import EFFECTS, CableData, Effect, Fitted, PointForce, PointLoad, Setup
 from dlo_casadi.effects.cable import Parameter

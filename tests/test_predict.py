@@ -264,7 +264,7 @@ def evenly_rolled(loom):
 
 def test_near_half_a_turn_both_ways_round_are_predicted(loom, evenly_rolled):
     """By how much more the clamp is rolled is the angle; it is known no better than end_roll."""
-    std = load(loom).metadata.std["end_roll"]
+    std = load(loom).params["end_roll"].std
     for more, turns in ((-0.5 * std, 0.5), (0.5 * std, -0.5)):
         ends = evenly_rolled(more)
         shape = predict(loom, **ends)
@@ -281,7 +281,7 @@ def test_near_half_a_turn_both_ways_round_are_predicted(loom, evenly_rolled):
 
 
 def test_the_command_tells_both_ways_round(loom, evenly_rolled, capsys):
-    std = load(loom).metadata.std["end_roll"]
+    std = load(loom).params["end_roll"].std
     ends = evenly_rolled(-0.5 * std)
     numbers = {key: [str(x) for x in ends[key]] for key in ("end", "end_orientation")}
     asked = ["--end", *numbers["end"], "--end-orientation", *numbers["end_orientation"]]

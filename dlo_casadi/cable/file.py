@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from dlo_casadi.cable.estimate import Covariance, Estimate
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.cable.metadata import Metadata
 from dlo_casadi.config.document import Document
@@ -100,6 +101,13 @@ class _Value(OpenSection):
     tolerance: float | None = None
     interval_95: tuple[float | None, float | None] | None = None
     identifiable: bool | None = None
+    unit: str = ""
+    fitted: bool = False
+
+    @property
+    def estimate(self) -> Estimate:
+        known = (self.interval_95, self.identifiable)
+        return Estimate(self.value, self.std or 0.0, self.unit, *known, fixed=not self.fitted)
 
 
 class _Fitted(OpenSection):
@@ -279,10 +287,9 @@ def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
     rest_scatter = RestScatter(scatter.rest_curvature_std, scatter.rest_curvature_smoothness)
     return Metadata(
         path=source,
-        names=names,
-        covariance=covariance,
+        params={name: row.estimate for name, row in file.parameters.items()},
+        covariance=Covariance(names, covariance),
         uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter, scatter.hanging),
-        std={name: row.std or 0.0 for name, row in file.parameters.items()},
         coefficients=np.array(file.rest_curvature.coefficients, dtype=float),
         fixtures=file.fixtures or {},
         identifiable=stiffness.identifiable,

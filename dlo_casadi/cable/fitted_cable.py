@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.curve import CableCurve
+from dlo_casadi.cable.estimate import Covariance, Estimate
 from dlo_casadi.cable.held import held_pose
 from dlo_casadi.cable.metadata import Metadata
 from dlo_casadi.cable.picture import draw_shape
@@ -65,6 +66,16 @@ class FittedCable(CasadiCable):
     def name(self) -> str:
         """What the cable is called."""
         return self.model.cable.name
+
+    @property
+    def params(self) -> dict[str, Estimate]:
+        """All parameters of the model by name, as they were estimated."""
+        return self.metadata.params
+
+    @property
+    def covariance(self) -> Covariance:
+        """Covariance of all fitted parameters by their names."""
+        return self.metadata.covariance
 
     @property
     def length(self) -> float:

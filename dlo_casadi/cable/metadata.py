@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimate import Covariance, Estimate
 from dlo_casadi.equilibrium.spread import Uncertainty
 
 
@@ -16,14 +17,11 @@ class Metadata:
     ----------
     path : Path or None
         The file, or the session's.
-    names : tuple of str
-        Fitted parameters, in the order of `covariance`.
-    covariance : (N, N)
-        In the products of the parameters' units.
+    params : dict of Estimate
+        All parameters of the model by name.
+    covariance : Covariance
     uncertainty : Uncertainty
         The same with the scatter from pose to pose.
-    std : dict
-        Standard deviation of each parameter by name [SI]; 0 where it was not fitted.
     coefficients : (n_coefficients,) [1/m]
         Of the rest curvature before the first pose; in space about the axis y, then about z.
     fixtures : dict
@@ -47,10 +45,9 @@ class Metadata:
     """
 
     path: Path | None
-    names: tuple[str, ...]
-    covariance: FloatArray
+    params: dict[str, Estimate]
+    covariance: Covariance
     uncertainty: Uncertainty
-    std: dict[str, float]
     coefficients: FloatArray
     fixtures: dict[str, Any]
     identifiable: bool | None

@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from dlo_casadi.cable import FittedCable, load
+from dlo_casadi.cable.file import load
+from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, one_of, option
 from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate

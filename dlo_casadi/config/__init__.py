@@ -6,9 +6,9 @@ reported at once, each with its line.
 
 from dlo_casadi.config.document import dump_yaml, read_yaml
 from dlo_casadi.config.load import (
+    any_photographs,
     checked_config,
     declared_setup,
-    is_photographed,
     load_as,
     load_config,
     wrong_effects,

@@ -98,9 +98,14 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
 _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 
 
-def is_photographed(pose: object) -> bool:
-    """Whether a file of the pose has the name of a picture."""
-    return isinstance(pose, Pose) and any(x.suffix.lower() in _IMAGE_ENDINGS for x in pose.paths)
+_RELATIVE = "files are found relative to the YAML, from Python relative to the working directory"
+
+
+def any_photographs(poses: object) -> bool:
+    """Whether a file of the poses has the name of a picture."""
+    listed = poses if isinstance(poses, list | tuple) else ()
+    paths = [path for pose in listed if isinstance(pose, Pose) for path in pose.paths]
+    return any(path.suffix.lower() in _IMAGE_ENDINGS for path in paths)
 
 
 # Results are named after a pose, with up to forty characters more; file systems take 255 bytes.
@@ -268,7 +273,7 @@ def _absent(file: Path) -> str:
     except (FileNotFoundError, NotADirectoryError):
         names = [path.name for path in file.parent.glob("*")]
         near = difflib.get_close_matches(file.name, names, 1, cutoff=0.8)
-        meant = f"did you mean {near[0]}?" if near else "files are found relative to the YAML"
+        meant = f"did you mean {near[0]}?" if near else _RELATIVE
         return f"{file} does not exist; {meant}"
     except OSError as error:
         return f"{show(str(file))} cannot be read: {error.strerror}"

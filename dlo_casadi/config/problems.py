@@ -227,7 +227,8 @@ def explain(
     for error in errors:
         place, kind, found = error["loc"], error["type"], error["input"]
         context = error.get("ctx", {})
-        section, label, key = _section_at(place[:-1], sections), source.label(place), place[-1]
+        section, label = _section_at(place[:-1], sections), source.label(place)
+        key = place[-1] if place else ""
         if found == PLACEHOLDER:
             text = f"{label} is still to be filled in{_help(section, key)}"
         elif kind == "missing" and isinstance(key, int):

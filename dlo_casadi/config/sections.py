@@ -34,7 +34,7 @@ from dlo_casadi.config.values import (
     within,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.errors import counted, well_formed
+from dlo_casadi.errors import ConfigError, counted, well_formed
 from dlo_casadi.rod.ends import REACTIONS
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
@@ -210,6 +210,9 @@ class Pose(Section):
         return HeldPose(**{name: getattr(self, name) for name in names})
 
     def __init__(self, *ends: Any, **values: Any) -> None:
+        if len(ends) > 2:
+            text = "start and end alone may stand without their names"
+            raise ConfigError(f"{counted(len(ends), 'argument')} without a name: {text}")
         super().__init__(**dict(zip(("start", "end"), ends, strict=False)), **values)
 
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
@@ -283,6 +286,13 @@ class Experiment(Section):
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
 
+    @field_validator("poses", mode="before")
+    @classmethod
+    def _listed(cls, poses: Any) -> Any:
+        if isinstance(poses, Section):
+            raise ValueError("a list belongs here, found one pose")
+        return poses
+
     @field_validator("poses")
     @classmethod
     def _shown(cls, poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
@@ -351,6 +361,8 @@ class Config(Section):
     def __repr__(self) -> str:
         poses = counted(len(self.experiment.poses), "pose")
         return f"<{type(self).__name__} {self.name!r}: {poses}>"
+
+    __str__ = __repr__
 
     def noted(self, **notes: Any) -> Self:
         """The same with other `path`, `warnings` or `skipped`."""

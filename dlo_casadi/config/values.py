@@ -6,7 +6,7 @@ with the range that is allowed. What can be computed but is hardly meant is a wa
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -137,6 +137,10 @@ def implausible_quaternion(values: Sequence[float]) -> str:
 # ---- types -------------------------------------------------------------------------------------
 
 
+# Items of a list that a section shows of itself.
+_SHOWN = 6
+
+
 def plain(value: Any) -> Any:
     """Arrays and NumPy's numbers as lists and numbers of Python, as they stand in a file."""
     if hasattr(value, "tolist"):
@@ -146,6 +150,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     return value
+
+
+class _Long(int):
+    """A list of so many items, where only that is told."""
+
+    def __repr__(self) -> str:
+        return f"<{counted(int(self), 'item')}>"
 
 
 class Section(BaseModel):
@@ -163,6 +174,13 @@ class Section(BaseModel):
         except ValidationError as error:
             given = Arguments(values)
             raise given.error(explain(type(self), error.errors(), given)) from None
+
+    def __repr_args__(self) -> Iterator[tuple[str, Any]]:
+        """What was given, long lists by their length."""
+        for name in (x for x in type(self).model_fields if x in self.model_fields_set):
+            value = getattr(self, name)
+            long = isinstance(value, tuple) and len(value) > _SHOWN
+            yield name, _Long(len(value)) if long else value
 
     # Sections inside of others are made by pydantic, which collects all problems of the whole.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
@@ -235,7 +253,7 @@ def _table(words: str, *columns: int) -> BeforeValidator:
             array = np.asarray(value)
         except ValueError:  # rows of different lengths
             array = np.zeros(0, object)
-        if array.dtype.kind not in "fiu" or not isinstance(value, list | tuple):
+        if array.dtype.kind not in "fiu" or not array.size or not isinstance(value, list | tuple):
             raise ValueError(f"{belongs}, found {show(value)}")
         if array.ndim != 1 + bool(columns) or (columns and array.shape[1] not in columns):
             raise ValueError(f"{belongs}, found numbers of the shape {array.shape}")
@@ -256,7 +274,7 @@ def _table(words: str, *columns: int) -> BeforeValidator:
 
 
 def _moment(value: object) -> object:
-    if isinstance(value, list | tuple) and len(value) == 3:
+    if isinstance(value, list | tuple) and len(value) in (1, 3):
         return value
     if isinstance(value, int | float) and not isinstance(value, bool):
         return (value,)
@@ -282,7 +300,7 @@ Direction = Annotated[
 Place = Annotated[Direction, within(COORDINATE)]
 Gravity = Annotated[Direction, checked(lambda vector: GRAVITY.complaint(math.hypot(*vector)))]
 Points = Annotated[
-    tuple[tuple[float, ...], ...], _table("points [[x, y], ...], in space [[x, y, z], ...]", 2, 3)
+    tuple[tuple[float, ...], ...], _table("numbers [[x, y], ...], in space [[x, y, z], ...]", 2, 3)
 ]
 ArcLengths = Annotated[tuple[float, ...], _table("arc lengths [s, ...]")]
 Force = Annotated[Direction, within(FORCE)]

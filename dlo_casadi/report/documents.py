@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable import FittedCable
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.file import SCHEMA, metadata_of, parameters_hash
+from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.config import Config, dump_yaml
 from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.errors import DloError, well_formed
@@ -23,14 +24,10 @@ from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.report.words import ALWAYS, all_warnings
 from dlo_casadi.session.hypotheses import Suspicion
-from dlo_casadi.session.outcome import (
-    Outcome,
-    ParameterEstimate,
-    PoseInput,
-    RestCurvatureEstimate,
-    Stage,
-    StageName,
-)
+from dlo_casadi.session.outcome import Outcome, PoseInput, RestCurvatureEstimate, Stage, StageName
+
+# What report.json has of a parameter of an added effect.
+_OF_EFFECT = ("value", "std", "unit")
 
 
 def report_dict(outcome: Outcome) -> dict[str, Any]:
@@ -63,7 +60,11 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
             "held_out_inside_90": outcome.inside_band,
         },
         "discretization": {"n": mesh.n, "element": mesh.element, "error_m": mesh.error},
-        "effects": list(map(asdict, outcome.effects)),
+        "effects": [
+            asdict(effect)
+            | {"parameters": {k: fields_of(x, *_OF_EFFECT) for k, x in effect.parameters.items()}}
+            for effect in outcome.effects
+        ],
         "candidates": [asdict(row) | {"reason": row.reason or None} for row in outcome.candidates],
         "verdict": outcome.verdict,
         "either_side": {name: asdict(found) for name, found in outcome.either_side.items()},
@@ -117,7 +118,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
     stage, held_out = outcome.stage(name), None
     if stage is None or not stage.parameters:
         nothing = RestCurvatureEstimate(*np.zeros((3, 0)))
-        unknown = {"bending_stiffness": ParameterEstimate(math.nan, math.nan, "N m^2")}
+        unknown = {"bending_stiffness": Estimate(math.nan, math.nan, "N m^2")}
         stage = Stage(name, None, None, None, unknown, nothing, {})
     else:
         held_out = asdict(outcome.held_out(stage))

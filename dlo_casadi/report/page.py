@@ -15,6 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.config import Config
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.errors import DloError, counted
@@ -24,7 +25,7 @@ from dlo_casadi.report.figures import figures_of
 from dlo_casadi.report.page_pictures import pictures, pose_pictures, scene_pictures, view_pictures
 from dlo_casadi.report.scene import VIEWS
 from dlo_casadi.report.words import compared
-from dlo_casadi.session.outcome import Outcome, ParameterEstimate, PoseInput
+from dlo_casadi.session.outcome import Outcome, PoseInput
 from dlo_casadi.show import text
 from dlo_casadi.show.text import millimetres
 from dlo_casadi.thresholds import NORMAL_95
@@ -152,7 +153,7 @@ def parameter_rows(outcome: Outcome) -> list[dict[str, str]]:
     return [dict(zip(keys, row, strict=True)) for row in rows]
 
 
-def symmetric_interval(estimate: ParameterEstimate) -> str:
+def symmetric_interval(estimate: Estimate) -> str:
     """A 95 % interval from the standard deviation, where no profile was computed."""
     if estimate.identifiable is False or not estimate.std > 0:
         return ""

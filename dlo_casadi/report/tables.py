@@ -1,15 +1,20 @@
 """Rows of the tables of a report: parameters, errors, time, one predicted pose; notebooks."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
+from dlo_casadi.cable.estimate import Covariance, Estimate
+from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import counted
 from dlo_casadi.report import words
-from dlo_casadi.session.outcome import MASS, Outcome, ParameterEstimate
+from dlo_casadi.session.outcome import MASS, Outcome
 from dlo_casadi.show import text
 from dlo_casadi.show.text import html_table
 
+# Correlations that a summary names.
+_STRONG = 0.9
 # A row of the tables of parameters: name, value, 95 % interval, remark.
 Row = tuple[str, str, str, str]
 
@@ -17,7 +22,7 @@ Row = tuple[str, str, str, str]
 NO_FIT = "of a model that does not fit"
 
 
-def describe(estimate: ParameterEstimate, explains: bool | None = None) -> tuple[str, str, str]:
+def describe(estimate: Estimate, explains: bool | None = None) -> tuple[str, str, str]:
     """Value, interval and remark: no number where the data do not tell one.
 
     `explains`: of the stage; without a model that fits there is neither std nor interval.
@@ -34,7 +39,7 @@ def describe(estimate: ParameterEstimate, explains: bool | None = None) -> tuple
     return (value, interval, "at a bound" if estimate.at_bound else "")
 
 
-def unidentified(estimate: ParameterEstimate) -> str:
+def unidentified(estimate: Estimate) -> str:
     """What can be said of a parameter that the shapes do not determine."""
     low, high = estimate.interval_95 or (None, None)
     unit = _after(estimate.unit)
@@ -242,6 +247,52 @@ def outcome_text(outcome: Outcome) -> str:
     warnings = len(words.all_warnings(outcome))
     if warnings:
         lines.append(f"  {counted(warnings, 'warning')}: see .warnings")
+    return "\n".join(lines)
+
+
+def estimates_of(outcome: Outcome) -> dict[str, Estimate]:
+    """All parameters of the last stage; what is known within tolerances comes last."""
+    stage, fit = outcome.stages[-1], outcome.fit
+    known, free = dict(stage.parameters), fit.problem.unknowns.names
+    for q in fit.model.parameters:
+        if q.name not in known and not (q.name == MASS_FACTOR and MASS in known):
+            known[q.name] = Estimate(
+                fit.value(q.name), fit.std(q.name), q.unit, fixed=q.name not in free
+            )
+    if stage.explains is False:
+        return {name: replace(x, interval_95=None) for name, x in known.items()}
+    return known
+
+
+def summary_text(outcome: Outcome) -> str:
+    """Errors, all parameters, strong correlations and warnings."""
+    fit, names = outcome.fit, outcome.fit.named_covariance[0]
+    covariance = Covariance(*fit.named_covariance)
+    shown, correlation = estimates_of(outcome), covariance.correlation
+    measurement = outcome.measurement
+    poses = counted(measurement.poses_fit + measurement.poses_held_out, "pose")
+    width = max(map(len, shown))
+    pairs = [
+        (abs(correlation[i, j]), f"  {names[i]}, {names[j]}: {correlation[i, j]:+.2f}")
+        for i in range(len(names))
+        for j in range(i)
+        if {names[i], names[j]} <= set(shown) and abs(correlation[i, j]) > _STRONG
+    ]
+    warnings = [*outcome.doubts, *words.all_warnings(outcome)]
+    verdict, *more = words.verdict_lines(outcome)
+    lines = [
+        f"{outcome.config.cable.name}: {verdict}",
+        *more,
+        f"  {poses} ({measurement.poses_held_out} held out), "
+        f"{counted(measurement.points, 'point')}",
+        *("  " + "  ".join(filter(None, row)) for row in error_rows(outcome)),
+        "Parameters",
+        *(f"  {name:{width}}  {found}" for name, found in shown.items()),
+    ]
+    if pairs:
+        lines += [f"Correlations beyond {_STRONG}", *(said for _, said in sorted(pairs)[::-1])]
+    if warnings:
+        lines += ["Warnings", *(f"  {said}" for said in warnings)]
     return "\n".join(lines)
 
 

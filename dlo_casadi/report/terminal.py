@@ -8,7 +8,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dlo_casadi.cable import Shape
+from dlo_casadi.cable.fitted_cable import Shape
 from dlo_casadi.config import Config
 from dlo_casadi.errors import counted
 from dlo_casadi.report import tables, words

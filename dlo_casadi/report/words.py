@@ -11,7 +11,7 @@ from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted
 from dlo_casadi.session.outcome import FoundEffect, Outcome, Stage, StageName
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
-from dlo_casadi.show.text import millimetres, plus_minus, vector
+from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import APART, NOTABLE
 
 # By what name tables and charts have the RMS distance that the noise of points gives by itself.
@@ -224,12 +224,7 @@ def structure_lines(outcome: Outcome) -> list[str]:
 
 
 def _effect_lines(effect: FoundEffect) -> list[str]:
-    values = [
-        f"{name} unbounded"
-        if found.value is None
-        else f"{name} {plus_minus(found.value, found.std or 0.0)} {found.unit}".strip()
-        for name, found in effect.parameters.items()
-    ]
+    values = [f"{name} {found}" for name, found in effect.parameters.items()]
     line = f"  {effect.name}: {', '.join(values)}"
     if effect.p_value is not None:
         # Below the smallest double it is zero.

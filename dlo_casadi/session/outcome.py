@@ -1,5 +1,6 @@
 """What a session of measurements has led to: plain results, computed elsewhere."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -7,6 +8,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import Diagnosis, Verdict
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, NextPose
@@ -26,32 +28,6 @@ StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"
 MASS = "mass"
 # Stages that a batch estimate must not be worse than.
 SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
-
-
-@dataclass(frozen=True)
-class ParameterEstimate:
-    """One parameter of one stage.
-
-    Parameters
-    ----------
-    value, std : float
-        In `unit`; std is 0 where the parameter was not estimated.
-    unit : str
-    interval_95 : (float or None, float or None), optional
-        Profile-likelihood interval; None in it = unbounded; absent = not computed.
-    identifiable : bool, optional
-        False where the interval is unbounded or spans more than a factor of ten; of a parameter
-        without one, where the measurements tell less than its bounds do, whose width std then is.
-    at_bound : bool
-        Whether the value sits on a physical bound.
-    """
-
-    value: float
-    std: float
-    unit: str
-    interval_95: tuple[float | None, float | None] | None = None
-    identifiable: bool | None = None
-    at_bound: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,7 +64,7 @@ class Stage:
         Over all measured points of that role; None if there are none, or if a pose of that role
         has no prediction.
     chi2_per_dof : float or None
-    parameters : dict of ParameterEstimate
+    parameters : dict of Estimate
     rest_curvature : RestCurvatureEstimate
     shapes : dict of PoseShape
         By pose name; poses without a prediction are absent.
@@ -110,7 +86,7 @@ class Stage:
     rmse_fit: float | None
     rmse_held_out: float | None
     chi2_per_dof: float | None
-    parameters: dict[str, ParameterEstimate]
+    parameters: dict[str, Estimate]
     rest_curvature: RestCurvatureEstimate
     shapes: dict[str, PoseShape]
     note: str = ""
@@ -291,22 +267,13 @@ class Discretization:
 
 
 @dataclass(frozen=True)
-class EffectParameter:
-    """Value and standard deviation of an effect's parameter in its unit; None where unbounded."""
-
-    value: float | None
-    std: float | None
-    unit: str
-
-
-@dataclass(frozen=True)
 class FoundEffect:
-    """An effect that was added to the model. `effect["name"]` is `effect.name`, as in report.json.
+    """An effect that was added to the model.
 
     Parameters
     ----------
     name : str
-    parameters : dict of EffectParameter
+    parameters : dict of Estimate
     p_value : float
         See `AddedEffect`.
     rmse_cross_validated_before, rmse_cross_validated_after : float or None [m]
@@ -316,14 +283,11 @@ class FoundEffect:
     """
 
     name: str
-    parameters: dict[str, EffectParameter]
+    parameters: dict[str, Estimate]
     p_value: float | None
     rmse_cross_validated_before: float | None
     rmse_cross_validated_after: float | None
     indistinguishable_from: tuple[str, ...]
-
-    def __getitem__(self, field: str) -> Any:
-        return getattr(self, field)
 
 
 def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
@@ -343,22 +307,20 @@ def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
     )
 
 
-def effect_parameters(fit: Fit, effect: Effect) -> dict[str, EffectParameter]:
+def effect_parameters(fit: Fit, effect: Effect) -> dict[str, Estimate]:
     """Parameters of an effect by their names.
 
     Those that vanish at infinity are estimated as their inverse; both are given.
     """
-    rows: dict[str, EffectParameter] = {}
+    rows: dict[str, Estimate] = {}
     for q in effect.parameters(fit.model.cable):
         full = f"{effect.label}.{q.name}"
         value, std = fit.value(full), fit.std(full)
-        rows[q.name] = EffectParameter(value, std, q.unit)
+        rows[q.name] = Estimate(value, std, q.unit, fixed=not std)
         if q.name in effect.inverses:
             name, unit = effect.inverses[q.name]
-            known = value > 0
-            rows[name] = EffectParameter(
-                1 / value if known else None, std / value**2 if known else None, unit
-            )
+            inverse = (1 / value, std / value**2) if value > 0 else (math.inf, math.inf)
+            rows[name] = Estimate(*inverse, unit, fixed=not std)
     return rows
 
 

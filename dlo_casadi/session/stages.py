@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import (
@@ -30,14 +31,7 @@ from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
 from dlo_casadi.paper.algorithm1 import Algorithm1Result
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.outcome import (
-    MASS,
-    ParameterEstimate,
-    ReadingErrors,
-    RestCurvatureEstimate,
-    Stage,
-    StageName,
-)
+from dlo_casadi.session.outcome import MASS, ReadingErrors, RestCurvatureEstimate, Stage, StageName
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 from dlo_casadi.thresholds import IDENTIFIABLE, NORMAL_95, UNSEEN
 
@@ -110,7 +104,7 @@ class _Model:
         self,
         name: StageName,
         measured: Sequence[MeasuredPose],
-        parameters: dict[str, ParameterEstimate],
+        parameters: dict[str, Estimate],
         rest_curvature: RestCurvatureEstimate,
         chi2_per_dof: float | None = None,
         note: str = "",
@@ -262,7 +256,7 @@ def _no_rest(model: CableModel) -> RestCurvatureEstimate:
 def initial_stage(model: CableModel, measured: Sequence[MeasuredPose]) -> Stage:
     """Prior stiffness, straight at rest: the paper's alpha^0."""
     stiffness = {
-        model.names[k]: ParameterEstimate(float(model.nominal[k]), 0.0, "N m^2")
+        model.names[k]: Estimate(float(model.nominal[k]), 0.0, "N m^2")
         for k in model.stiffness_indices
     }
     straight = _Model(model, model.nominal, np.zeros(model.chain.n_rests))
@@ -279,7 +273,7 @@ def stiffness_stage(
     known = bool(2 * half < np.log(IDENTIFIABLE))
     low, high = (float(found.EI * np.exp(x)) if known else None for x in (-half, half))
     spread = found.EI * min(found.log_std, 1e3)
-    stiffness = ParameterEstimate(found.EI, spread, "N m^2", (low, high), known)
+    stiffness = Estimate(found.EI, spread, "N m^2", (low, high), known)
     straight = _Model(model, p, np.zeros(model.chain.n_rests))
     return straight.stage(
         "stiffness_only", measured, {BENDING_STIFFNESS: stiffness}, _no_rest(model)
@@ -300,7 +294,7 @@ def algorithm1_stage(
     return _Model(result.model, result.p, result.rest).stage(
         "algorithm1",
         measured,
-        {BENDING_STIFFNESS: ParameterEstimate(result.EI, 0.0, "N m^2")},
+        {BENDING_STIFFNESS: Estimate(result.EI, 0.0, "N m^2")},
         RestCurvatureEstimate(s, np.asarray(result.theta_0) / h, np.zeros_like(s)),
         note=result.message,
     )
@@ -335,33 +329,35 @@ def fit_stage(
 
 def fitted_parameters(
     fit: Fit, intervals: Mapping[str, Interval], reported: Sequence[str] = ()
-) -> dict[str, ParameterEstimate]:
+) -> dict[str, Estimate]:
     """What a fit says of its parameters; see `fit_stage`."""
     model = fit.model
-    parameters: dict[str, ParameterEstimate] = {}
+    parameters: dict[str, Estimate] = {}
     for full, interval in intervals.items():
         key, unit, size = full, "N m^2", 1.0
         if full == MASS_FACTOR:
             key, unit, size = MASS, "kg", model.cable.mass
         ends = tuple(None if end is None else size * end for end in (interval.low, interval.high))
-        parameters[key] = ParameterEstimate(
+        parameters[key] = Estimate(
             size * fit.value(full),
             size * fit.std(full),
             unit,
             (ends[0], ends[1]),
             interval.identifiable,
+            fixed=full not in fit.problem.unknowns.names,
         )
     roll = [END_ROLL] if END_ROLL in model.names else []
     for qualified in (*roll, *reported):
         q = model.parameters[model.names.index(qualified)]
         value = fit.value(qualified)
         at_bound = min(value - q.lower, q.upper - value) < 1e-9 * q.scale
-        parameters[qualified] = ParameterEstimate(
+        parameters[qualified] = Estimate(
             value,
             fit.std(qualified),
             q.unit,
             identifiable=fit.is_determined(qualified),
             at_bound=at_bound,
+            fixed=qualified not in fit.problem.unknowns.names,
         )
     return parameters
 

@@ -174,7 +174,7 @@ def plan(
     if parameters is None:
         model, p, rest = example(in_space=in_space)
     else:
-        from dlo_casadi.cable import load
+        from dlo_casadi.cable.file import load
 
         cable = load(parameters)
         model, p, rest = cable.model, cable.p, cable.rest

@@ -1,8 +1,11 @@
 """The Python API: results that show themselves, predict and write themselves."""
 
+import copy
 import dataclasses
 import json
+import pickle
 import re
+import sys
 from io import StringIO
 from pathlib import Path
 
@@ -66,6 +69,68 @@ def test_text_says_what_was_found(result):
     assert re.search(r"noise alone \(estimated\)  0\.\d+ mm", text)
     assert repr(result) == text
     assert len(text.splitlines()) < 12
+
+
+def test_parameters_have_names_and_quality(result):
+    stiffness = result.params["bending_stiffness"]
+    assert stiffness == result.stages[-1].parameters["bending_stiffness"]
+    assert stiffness.interval_95[0] < stiffness.value < stiffness.interval_95[1]
+    assert not stiffness.fixed
+    assert re.fullmatch(
+        r"<Estimate 0\.\d+ ± 0\.\d+ N m\^2 \(95 %: 0\.\d+ to 0\.\d+\)>", repr(stiffness)
+    )
+    offset = result.params["end_offset.dx"]
+    assert (offset.unit, offset.interval_95) == ("m", None)
+    assert offset.std == pytest.approx(result.covariance.std["end_offset.dx"])
+    variance = result.covariance["end_offset.dx", "end_offset.dx"]
+    assert variance == pytest.approx(offset.std**2)
+    assert np.diag(result.covariance.correlation) == pytest.approx(1.0)
+    with pytest.raises(dlo.DloError, match="'mass' was not fitted; fitted are bending_stiffness, "):
+        result.covariance["mass", "mass"]
+    told = dataclasses.replace(stiffness, fixed=True, interval_95=(0.1, None), identifiable=False)
+    assert str(told).endswith("(95 %: 0.1 to unbounded), fixed, not identifiable")
+
+
+def test_residuals_are_distances_to_the_prediction(result):
+    """Of all poses, held-out ones too; their RMS across the prediction is the error of the fit."""
+    assert {name: len(gap) for name, gap in result.residuals.items()} == {
+        pose.name: len(pose.points) for pose in result.poses
+    }
+    fitted = [result.residuals[pose.name] for pose in result.poses if pose.role == "fit"]
+    squares = np.concatenate([(gap**2).sum(axis=1) for gap in fitted])
+    assert np.sqrt(squares.mean()) == pytest.approx(result.stages[-1].rmse_fit)
+
+
+def test_a_summary_names_all_parameters(result):
+    text = result.summary()
+    assert all(f"\n  {name} " in text for name in result.params)
+    assert f"{len(result.poses)} poses (" in text
+
+
+def test_parameters_are_a_table_of_pandas(result, monkeypatch):
+    pandas = pytest.importorskip("pandas")
+    table = result.to_dataframe()
+    assert isinstance(table, pandas.DataFrame)
+    assert list(table.index) == list(result.params)
+    row = table.loc["bending_stiffness"]
+    known = result.params["bending_stiffness"]
+    assert (row["value"], row["low_95"], row["unit"]) == (
+        known.value,
+        known.interval_95[0],
+        "N m^2",
+    )
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(dlo.DloError, match=r"pandas is not installed.\n  Try: pip install pandas"):
+        result.to_dataframe()
+
+
+def test_a_result_is_kept_and_copied(result):
+    for other in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result)):
+        assert other.params == result.params
+        assert np.array_equal(other.covariance.values, result.covariance.values)
+        assert np.array_equal(other.cable.p, result.cable.p)
+    shape = result.cable.solve((0.3, -0.1))
+    assert str(pickle.loads(pickle.dumps(shape))) == str(shape)
 
 
 def test_a_notebook_gets_a_table_with_everything_escaped(result):

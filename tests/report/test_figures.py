@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
@@ -14,7 +15,7 @@ from dlo_casadi.report import figures, figures_poses
 from dlo_casadi.report.photographs import write_overlays
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.words import compared
-from dlo_casadi.session.outcome import EffectParameter, FoundEffect, PoseInput
+from dlo_casadi.session.outcome import FoundEffect, PoseInput
 from dlo_casadi.show.style import save_figure
 
 PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"
@@ -28,7 +29,7 @@ CANDIDATES = tuple(
 )
 EFFECT = FoundEffect(
     name="lumped_mass",
-    parameters={"mass": EffectParameter(0.05, 0.002, "kg")},
+    parameters={"mass": Estimate(0.05, 0.002, "kg")},
     p_value=1e-9,
     rmse_cross_validated_before=5e-4,
     rmse_cross_validated_after=1e-4,

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.report.documents import finite, report_dict, report_text
 from dlo_casadi.report.page import page_data
 from dlo_casadi.report.words import all_warnings, verdict_lines
-from dlo_casadi.session.outcome import ParameterEstimate, RestCurvatureEstimate, Stage
+from dlo_casadi.session.outcome import RestCurvatureEstimate, Stage
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 
 KEYS = {
@@ -46,7 +47,7 @@ def strict(text):
 
 def stage(name, value=math.nan, **changes):
     rest = RestCurvatureEstimate(np.array([0.0, 1.0]), np.array([1.0, math.nan]), np.zeros(2))
-    estimate = ParameterEstimate(value, math.inf, "N m^2", (None, 3.0), False)
+    estimate = Estimate(value, math.inf, "N m^2", (None, 3.0), False)
     full = Stage(name, 1e-3, math.inf, None, {"bending_stiffness": estimate}, rest, {})
     return replace(full, **changes)
 
@@ -210,7 +211,7 @@ def test_numpy_becomes_plain(value, plain):
 
 
 def test_a_parameter_on_its_bound_is_a_warning(outcome):
-    estimate = ParameterEstimate(0.0, 0.1, "kg", at_bound=True)
+    estimate = Estimate(0.0, 0.1, "kg", at_bound=True)
     last = replace(outcome.stage("batch"), parameters={"lumped_mass.mass": estimate})
 
     lines = all_warnings(replace(outcome, stages=(*outcome.stages[:-1], last)))

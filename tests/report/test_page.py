@@ -14,6 +14,7 @@ from PIL import Image
 from small_sessions import BARE
 from test_figures import CANDIDATES, EFFECT, LOAD, with_readings
 
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.diagnosis.next_measurement import NextPose, NextReading
 from dlo_casadi.report import canvas, figures
 from dlo_casadi.report.page import (
@@ -31,7 +32,6 @@ from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.photographs import PHOTOGRAPHS, photograph_of
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.tables import stage_rows
-from dlo_casadi.session.outcome import ParameterEstimate
 from dlo_casadi.show import style
 from dlo_casadi.show.text import millimetres
 
@@ -130,9 +130,9 @@ def test_an_effect_has_a_meaning_and_an_unknown_one_none():
 
 
 def test_what_the_data_cannot_tell_has_no_value(outcome):
-    unknown = ParameterEstimate(1.0, 9.0, "N m^2", (0.1, None), identifiable=False)
-    bound = ParameterEstimate(0.0, 0.1, "kg", at_bound=True)
-    known = ParameterEstimate(0.5, 0.01, "m")
+    unknown = Estimate(1.0, 9.0, "N m^2", (0.1, None), identifiable=False)
+    bound = Estimate(0.0, 0.1, "kg", at_bound=True)
+    known = Estimate(0.5, 0.01, "m")
     parameters = {"bending_stiffness": unknown, "lumped_mass.mass": bound, "x.position": known}
     last = replace(outcome.stage("batch"), parameters=parameters)
     rows = parameter_rows(replace(outcome, stages=(*outcome.stages[:-1], last)))
@@ -146,7 +146,7 @@ def test_what_the_data_cannot_tell_has_no_value(outcome):
 
 
 def test_a_fixed_parameter_has_no_interval():
-    assert symmetric_interval(ParameterEstimate(0.5, 0.0, "m")) == ""
+    assert symmetric_interval(Estimate(0.5, 0.0, "m")) == ""
 
 
 def test_a_configuration_that_has_gone_is_said_to_be(outcome, tmp_path):

@@ -119,14 +119,13 @@ def test_a_folder_of_results_will_do(file):
 def test_covariance_is_in_si_units(outcome, file):
     metadata, fit = load(file).metadata, outcome.fit
 
-    assert metadata.names == fit.problem.unknowns.names
+    assert metadata.covariance.names == fit.problem.unknowns.names
     for name in fit.model.names:
-        k = metadata.names.index(name)
-        assert np.sqrt(metadata.covariance[k, k]) == pytest.approx(fit.std(name), rel=1e-12)
-    rest = metadata.names.index("rest_curvature[3]")
+        assert metadata.covariance.std[name] == pytest.approx(fit.std(name), rel=1e-12)
+        assert np.sqrt(metadata.covariance[name, name]) == pytest.approx(fit.std(name), rel=1e-12)
     curvature = outcome.stage("batch").rest_curvature
     # B-splines are positive and sum to one: a curve's std is of the size of its coefficients'.
-    assert np.sqrt(metadata.covariance[rest, rest]) < 20 * curvature.std.max()
+    assert metadata.covariance.std["rest_curvature[3]"] < 20 * curvature.std.max()
     _, covariance = fit.named_covariance
     assert np.array_equal(covariance, covariance.T)
 

@@ -8,6 +8,7 @@ from rich.console import Console
 from test_figures import EFFECT, LOAD
 from test_page import PROPOSAL
 
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE, Structure
 from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page import page_data
@@ -15,7 +16,6 @@ from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.tables import describe, stage_rows, unidentified
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.report.words import separation_text, structure_lines
-from dlo_casadi.session.outcome import ParameterEstimate
 from dlo_casadi.session.pose_shape import BranchShape
 from dlo_casadi.show.text import plus_minus
 
@@ -29,7 +29,7 @@ def said(outcome):
 
 
 def with_stiffness(outcome, interval):
-    estimate = ParameterEstimate(17.0, 30.0, "N m^2", interval, identifiable=False)
+    estimate = Estimate(17.0, 30.0, "N m^2", interval, identifiable=False)
     batch = replace(outcome.stage("batch"), parameters={"bending_stiffness": estimate})
     return replace(outcome, stages=(*outcome.stages[:-1], batch))
 
@@ -81,7 +81,7 @@ def test_without_gravity_a_reading_is_asked_for_and_no_weight(outcome):
 
 
 def test_a_parameter_on_its_bound_says_so(outcome):
-    estimate = ParameterEstimate(0.0, 0.1, "kg", at_bound=True)
+    estimate = Estimate(0.0, 0.1, "kg", at_bound=True)
 
     assert describe(estimate)[2] == "at a bound"
 
@@ -218,4 +218,4 @@ def test_digits_follow_the_standard_deviation(value, std, text):
 
 
 def test_an_unbounded_parameter_has_no_number():
-    assert unidentified(ParameterEstimate(1.0, 1.0, "m")) == "unknown"
+    assert unidentified(Estimate(1.0, 1.0, "m")) == "unknown"

@@ -1,0 +1,95 @@
+"""Estimated parameters and how well they are known."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.errors import DloError
+from dlo_casadi.show.text import plus_minus
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter.
+
+    Parameters
+    ----------
+    value, std : float
+        In `unit`; std is 0 where the parameter was not estimated. Infinite where the value is the
+        inverse of a parameter at zero.
+    unit : str
+    interval_95 : (float or None, float or None), optional
+        Profile-likelihood interval; None in it = unbounded; absent = not computed.
+    identifiable : bool, optional
+        False where the interval is unbounded or spans more than a factor of ten; of a parameter
+        without one, where the measurements tell less than its bounds do, whose width std then is.
+    at_bound : bool
+        Whether the value sits on a physical bound.
+    fixed : bool
+        Whether it was kept at its value.
+    """
+
+    value: float
+    std: float
+    unit: str
+    interval_95: tuple[float | None, float | None] | None = None
+    identifiable: bool | None = None
+    at_bound: bool = False
+    fixed: bool = False
+
+    def __str__(self) -> str:
+        text = "unbounded" if math.isinf(self.value) else plus_minus(self.value, self.std)
+        text = f"{text} {self.unit}".strip()
+        if self.interval_95 is not None:
+            low, high = ("unbounded" if x is None else f"{x:.4g}" for x in self.interval_95)
+            text += f" (95 %: {low} to {high})"
+        remarks = {
+            "fixed": self.fixed,
+            "at a bound": self.at_bound,
+            "not identifiable": self.identifiable is False,
+        }
+        return ", ".join([text, *(remark for remark, holds in remarks.items() if holds)])
+
+    def __repr__(self) -> str:
+        return f"<Estimate {self}>"
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariance of estimates by their names: `covariance["bending_stiffness", "end_roll"]`.
+
+    Parameters
+    ----------
+    names : (N,) tuple of str
+        Fitted parameters, and `rest_curvature[k]` [1/m], its spline coefficients.
+    values : (N, N)
+        In the products of the units.
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+
+    def __getitem__(self, pair: tuple[str, str]) -> float:
+        if unknown := [name for name in pair if name not in self.names]:
+            raise DloError(f"{unknown[0]!r} was not fitted; fitted are {', '.join(self.names)}")
+        i, j = map(self.names.index, pair)
+        return float(self.values[i, j])
+
+    @property
+    def std(self) -> dict[str, float]:
+        """Standard deviations by name."""
+        roots = np.sqrt(np.maximum(np.diag(self.values), 0.0))
+        return dict(zip(self.names, roots.tolist(), strict=True))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlations (N, N); zero beside what is known exactly."""
+        std = np.array(list(self.std.values()))
+        scale = np.outer(std, std)
+        return np.divide(self.values, scale, out=np.zeros_like(scale), where=scale > 0)
+
+    def __array__(self, *arguments: Any, **options: Any) -> FloatArray:
+        return np.array(self.values, *arguments, **options)
