@@ -170,7 +170,9 @@ def test_every_example_is_shown():
     shown = TEXTS["docs/pages/how-to/examples.md"]
     names = {script.stem for script in (ROOT / "scripts/examples").glob("*.py")}
     assert [
-        name for name in names - {"simulated_rod"} if f'"scripts/examples/{name}.py"' not in shown
+        name
+        for name in names - {"simulated_rod"}
+        if f'--8<-- "scripts/examples/{name}.py"' not in shown
     ] == []
 
 
