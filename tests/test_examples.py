@@ -83,7 +83,7 @@ def simulated(monkeypatch):
 def test_points_of_a_new_pose_lie_in_the_band(simulated, tmp_path):
     script = example("fit_arrays")
     result = script.main(tmp_path / "picture.png")
-    low, high = result.stages[-1].parameters["bending_stiffness"].interval_95
+    low, high = result.params["bending_stiffness"].interval_95
     assert low < example("simulated_rod").EI < high
     assert high - low < 0.1 * low
     assert (tmp_path / "picture.png").stat().st_size > 10_000

@@ -30,8 +30,8 @@ def fit(ends: list[tuple[float, float]], generator: np.random.Generator) -> dlo.
 
 def foreseen(cable: dlo.FittedCable, ends: np.ndarray) -> np.ndarray:
     """Standard deviation of EI [N m^2] after one more pose with each of the ends (m, 2)."""
-    names, covariance = cable.metadata.names, cable.metadata.covariance
-    values = [cable.p[cable.model.names.index(name)] for name in names]
+    names, covariance = cable.covariance.names, cable.covariance.values
+    values = [cable.params[name].value for name in names]
     end, by = ca.MX.sym("end", 2), ca.MX.sym("parameters", len(names))
     shape = cable.function(parameters=names)
     points = shape(pose=ca.vertcat(0, 0, end, 0, 0), parameters=by)["points"]
@@ -59,7 +59,7 @@ def main(picture: Path, size: int = 20) -> tuple[float, float, float]:
     ends = np.column_stack([x.ravel(), y.ravel()])
     std = foreseen(cable, ends)
     best = tuple(ends[np.nanargmin(std)])
-    told = fit([*TAKEN, best], generator).cable.metadata.std["bending_stiffness"]
+    told = fit([*TAKEN, best], generator).params["bending_stiffness"].std
     figure = Figure(figsize=(5.4, 4.6), layout="constrained")
     axes, percent = figure.subplots(), 100 / cable.p[0]
     drawn = axes.pcolormesh(x, y, percent * std.reshape(x.shape), cmap="viridis_r")
@@ -67,7 +67,7 @@ def main(picture: Path, size: int = 20) -> tuple[float, float, float]:
     for end in (*TAKEN, best):
         style = {"color": "C1", "lw": 2.5} if end is best else {"color": "0.4", "lw": 1}
         axes.plot(*cable.solve(end=end).points.T, **style)
-    before = cable.metadata.std["bending_stiffness"]
+    before = cable.params["bending_stiffness"].std
     title = f"EI known to {percent * before:.1f} %, then to {percent * told:.2f} %"
     axes.set(aspect="equal", xlabel="end x [m]", ylabel="end y [m]", title=title)
     figure.savefig(picture, dpi=110)
