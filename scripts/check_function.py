@@ -31,9 +31,10 @@ from numpy.typing import NDArray
 from dlo_casadi.codegen import Capsule, CompiledSolver, generate
 from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.effects import EFFECTS, BoundaryEffect, CableData, Effect
+from dlo_casadi.equilibrium.implicit import pose_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.symbolic import CasadiCable, pose_of
+from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = NDArray[np.floating]

@@ -8,8 +8,8 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose as DeclaredPose
+from dlo_casadi.equilibrium.implicit import pose_size
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.symbolic import pose_size
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import EndConditions

@@ -1,25 +1,8 @@
-"""Equilibria inside other people's CasADi problems: a differentiable function, and the equations.
-
-The search for an equilibrium is no smooth operation, the equilibrium it finds is: z(u) with
-g(z(u), u) = 0 for the numbers u of the pose. In the graph a node without derivatives returns the
-equilibrium z_0 of the present u, and two steps of the chord method follow from there,
-
-    z_(k+1) = z_k - K^-1 g(z_k, u),    K = dg/dz (z_0, u), taken for a constant.
-
-At the present u they stay where they are. Their error at u + du is O(du^(k+1)), so that two steps
-have the first and second derivatives of z exactly (implicit function theorem), whatever CasADi does
-to differentiate them, and one matrix serves all orders. In space z are increments about the frames
-of the equilibrium itself.
-
-References
-----------
-Ortega and Rheinboldt, Iterative Solution of Nonlinear Equations, 1970, section 10.2 (chord method);
-Griewank and Walther, Evaluating Derivatives, 2008, chapter 15 (implicit functions).
-"""
+"""A cable whose parameters have values as CasADi functions, for problems of one's own."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -27,45 +10,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import SIGNS, Branch, HeldPose
-from dlo_casadi.equilibrium.solve import out_of_reach, solve_equilibrium
-from dlo_casadi.errors import DloError, EquilibriumError, counted
+from dlo_casadi.equilibrium.implicit import (
+    chord,
+    constant,
+    pose_of,
+    pose_size,
+    search_of,
+    search_sizes,
+    symbols_of,
+)
+from dlo_casadi.equilibrium.pose import SIGNS, Branch
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.whole_pose import PoseSymbols, balance, shape, tangent
-from dlo_casadi.rod.ends import EndConditions
+from dlo_casadi.model.whole_pose import PoseSymbols, balance, shape
 
-# Equilibria that a search keeps: an optimiser asks for value, gradient and Hessian of one pose.
-KEPT = 1024
 # Smallest curvature [1/m] that is told from none: the norm of two has no derivative at zero.
 STRAIGHT = 1e-8
-
-
-def pose_size(model: CableModel) -> int:
-    """Size of dlo_pose in the C header: both ends and, in space, `turns`."""
-    return EndConditions.size(model.node) + int(model.in_space)
-
-
-def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None) -> HeldPose:
-    """The pose whose numbers are laid out as dlo_pose; what is not held is left out."""
-    d, c = model.node.dimension, model.node.coordinates
-    start, end, first, last, turns = np.split(numbers, np.cumsum([d, d, c, c]))
-    held: dict[str, Any] = {}
-    for side, frame in (("start", first), ("end", last)):
-        if getattr(model, side) != "clamped":
-            continue
-        if model.in_space:
-            held[f"{side}_orientation"] = tuple(frame.tolist())
-        else:
-            held[f"{side}_heading"] = float(frame[0])
-    both = model.start == model.end == "clamped"
-    return HeldPose(
-        start=tuple(start.tolist()),
-        end=None if model.end == "free" else tuple(end.tolist()),
-        turns=float(turns[0]) if model.in_space and both else 0.0,
-        branch=branch,
-        **held,
-    )
+# Longest step of a node [rad] from a shape that counts as an equilibrium.
+FARTHEST = 1e-6
 
 
 class Unknowns(NamedTuple):
@@ -93,7 +56,11 @@ class CasadiCable:
     rest: FloatArray
 
     def function(
-        self, *, parameters: bool | Sequence[str] = False, branch: Branch | None = None
+        self,
+        *,
+        parameters: bool | Sequence[str] = False,
+        branch: Branch | None = None,
+        search: ca.Function | None = None,
     ) -> ca.Function:
         """The shape as a differentiable function of the pose, for CasADi problems of one's own.
 
@@ -110,6 +77,10 @@ class CasadiCable:
             values.
         branch : "ccw" or "cw", optional
             In a plane, which way the cable turns from start to end.
+        search : casadi.Function, optional
+            What finds equilibria in place of Python: `casadi.external("dlo_equilibrium", library)`,
+            or `dlo_equilibrium_ccw`, `_cw`, of this cable's generated C, compiled into a shared
+            library. The function is then several times faster, and can be serialised.
 
         Returns
         -------
@@ -128,27 +99,34 @@ class CasadiCable:
             and at the end. `curvature <= 1 / radius` is `min_bend_radius >= radius`, and smooth.
             status : 0 for a stable equilibrium; otherwise all other outputs and their derivatives
             are NaN, and it is the reason, a dlo_status of the C header: 1 out of reach, 2 none
-            found, 3 a number is not finite, 4 none that is stable.
+            found, 3 a number is not finite, 4 none that is stable, 6 a quaternion is zero, a joint
+            of links is at its bound, or `search` is that of another cable.
 
         Raises
         ------
         DloError
-            If a parameter or the branch is unknown. The function itself raises nothing.
+            If a parameter or the branch is unknown, or `search` has other sizes, or stands beside
+            parameters or a branch, which it has itself. The function itself raises nothing.
 
         Notes
         -----
-        Derivatives are those of the implicit function theorem, see the module. The
-        search runs in Python, so that the function cannot be serialised and lives until the
-        process ends; the generated C can, see `casadi.external` in its header.
+        Derivatives are those of the implicit function theorem, see `implicit`. Without `search` the
+        function calls Python, cannot be serialised, and keeps what it needs until the process ends.
         """
-        if branch is not None and (self.model.in_space or branch not in SIGNS):
-            raise DloError(f"branch must be 'ccw' or 'cw', in a plane, or None, found {branch!r}")
         inputs, p = self._inputs(parameters)
         pose = inputs["pose"]
-        search = _search(self.model, self.rest.tobytes(), branch)
-        x, multipliers, status, there = search(pose, p)
-        x, multipliers = _chord(self.model, self.rest)(x, multipliers, pose, p)
-        symbols = _symbols(self.model, self.rest, x, multipliers, pose, p)
+        if search is None:
+            if branch is not None and (self.model.in_space or branch not in SIGNS):
+                raise DloError(f"branch must be 'ccw', 'cw' (in a plane) or None, found {branch!r}")
+            found = constant(search_of(self.model, self.rest.tobytes(), branch))(pose, p)
+        else:
+            self._check_search(search, with_others=bool(parameters or branch))
+            found = constant(search)(pose)
+        x, multipliers, status, there = found
+        x, multipliers, step = chord(self.model, self.rest)(x, multipliers, pose, p)
+        there = ca.if_else(step < FARTHEST, there, np.nan)
+        status = ca.if_else(ca.logic_or(step < FARTHEST, status != 0), status, 6)
+        symbols = symbols_of(self.model, self.rest, x, multipliers, pose, p)
         outputs = {name: there * out for name, out in _outputs(self.model, symbols).items()}
         return _function("cable", inputs, outputs | {"status": status})
 
@@ -196,7 +174,7 @@ class CasadiCable:
         if self.model.in_space:
             squares = ca.sum1(x**2)
             unit, lengths = x / ca.repmat(ca.sqrt(squares), node.coordinates, 1), squares.T - 1
-        symbols = _symbols(self.model, self.rest, unit, multipliers, inputs["pose"], p)
+        symbols = symbols_of(self.model, self.rest, unit, multipliers, inputs["pose"], p)
         rows = balance(self.model, symbols)
         outputs = {
             "residual": ca.vertcat(rows, lengths),
@@ -232,6 +210,21 @@ class CasadiCable:
         found = solve_equilibrium(self.model, self.p, self.rest, held)
         return Unknowns(found.x.T, found.multipliers)
 
+    def _check_search(self, search: ca.Function, *, with_others: bool) -> None:
+        if with_others:
+            raise DloError(
+                "search is the generated C, which has its own parameters and branch: leave out "
+                "`parameters` and `branch`\n  Try: dlo_equilibrium_ccw or _cw for a branch"
+            )
+        sizes = [search.size_in(i) for i in range(search.n_in())]
+        sizes += [search.size_out(i) for i in range(search.n_out())]
+        expected = [(pose_size(self.model), 1), *search_sizes(self.model)]
+        if sizes != expected:
+            raise DloError(
+                f"search has inputs and outputs of the sizes {sizes}, this cable needs {expected}\n"
+                '  Try: casadi.external("dlo_equilibrium", library) of this very cable.'
+            )
+
     def _inputs(self, parameters: bool | Sequence[str]) -> tuple[dict[str, Any], Any]:
         """Symbols of the pose and of the parameters asked for, and all parameters."""
         known = self.model.names
@@ -252,26 +245,6 @@ def _function(name: str, inputs: dict[str, Any], outputs: dict[str, Any]) -> ca.
     return ca.Function(
         name, [*inputs.values()], [*outputs.values()], [*inputs], [*outputs], {"cse": True}
     )
-
-
-def _symbols(
-    model: CableModel, rest: FloatArray, x: Any, multipliers: Any, pose: Any, p: Any
-) -> PoseSymbols:
-    """Arguments of the expressions of a pose; `pose` as dlo_pose, quaternions of any length."""
-    d, c = model.node.dimension, model.node.coordinates
-    start, end, first, last, _ = ca.vertsplit(
-        pose, np.cumsum([0, d, d, c, c, pose.numel() - 2 * (d + c)]).tolist()
-    )
-    frames = []
-    for held, frame in ((model.start, first), (model.end, last)):
-        if held != "clamped":
-            frame = ca.MX(ca.DM(model.node.identity))
-        frames.append(frame / ca.norm_2(frame) if model.in_space else frame)
-    end = end if model.end != "free" else ca.MX.zeros(d)
-    camera = ca.MX.zeros(model.n_pose - EndConditions.size(model.node))
-    full = ca.vertcat(start, end, *frames, camera)
-    still = ca.DM.zeros(len(model.deviation_names))
-    return PoseSymbols(ca.vec(x), multipliers, p, ca.DM(rest), full, still)
 
 
 def _outputs(model: CableModel, symbols: PoseSymbols) -> dict[str, Any]:
@@ -301,116 +274,3 @@ def _curvature(model: CableModel) -> ca.Function:
         ends.append(in_cells[outer] + share * (in_cells[outer] - in_cells[inner]))
     signed = ca.vertcat(*ends[:1], in_cells.T, *ends[1:])
     return ca.Function("curvature", [strains], [ca.sqrt(signed**2 + STRAIGHT**2)])
-
-
-# ---- the equilibrium as a node of a graph --------------------------------------------------------
-
-
-class _Search(ca.Callback):
-    """(pose, p) -> (x, multipliers, status, 1 or NaN): piecewise constant to CasADi."""
-
-    def __init__(self, model: CableModel, rest: FloatArray, branch: Branch | None) -> None:
-        super().__init__()
-        self.model, self.rest, self.branch = model, rest, branch
-        self._found = lru_cache(maxsize=KEPT)(self._find)
-        self._sizes = (
-            (model.node.coordinates, model.chain.n_nodes),
-            (model.n_border, 1),
-            (1, 1),
-            (1, 1),
-        )
-        self.construct("equilibrium")
-
-    def get_n_in(self) -> int:
-        return 2
-
-    def get_n_out(self) -> int:
-        return len(self._sizes)
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense((pose_size(self.model), len(self.model.names))[i], 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(*self._sizes[i])
-
-    def has_jacobian(self) -> bool:
-        return True
-
-    def get_jacobian(
-        self, name: str, inputs: Sequence[str], outputs: Sequence[str], options: Any
-    ) -> ca.Function:
-        """Zeros without entries: derivatives are those of the steps that follow."""
-        given = [ca.MX.sym(i, self.sparsity_in(k)) for k, i in enumerate(inputs[:2])]
-        given += [ca.MX.sym(o, *size) for o, size in zip(inputs[2:], self._sizes, strict=True)]
-        zeros = [ca.MX(n * m, self.size1_in(i)) for n, m in self._sizes for i in range(2)]
-        return ca.Function(name, given, zeros, inputs, outputs, options)
-
-    def eval(self, given: Sequence[ca.DM]) -> list[ca.DM]:
-        pose, p = (np.array(part).ravel() for part in given)
-        return self._found(pose.tobytes(), p.tobytes())
-
-    def _find(self, pose: bytes, p: bytes) -> list[ca.DM]:
-        numbers, known = np.frombuffer(pose), np.frombuffer(p)
-        found = _solved(self.model, known, self.rest, numbers, self.branch)
-        if isinstance(found, Equilibrium):
-            return [ca.DM(found.x.T), ca.DM(found.multipliers), ca.DM(0), ca.DM(1)]
-        none = [ca.DM.nan(*size) for size in self._sizes]
-        return [*none[:2], ca.DM(found), none[3]]
-
-
-def _solved(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    numbers: FloatArray,
-    branch: Branch | None,
-) -> Equilibrium | int:
-    """The stable equilibrium of a pose, or the number of the reason why there is none."""
-    pose = pose_of(model, numbers, branch)
-    if not (np.all(np.isfinite(pose.vector)) and np.all(np.isfinite(p))):
-        return 3
-    if out_of_reach(model, p, pose) is not None:
-        return 1
-    try:
-        found = solve_equilibrium(model, p, rest, pose)
-    except EquilibriumError:
-        return 2
-    # A joint held at its bound is no root of the equations.
-    return found if found.stable and not found.bound_multipliers.any() else 4
-
-
-@cache
-def _search(model: CableModel, rest: bytes, branch: Branch | None) -> _Search:
-    """A node for the life of the process: graphs that contain it do not keep it alive."""
-    return _Search(model, np.frombuffer(rest), branch)
-
-
-def _chord(model: CableModel, rest: FloatArray) -> ca.Function:
-    """(x, multipliers, pose, p) -> (x, multipliers) after two chord steps, see the module."""
-    node, count, k = model.node, model.chain.n_nodes, model.n_border
-    x = ca.MX.sym("x", node.coordinates, count)
-    lam, pose = ca.MX.sym("multipliers", k), ca.MX.sym("pose", pose_size(model))
-    p, z = ca.MX.sym("p", len(model.names)), ca.MX.sym("z", count * node.increment + k)
-    one, step = ca.SX.sym("one", node.coordinates), ca.SX.sym("step", node.increment)
-    moved = ca.Function("moved", [one, step], [node.moved(one, step)])
-
-    def after(z: Any) -> tuple[Any, Any]:
-        steps, more = ca.vertsplit(z, [0, count * node.increment, z.numel()])
-        return moved(x, ca.reshape(steps, node.increment, count)), lam + more
-
-    force = ca.Function(
-        "imbalance",
-        [z, x, lam, pose, p],
-        [balance(model, _symbols(model, rest, *after(z), pose, p))],
-    )
-    matrix = tangent(model, _symbols(model, rest, x, lam, pose, p))
-    if model.may_spin and not rest.any():
-        # Such a cable may roll about its own axis: the first node is kept from it.
-        matrix[0, 0] += ca.mmax(ca.fabs(matrix))
-    arguments: list[Any] = [x, lam, pose, p]
-    fixed: dict[str, Any] = {"is_diff_in": [False] * len(arguments), "never_inline": True}
-    matrix = ca.Function("tangent", arguments, [matrix], fixed)(*arguments)
-    total = ca.MX.zeros(z.shape)
-    for _ in range(2):
-        total -= ca.solve(matrix, force(total, *arguments), "qr")
-    return ca.Function("chord", arguments, [*after(total)])

@@ -10,6 +10,7 @@ from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.effects import CableData, ClampCompliance, ClampRotation
 from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
@@ -93,3 +94,43 @@ def test_an_optimiser_needs_no_python(tmp_path):
         ends.append(np.array(solver(x0=[0.3, -0.4], lbg=0.25, ubg=0.25)["x"]).ravel())
         assert solver.stats()["success"]
     np.testing.assert_allclose(*ends, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def in_c(tmp_path_factory):
+    """A cable in space, and the search for its equilibria in C."""
+    model, p, rest = cable("space", start="clamped", end="clamped", effects=(ClampRotation(),))
+    folder = tmp_path_factory.mktemp("solver")
+    library = compile_library(generate(model, p, rest.ravel()), folder, STRICT)
+    return CasadiCable(model, p, rest.ravel()), ca.external("dlo_equilibrium", str(library))
+
+
+def test_with_the_search_in_c_the_function_is_serialised_and_has_both_derivatives(in_c):
+    known, search = in_c
+    function = known.function()
+    compiled = ca.Function.deserialize(known.function(search=search).serialize())
+    pose, u = POSES["space"], ca.MX.sym("u", 15)
+    found = []
+    for shape in (compiled, function):
+        outs = ca.veccat(*shape(u))
+        sums = ca.dot(np.random.default_rng(0).normal(size=outs.numel()), outs)
+        hessian, gradient = ca.hessian(sums, u)
+        found.append(ca.Function("all", [u], [outs, gradient, hessian])(pose))
+    for by_c, by_python in zip(*found, strict=True):
+        scale = float(ca.norm_inf(by_python))
+        np.testing.assert_allclose(np.array(by_c), np.array(by_python), atol=1e-8 * scale)
+
+
+def test_the_search_of_another_cable_gives_no_number(in_c):
+    known, search = in_c
+    softer = CasadiCable(known.model, 0.9 * known.p, known.rest).function(search=search)
+    *outs, status = softer(POSES["space"])
+    assert status == 6
+    assert all(np.isnan(np.array(out)).all() for out in outs)
+    finer = CasadiCable(known.model.with_mesh(8), known.p, np.zeros(24))
+    for refused, options, words in (
+        (finer, {}, "search has inputs and outputs of the sizes"),
+        (known, {"parameters": True}, "leave out `parameters` and `branch`"),
+    ):
+        with pytest.raises(DloError, match=words):
+            refused.function(search=search, **options)

@@ -1,0 +1,202 @@
+"""The equilibrium as a node of CasADi graphs, with exact derivatives of first and second order.
+
+The search for an equilibrium is no smooth operation, the equilibrium it finds is: z(u) with
+g(z(u), u) = 0 for the numbers u of the pose. In the graph a node without derivatives returns the
+equilibrium z_0 of the present u, and two steps of the chord method follow from there,
+
+    z_(k+1) = z_k - K^-1 g(z_k, u),    K = dg/dz (z_0, u), taken for a constant.
+
+At the present u they stay where they are. Their error at u + du is O(du^(k+1)), so that two steps
+have the first and second derivatives of z exactly (implicit function theorem), whatever CasADi does
+to differentiate them, and one matrix serves all orders. In space z are increments about the frames
+of the equilibrium itself.
+
+References
+----------
+Ortega and Rheinboldt, Iterative Solution of Nonlinear Equations, 1970, section 10.2 (chord method);
+Griewank and Walther, Evaluating Derivatives, 2008, chapter 15 (implicit functions).
+"""
+
+from collections.abc import Sequence
+from functools import cache, lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.pose import Branch, HeldPose
+from dlo_casadi.equilibrium.solve import out_of_reach, solve_equilibrium
+from dlo_casadi.errors import EquilibriumError
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.whole_pose import PoseSymbols, balance, tangent
+from dlo_casadi.rod.ends import EndConditions
+
+# Equilibria that a search keeps: an optimiser asks for value, gradient and Hessian of one pose.
+KEPT = 1024
+# Least length of a quaternion, as in the generated C.
+LEAST_FRAME = 1e-6
+
+
+def pose_size(model: CableModel) -> int:
+    """Size of dlo_pose in the C header: both ends and, in space, `turns`."""
+    return EndConditions.size(model.node) + int(model.in_space)
+
+
+def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None) -> HeldPose:
+    """The pose whose numbers are laid out as dlo_pose; what is not held is left out."""
+    d, c = model.node.dimension, model.node.coordinates
+    start, end, first, last, turns = np.split(numbers, np.cumsum([d, d, c, c]))
+    held: dict[str, Any] = {}
+    for side, frame in (("start", first), ("end", last)):
+        if getattr(model, side) != "clamped":
+            continue
+        if model.in_space:
+            held[f"{side}_orientation"] = tuple(frame.tolist())
+        else:
+            held[f"{side}_heading"] = float(frame[0])
+    both = model.start == model.end == "clamped"
+    return HeldPose(
+        start=tuple(start.tolist()),
+        end=None if model.end == "free" else tuple(end.tolist()),
+        turns=float(turns[0]) if model.in_space and both else 0.0,
+        branch=branch,
+        **held,
+    )
+
+
+def symbols_of(
+    model: CableModel, rest: FloatArray, x: Any, multipliers: Any, pose: Any, p: Any
+) -> PoseSymbols:
+    """Arguments of the expressions of a pose; `pose` as dlo_pose, quaternions of any length."""
+    d, c = model.node.dimension, model.node.coordinates
+    start, end, first, last, _ = ca.vertsplit(
+        pose, np.cumsum([0, d, d, c, c, pose.numel() - 2 * (d + c)]).tolist()
+    )
+    frames = []
+    for held, frame in ((model.start, first), (model.end, last)):
+        if held != "clamped":
+            frame = ca.MX(ca.DM(model.node.identity))
+        frames.append(frame / ca.norm_2(frame) if model.in_space else frame)
+    end = end if model.end != "free" else ca.MX.zeros(d)
+    camera = ca.MX.zeros(model.n_pose - EndConditions.size(model.node))
+    full = ca.vertcat(start, end, *frames, camera)
+    still = ca.DM.zeros(len(model.deviation_names))
+    return PoseSymbols(ca.vec(x), multipliers, p, ca.DM(rest), full, still)
+
+
+def search_sizes(model: CableModel) -> list[tuple[int, int]]:
+    """Sizes of the outputs of a search: x, multipliers, status, 1 or NaN."""
+    return [(model.node.coordinates, model.chain.n_nodes), (model.n_border, 1), (1, 1), (1, 1)]
+
+
+class _Search(ca.Callback):
+    """(pose, p) -> (x, multipliers, status, 1 or NaN)."""
+
+    def __init__(self, model: CableModel, rest: FloatArray, branch: Branch | None) -> None:
+        super().__init__()
+        self.model, self.rest, self.branch = model, rest, branch
+        self._found = lru_cache(maxsize=KEPT)(self._find)
+        self._sizes = search_sizes(model)
+        self.construct("equilibrium")
+
+    def get_n_in(self) -> int:
+        return 2
+
+    def get_n_out(self) -> int:
+        return len(self._sizes)
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return ca.Sparsity.dense((pose_size(self.model), len(self.model.names))[i], 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(*self._sizes[i])
+
+    def eval(self, given: Sequence[ca.DM]) -> list[ca.DM]:
+        pose, p = (np.array(part).ravel() for part in given)
+        return self._found(pose.tobytes(), p.tobytes())
+
+    def _find(self, pose: bytes, p: bytes) -> list[ca.DM]:
+        numbers, known = np.frombuffer(pose), np.frombuffer(p)
+        found = _solved(self.model, known, self.rest, numbers, self.branch)
+        if isinstance(found, Equilibrium):
+            return [ca.DM(found.x.T), ca.DM(found.multipliers), ca.DM(0), ca.DM(1)]
+        none = [ca.DM.nan(*size) for size in self._sizes]
+        return [*none[:2], ca.DM(found), none[3]]
+
+
+def _solved(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    numbers: FloatArray,
+    branch: Branch | None,
+) -> Equilibrium | int:
+    """The stable equilibrium of a pose, or the number of the reason why there is none."""
+    pose = pose_of(model, numbers, branch)
+    if not (np.all(np.isfinite(pose.vector)) and np.all(np.isfinite(p))):
+        return 3
+    if out_of_reach(model, p, pose) is not None:
+        return 1
+    if model.in_space and not all(np.linalg.norm(frame) > LEAST_FRAME for frame in pose.frames):
+        return 6
+    try:
+        found = solve_equilibrium(model, p, rest, pose)
+    except EquilibriumError:
+        return 2
+    return found if found.stable else 4
+
+
+@cache
+def search_of(model: CableModel, rest: bytes, branch: Branch | None) -> _Search:
+    """A node for the life of the process: graphs that contain it do not keep it alive."""
+    return _Search(model, np.frombuffer(rest), branch)
+
+
+def constant(function: ca.Function) -> ca.Function:
+    """The same function without derivatives."""
+    given: list[Any] = function.mx_in()
+    outs: list[Any] = function.mx_out()
+    zeros = [ca.MX(out.numel(), one.numel()) for out in outs for one in given]
+    options: dict[str, Any] = {
+        "custom_jacobian": ca.Function(f"jac_{function.name()}", [*given, *outs], zeros),
+        "enable_forward": False,
+        "enable_reverse": False,
+        "never_inline": True,
+    }
+    return ca.Function(function.name(), given, function.call(given), options)
+
+
+def chord(model: CableModel, rest: FloatArray) -> ca.Function:
+    """(x, multipliers, pose, p) -> (x, multipliers) after two chord steps, see the module.
+
+    And the longest step of a node [rad]: none from an equilibrium.
+    """
+    node, count, k = model.node, model.chain.n_nodes, model.n_border
+    x = ca.MX.sym("x", node.coordinates, count)
+    lam, pose = ca.MX.sym("multipliers", k), ca.MX.sym("pose", pose_size(model))
+    p, z = ca.MX.sym("p", len(model.names)), ca.MX.sym("z", count * node.increment + k)
+    one, step = ca.SX.sym("one", node.coordinates), ca.SX.sym("step", node.increment)
+    moved = ca.Function("moved", [one, step], [node.moved(one, step)])
+
+    def after(z: Any) -> tuple[Any, Any]:
+        steps, more = ca.vertsplit(z, [0, count * node.increment, z.numel()])
+        return moved(x, ca.reshape(steps, node.increment, count)), lam + more
+
+    force = ca.Function(
+        "imbalance",
+        [z, x, lam, pose, p],
+        [balance(model, symbols_of(model, rest, *after(z), pose, p))],
+    )
+    matrix = tangent(model, symbols_of(model, rest, x, lam, pose, p))
+    if model.may_spin and not rest.any():
+        # Such a cable may roll about its own axis: the first node is kept from it.
+        matrix[0, 0] += ca.mmax(ca.fabs(matrix))
+    arguments: list[Any] = [x, lam, pose, p]
+    matrix = constant(ca.Function("tangent", arguments, [matrix]))(*arguments)
+    total = ca.MX.zeros(z.shape)
+    for _ in range(2):
+        total -= ca.solve(matrix, force(total, *arguments), "qr")
+    longest = ca.mmax(ca.fabs(total[: count * node.increment]))
+    return ca.Function("chord", arguments, [*after(total), longest])
