@@ -1,0 +1,238 @@
+"""Random sessions of which the truth is known: cables, poses, noise, and what is not declared.
+
+Simulated by this toolkit's own model on a fine mesh, so that nothing can be missing but what is
+hidden. Sizes run from hardly to plainly visible; the declared stiffness is up to ten times off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import dlo_casadi as dlo
+from dlo_casadi.effects import EFFECTS, CableData
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.sensing.noise import NoiseModel
+
+Draw = Callable[..., float]
+Values = dict[str, float]
+
+# Largest factor of the true stiffness to the declared one, either way.
+DECLARED_OFF = 10.0
+POSES = 14
+# Lines: points, noise of one coordinate [m], share of it that is correlated along the cable, its
+# correlation length [m]. Markers: their number and noise [m].
+LINE = (150, 1e-3, 0.5, 0.03)
+MARKERS = (12, 3e-4)
+# Noise of readings [N], [N m].
+FORCE_STD, MOMENT_STD = 0.01, 0.001
+ELEMENTS = {2: 40, 3: 24}
+
+
+def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Generator) -> Values:
+    """Parameters of an effect, drawn; `typical` [1/m] is the cable's curvature."""
+    length, weight = cable.length, 9.81 * cable.mass
+    axes = cable.axes
+
+    def signed(low: float, high: float) -> float:
+        return float(generator.choice([-1.0, 1.0]) * generator.uniform(low, high))
+
+    def spread(low: float, high: float) -> float:
+        return float(np.exp(generator.uniform(np.log(low), np.log(high))))
+
+    place = generator.uniform(0.25, 0.75) * length
+    force = weight * generator.uniform(0.1, 0.8)
+    way = generator.standard_normal(len(axes))
+    way *= force / np.linalg.norm(way)
+    anchor = [0.4 * length, signed(0.15, 0.4) * length, signed(0.15, 0.4) * length]
+    return {
+        "lumped_mass": lambda: {"mass": spread(0.02, 0.6) * cable.mass, "position": place},
+        "point_force": lambda: (
+            {"position": place} | {f"f{axis}": float(x) for axis, x in zip(axes, way, strict=True)}
+        ),
+        "tether": lambda: (
+            {"stiffness": spread(1.0, 15.0), "position": place}
+            | {f"anchor_{axis}": x for axis, x in zip(axes, anchor, strict=False)}
+        ),
+        "gravity_tilt": lambda: (
+            {"angle": signed(0.03, 0.15)}
+            if len(axes) == 2
+            else {"angle_x": signed(0.02, 0.1), "angle_y": signed(0.02, 0.1)}
+        ),
+        "mass_error": lambda: {"factor": 1 + signed(0.05, 0.4)},
+        "stiffness_gradient": lambda: {"slope": signed(0.1, 0.6)},
+        "bending_softening": lambda: {"softness": 1 / (generator.uniform(0.5, 2.0) * typical)},
+        "bending_anisotropy": lambda: {"ratio": spread(1.3, 4.0), "angle": signed(0.0, 1.4)},
+        "axial_stretch": lambda: {"compliance": spread(0.003, 0.03) / weight},
+        "length_error": lambda: {"length_difference": signed(0.004, 0.02) * length},
+        "clamp_angle": lambda: {
+            "start_heading_error": signed(0.03, 0.2),
+            "end_heading_error": signed(0.0, 0.05),
+        },
+        "clamp_rotation": lambda: {"start_y": signed(0.03, 0.2), "start_z": signed(0.03, 0.2)},
+        "rest_curvature_drift": lambda: {"rate": generator.uniform(0.05, 0.3)},
+        "camera_frame": lambda: (
+            {f"rotation_{axis}": signed(0.005, 0.03) for axis in "xyz"}
+            | {f"translation_{axis}": signed(0.001, 0.005) for axis in "xyz"}
+        ),
+    }[name]()
+
+
+HIDDEN = {
+    2: (
+        "lumped_mass", "point_force", "tether", "gravity_tilt", "mass_error", "stiffness_gradient",
+        "bending_softening", "axial_stretch", "length_error", "clamp_angle", "rest_curvature_drift",
+    ),
+    3: (
+        "lumped_mass", "point_force", "tether", "gravity_tilt", "mass_error", "stiffness_gradient",
+        "bending_softening", "bending_anisotropy", "length_error", "clamp_rotation",
+        "rest_curvature_drift", "camera_frame",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A session and its truth.
+
+    Parameters
+    ----------
+    session : Session
+        As a user would declare it, without what is hidden.
+    hidden : tuple of str
+        Names of the effects that are not declared.
+    values : dict
+        True parameters by qualified name [SI].
+    """
+
+    session: dlo.Session
+    hidden: tuple[str, ...]
+    values: Mapping[str, float]
+
+
+def simulated(generator: np.random.Generator, dimension: int, count: int) -> Simulated:
+    """A random session with `count` hidden effects, in the plane (2) or in space (3)."""
+    while True:
+        found = _tried(generator, dimension, count)
+        if found is not None:
+            return found
+
+
+def _tried(generator: np.random.Generator, dimension: int, count: int) -> Simulated | None:
+    """As `simulated`; None where the poses have no stable equilibria."""
+    length, mass = generator.uniform(0.5, 1.0), generator.uniform(0.03, 0.12)
+    weight = 9.81 * mass
+    bending = weight * length**2 * np.exp(generator.uniform(np.log(0.03), np.log(0.3)))
+    torsion = bending * generator.uniform(0.5, 0.9)
+    off = np.exp(generator.uniform(-1.0, 1.0) * np.log(DECLARED_OFF))
+    cable = CableData(length, mass, 0.006, bending * off)
+    if dimension == 3:
+        cable = CableData(length, mass, 0.006, bending * off, torsional_stiffness=torsion * off)
+    held = "clamped" if dimension == 3 or generator.random() < 0.5 else "pinned"
+    chosen = [name for name in HIDDEN[dimension] if held == "clamped" or "clamp" not in name]
+    hidden = tuple(str(x) for x in generator.choice(chosen, count, replace=False))
+    gravity = (0.0, -9.81) if dimension == 2 else (0.0, 0.0, -9.81)
+    model = CableModel(cable, ELEMENTS[dimension], start=held, end=held, gravity=gravity)
+    values = {"bending_stiffness": bending, "torsional_stiffness": torsion}
+    for name in hidden:
+        model = model.with_effect(EFFECTS[name]())
+        sizes = _sizes(name, cable, 4.0 / length, generator)
+        values |= {f"{name}.{key}": value for key, value in sizes.items()}
+    p = model.nominal.copy()
+    for k, name in enumerate(model.names):
+        p[k] = values.get(name, p[k])
+    ends = [_ends(generator, dimension, length, held, k) for k in range(POSES)]
+    true = [_moved(generator, pose) for pose in ends]
+    shapes = predict_poses(model, p, _rest(generator, model), true)
+    if any(shape is None or not shape.equilibrium.stable for shape in shapes):
+        return None
+    marked, read = generator.random() < 0.5, "mass_error" in hidden
+    poses = []
+    for k, (pose, shape) in enumerate(zip(ends, shapes, strict=True)):
+        s, points = _measured(generator, shape, marked, length)
+        readings = {}
+        if read:
+            force = shape.equilibrium.end_force
+            readings["end_force"] = force + FORCE_STD * generator.standard_normal(dimension)
+        known = {
+            key: value for key, value in vars(pose).items() if key.endswith(("heading", "tation"))
+        }
+        role = "held_out" if k % 5 == 4 else "fit"
+        at = {"at": s} if marked else {}
+        poses.append(
+            dlo.Pose(pose.start, pose.end, points=points, role=role, **at, **known, **readings)
+        )
+    session = dlo.Session(
+        dlo.Cable(length=length, mass=mass, diameter=0.006, bending_stiffness=bending * off),
+        poses,
+        gravity=gravity,
+        boundary=(held, held),
+        std=MARKERS[1] if marked else None,
+        force_std=FORCE_STD if read else None,
+    )
+    return Simulated(session, hidden, values)
+
+
+def _rest(generator: np.random.Generator, model: CableModel) -> NDArray[np.floating]:
+    """A smooth rest curvature [1/m], three waves about each axis."""
+    length, node = model.cable.length, model.node
+    places = model.chain.cells.mean(axis=1) / length
+    waves = np.cos(np.pi * np.arange(3)[:, None] * places)
+    bends = generator.normal(0.0, 0.1, (len(node.curvatures), 3)) @ waves * 2 * np.pi / length
+    twist = np.zeros((len(node.strains) - len(bends), len(places)))
+    return np.concatenate([*twist, *bends])
+
+
+def _ends(
+    generator: np.random.Generator, dimension: int, length: float, held: str, k: int
+) -> HeldPose:
+    """Ends of a pose as they are declared."""
+    span, name = generator.uniform(0.55, 0.85) * length, f"pose_{k:02d}"
+    if dimension == 2:
+        way = generator.uniform(-0.7, 0.7)
+        end = (span * np.cos(way), span * np.sin(way))
+        if held == "pinned":
+            return HeldPose((0.0, 0.0), end, name=name)
+        first, last = generator.uniform(-0.6, 0.6, 2)
+        return HeldPose((0.0, 0.0), end, start_heading=first, end_heading=last, name=name)
+    way = Rotation.from_rotvec(generator.uniform(-0.5, 0.5, 3))
+    first, last = (Rotation.from_rotvec(generator.uniform(-0.7, 0.7, 3)) for _ in range(2))
+    return HeldPose(
+        (0.0, 0.0, 0.0),
+        tuple(way.apply([span, 0.0, 0.0])),
+        start_orientation=tuple(first.as_quat()),
+        end_orientation=tuple(last.as_quat()),
+        name=name,
+    )
+
+
+def _moved(generator: np.random.Generator, pose: HeldPose) -> HeldPose:
+    """The pose as it truly was: 0.1 mm and, of clamps, 2 mrad from what is declared."""
+    frames = pose.frames
+    turns = 2e-3 * generator.standard_normal((2, pose.node.increment))
+    turned = [pose.node.moved(x[None], t[None])[0] for x, t in zip(frames, turns, strict=True)]
+    end = np.array(pose.end) + 1e-4 * generator.standard_normal(len(pose.start))
+    return pose.moved(np.array(pose.start), end, turned)
+
+
+def _measured(
+    generator: np.random.Generator, shape: object, marked: bool, length: float
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Arc lengths [m] and points as a camera has them."""
+    if marked:
+        s = np.linspace(0.02, 0.98, MARKERS[0]) * length
+        noise = MARKERS[1] * generator.standard_normal((len(s), len(shape.curve.nodes[0])))
+        return s, shape.curve.at(s) + noise
+    count, std, share, along = LINE
+    s = np.linspace(0.01, 0.99, count) * length
+    covariance = NoiseModel(std, share, along, "gaussian").covariance(s, np.ones(count))
+    factor = np.linalg.cholesky(covariance)
+    return s, shape.curve.at(s) + factor @ generator.standard_normal(
+        (count, len(shape.curve.nodes[0]))
+    )
