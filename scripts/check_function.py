@@ -115,7 +115,7 @@ def held_best(starts: int = 10) -> bool:
     for first in np.random.default_rng(0).uniform(low, high, (starts, 3)):
         problem = ca.Opti()
         end = problem.variable(3)
-        there = shape.convert_out(shape(ca.vertcat(0, 0, 0, end, down, up, 0)))
+        there = shape(pose=ca.vertcat(0, 0, 0, end, down, up, 0))
         pull = ca.norm_2(there["end_force"])
         problem.minimize(pull)
         problem.subject_to(there["curvature"] <= 1 / radius)

@@ -36,10 +36,10 @@ def test_the_end_is_held_best_from_any_side_and_against_other_places():
     np.testing.assert_allclose(*ends, atol=1e-5)
     assert max(counts) <= 40
     for x, y in np.random.default_rng(0).uniform(low, high, (12, 2)):
-        found = shape.convert_out(shape([0, 0, x, y, script.DOWN, script.UP]))
+        found = shape(pose=[0, 0, x, y, script.DOWN, script.UP])
         if float(found["min_bend_radius"]) >= script.RADIUS:
             assert float(ca.norm_2(found["end_force"])) > pulls[0]
-    at = shape.convert_out(shape([0, 0, *ends[0], script.DOWN, script.UP]))
+    at = shape(pose=[0, 0, *ends[0], script.DOWN, script.UP])
     assert float(at["min_bend_radius"]) == pytest.approx(script.RADIUS, rel=1e-4)
 
 

@@ -34,7 +34,7 @@ def best_end(shape: ca.Function, first: np.ndarray) -> tuple[np.ndarray, float, 
     """End [m], pull on it [N], and iterations of IPOPT from a first guess of the end."""
     problem = ca.Opti()
     end = problem.variable(2)
-    found = shape.convert_out(shape(ca.vertcat(0, 0, end, DOWN, UP)))
+    found = shape(pose=ca.vertcat(0, 0, end, DOWN, UP))
     pull = ca.norm_2(found["end_force"])
     problem.minimize(pull)
     problem.subject_to(found["curvature"] <= 1 / RADIUS)

@@ -42,7 +42,7 @@ def easiest(known: CasadiCable, count: int = 20) -> dict[str, np.ndarray]:
     problem.set_initial(x, np.vstack([guess.x for guess in guesses]).T)
     problem.set_initial(multipliers, np.stack([g.multipliers for g in guesses], axis=1))
     poses, system = ca.vertcat(0 * ends, ends, 0 * ends), known.equations().map(count)
-    at = system.convert_out(system(ca.vec(x).T, multipliers, poses)) | {"ends": ends}
+    at = {**system(x=ca.vec(x).T, multipliers=multipliers, pose=poses), "ends": ends}
     steps, at["pulls"] = ends[:, 1:] - ends[:, :-1], ca.sum1(at["end_force"] ** 2) ** 0.5
     problem.minimize(peak + 0.01 * ca.sumsqr(steps))
     problem.subject_to(at["residual"] == 0)
