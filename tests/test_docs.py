@@ -149,6 +149,11 @@ def test_files_that_are_named_exist(page):
     assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
 
 
+def test_every_command_is_named():
+    named = re.findall(r"\bdlo ([a-z][a-z-]+)", "\n".join(TEXTS.values()))
+    assert set(COMMANDS) <= set(named)
+
+
 def test_every_effect_has_its_section_and_picture():
     sections = "\n".join(text for page, text in TEXTS.items() if "/effects/" in page)
     for name, kind in dlo.EFFECTS.items():
