@@ -80,7 +80,8 @@ class CasadiCable:
         search : casadi.Function, optional
             What finds equilibria in place of Python: `casadi.external("dlo_equilibrium", library)`,
             or `dlo_equilibrium_ccw`, `_cw`, of this cable's generated C, compiled into a shared
-            library. The function is then several times faster, and can be serialised.
+            library. The function is then several times faster, can be serialised, and CasADi writes
+            it and its derivatives as C (`Function.generate`).
 
         Returns
         -------

@@ -74,6 +74,6 @@ if __name__ == "__main__":
         scene.plot(*points, color=plt.get_cmap("viridis_r")(k / 20), lw=1, zorder=0)
     scene.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="The end's way, and shapes")
     pulls.set(xlabel="time [s]", title="Pull on the end [N]", yticks=[0.8, 0.9, 1, LIMIT, 1.2, 1.3])
-    scene.legend(loc="upper left"), pulls.legend()
+    pulls.legend()
     Path("results").mkdir(exist_ok=True)
     figure.savefig("results/move_the_end.png", dpi=120)
