@@ -142,7 +142,7 @@ def test_new_lists_the_photographs_and_names_what_is_left(tmp_path, capsys):
     assert main(["check", str(config)]) == 2
     said = capsys.readouterr().err
     assert "line 6: cable.length is still to be filled in: Length along the cable" in said
-    assert "end is still to be filled in: Where the end is held [x, y] [m]" in said
+    assert "end is still to be filled in: Where the end is held [m]: [x, y]" in said
 
     assert main(["new", str(config)]) == 2
     assert "exists already, and nothing is replaced" in capsys.readouterr().err

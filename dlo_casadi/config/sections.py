@@ -145,14 +145,14 @@ class Pose(Section):
     points: Points | None = None
     """Points [[x, y], ...] along the cable [m], in space [[x, y, z], ...], instead of a file."""
     at: ArcLengths | None = None
-    """Arc lengths [s, ...] [m] of the points from the start, which makes them markers."""
+    """Arc lengths [m] of the points from the start, [s, ...], which makes them markers."""
     name: Annotated[Name, checked(_no_file_name)] = Field(default="", validate_default=True)
     """What to call the pose; as its file without folder and ending, or by its number, when
     absent."""
     start: Place
-    """Where the start is held [x, y] [m], in space [x, y, z]."""
+    """Where the start is held [m]: [x, y], in space [x, y, z]."""
     end: Place | None = None
-    """Where the end is held [x, y] [m], in space [x, y, z]; a free end has none."""
+    """Where the end is held [m]: [x, y], in space [x, y, z]; a free end has none."""
     start_heading: Number | None = None
     """Direction of the cable in a clamped start, counter-clockwise from +x [rad]."""
     end_heading: Number | None = None
