@@ -324,10 +324,18 @@ def test_the_command_takes_what_the_function_takes(loom, capsys):
 @pytest.mark.parametrize(
     ("file", "ends", "message"),
     [
-        ("loom", {"end": (0.7, -0.3)}, "end: three finite numbers (x, y, z) in metres"),
+        (
+            "loom",
+            IN_SPACE | {"end": (0.7, -0.3)},
+            "end: [x, y, z] belongs here (three numbers of gravity), found (0.7, -0.3)",
+        ),
         ("loom", IN_SPACE | {"end_heading": 0.0}, "is in space (three numbers of gravity)"),
         ("loom", IN_SPACE | {"branch": "cw"}, "is in space: a branch has no meaning"),
-        ("loom", IN_SPACE | {"turns": float("inf")}, "turns: a finite number [full turns]"),
+        (
+            "loom",
+            IN_SPACE | {"turns": float("inf")},
+            "turns: a finite number belongs here, found inf",
+        ),
         (
             "loom",
             IN_SPACE | {"end_orientation": (0.1, 0.1, 0.1, 0.5)},
@@ -341,9 +349,13 @@ def test_the_command_takes_what_the_function_takes(loom, capsys):
             "is in a plane (two numbers of gravity).\n  Try: start_heading [rad]",
         ),
         ("pinned", {}, "the end of 'short_clean' is pinned: where is it?"),
-        ("pinned", {"end": (0.3, float("nan"))}, "end: two finite numbers (x, y) in metres"),
-        ("pinned", {"end": (0.3, 0.1, 0.0)}, "end: two finite numbers (x, y) in metres"),
-        ("loom", IN_SPACE | {"end_orientation": (1, 0, 0)}, "belongs here, not 3 numbers"),
+        ("pinned", {"end": (0.3, float("nan"))}, "end[1]: a finite number belongs here, found nan"),
+        ("pinned", {"end": (0.3, 0.1, 0.0)}, "end: [x, y] belongs here (two numbers of gravity)"),
+        (
+            "loom",
+            IN_SPACE | {"end_orientation": (1, 0, 0)},
+            "a quaternion [qx, qy, qz, qw] belongs here, found [1, 0, 0]",
+        ),
         (
             "pinned",
             {"end": (0.3, 0), "start_heading": 1.0},
@@ -352,10 +364,14 @@ def test_the_command_takes_what_the_function_takes(loom, capsys):
         (
             "pinned",
             {"end": "ab"},
-            "end: two finite numbers (x, y) in metres belong here, found 'ab'",
+            "end: two numbers [x, y] belong here, in space three [x, y, z], found 'ab'",
         ),
         ("pinned", {"end": (0.3, 0), "branch": "left"}, "branch must be 'ccw', 'cw' or None"),
-        ("overhang", {"start_heading": float("nan")}, "start_heading: a finite number [rad]"),
+        (
+            "overhang",
+            {"start_heading": float("nan")},
+            "start_heading: a finite number belongs here, found nan",
+        ),
         ("overhang", {"end": (0.3, 0.0)}, "the end of 'overhang' is free: it cannot be held"),
         ("overhang", {}, "differed from pose to pose: give start_heading [rad]"),
     ],

@@ -2,4 +2,12 @@
 
 from dlo_casadi.codegen.compiled import CompiledSolver
 from dlo_casadi.codegen.generate import Solver, generate
-from dlo_casadi.codegen.shapes import STATUSES, Capsule, Gap, HalfSpace, Shape, ShapePath, Slope
+from dlo_casadi.codegen.shapes import (
+    STATUSES,
+    Capsule,
+    CompiledShape,
+    Gap,
+    HalfSpace,
+    ShapePath,
+    Slope,
+)

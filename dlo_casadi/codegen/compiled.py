@@ -17,10 +17,10 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.shapes import (
     STATUSES,
+    CompiledShape,
     Gap,
     HalfSpace,
     Obstacle,
-    Shape,
     ShapePath,
     Slope,
     no_equilibrium,
@@ -113,7 +113,9 @@ class CompiledSolver:
             getattr(self._c, name).argtypes = [_TYPES[kind] for kind in kinds]
         self._records, self.workspace = records_of(model), self.source.workspace
 
-    def solve(self, pose: HeldPose, *, warm: Shape | None = None, throw: bool = True) -> Shape:
+    def solve(
+        self, pose: HeldPose, *, warm: CompiledShape | None = None, throw: bool = True
+    ) -> CompiledShape:
         """Shape of the cable in one pose.
 
         Parameters
@@ -121,7 +123,7 @@ class CompiledSolver:
         pose : HeldPose
             Its branch selects which way a cable in a plane turns; without one the result is the
             stable equilibrium of lowest energy. If none turns so, the status is "other_branch".
-        warm : Shape, optional
+        warm : CompiledShape, optional
             Where to start from.
         throw : bool
             Whether to raise if there is no equilibrium; otherwise see the shape's `status`.
@@ -143,7 +145,7 @@ class CompiledSolver:
             )
         return _shape(out[0], status)
 
-    def step(self, shape: Shape, pose: HeldPose, *, steps: int = 4) -> Shape:
+    def step(self, shape: CompiledShape, pose: HeldPose, *, steps: int = 4) -> CompiledShape:
         """Shape in a nearby pose after at most `steps` Newton steps; see its `status`.
 
         Raises
@@ -174,7 +176,7 @@ class CompiledSolver:
         Returns
         -------
         structured array (m,), (m,)
-            Records with the fields of Shape, and statuses (index into STATUSES).
+            Records with the fields of CompiledShape, and statuses (index into STATUSES).
 
         Raises
         ------
@@ -187,7 +189,7 @@ class CompiledSolver:
         return out, statuses
 
     def path(
-        self, poses: Poses, *, branch: Branch | None = None, warm: Shape | None = None
+        self, poses: Poses, *, branch: Branch | None = None, warm: CompiledShape | None = None
     ) -> ShapePath:
         """Shapes along a path, each followed continuously from the one before.
 
@@ -195,7 +197,7 @@ class CompiledSolver:
         ----------
         poses, branch : as in `solve_many`
             The branch is that of the first pose.
-        warm : Shape, optional
+        warm : CompiledShape, optional
             For the first pose.
 
         Raises
@@ -210,7 +212,7 @@ class CompiledSolver:
         shapes = tuple(_shape(record, int(k)) for record, k in zip(out, statuses, strict=True))
         return ShapePath(shapes, int(jump[0]) if jump[0] < len(table) else None)
 
-    def sensitivity(self, shape: Shape, pose: HeldPose) -> Slope:
+    def sensitivity(self, shape: CompiledShape, pose: HeldPose) -> Slope:
         """Derivatives of a shape by the pose it was solved for.
 
         Raises
@@ -229,7 +231,7 @@ class CompiledSolver:
         return Slope(**_values(out[0]))
 
     def clearance(
-        self, shape: Shape, obstacles: Sequence[Obstacle], slope: Slope | None = None
+        self, shape: CompiledShape, obstacles: Sequence[Obstacle], slope: Slope | None = None
     ) -> Gap:
         """The nearest place of the cable to obstacles, and its distance from them.
 
@@ -261,11 +263,11 @@ class CompiledSolver:
             raise DloError(f"no clearance ({STATUSES[status]}): {count} given")
         return Gap(**_values(out[0]))
 
-    def _record_of(self, shape: Shape | None) -> Any:
+    def _record_of(self, shape: CompiledShape | None) -> Any:
         if shape is None:
             return None
         nodes = self._records.shape["x"].shape
-        if not isinstance(shape, Shape) or np.shape(shape.x) != nodes:
+        if not isinstance(shape, CompiledShape) or np.shape(shape.x) != nodes:
             raise DloError(f"a shape of this solver, with x of the shape {nodes}, belongs here")
         return _filled(self._records.shape, shape)
 
@@ -278,8 +280,8 @@ class CompiledSolver:
         return status
 
 
-def _shape(record: Any, status: int) -> Shape:
-    return Shape(**_values(record), status=STATUSES[status])
+def _shape(record: Any, status: int) -> CompiledShape:
+    return CompiledShape(**_values(record), status=STATUSES[status])
 
 
 def _values(record: Any) -> dict[str, Any]:
@@ -288,7 +290,7 @@ def _values(record: Any) -> dict[str, Any]:
     return {name: v.copy() if v.ndim else v.item() for name, v in values.items()}
 
 
-def _filled(record: np.dtype[Any], values: Shape | Slope) -> Any:
+def _filled(record: np.dtype[Any], values: CompiledShape | Slope) -> Any:
     out = np.zeros(1, record)
     for name in record.names or ():
         out[name] = getattr(values, name)

@@ -42,7 +42,7 @@ _HINTS = {
 
 
 @dataclass(frozen=True)
-class Shape:
+class CompiledShape:
     """Shape of the cable in one pose, as in the C header.
 
     Parameters
@@ -90,7 +90,7 @@ class ShapePath:
     the held branch, None if there is none.
     """
 
-    shapes: tuple[Shape, ...]
+    shapes: tuple[CompiledShape, ...]
     first_jump: int | None
 
 

@@ -5,7 +5,9 @@ with the range that is allowed. What can be computed but is hardly meant is a wa
 `load_config`.
 """
 
+import inspect
 import math
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
@@ -174,6 +176,18 @@ class Section(BaseModel):
         except ValidationError as error:
             given = Arguments(values)
             raise given.error(explain(type(self), error.errors(), given)) from None
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        """Tell the keys in `help`, beside the docstring that stands in the schema."""
+        own = inspect.cleandoc(cls.__doc__ or "")
+        cls.model_config["json_schema_extra"] = {"description": own}
+        if "Parameters\n" not in own:
+            rows = [
+                f"{key}\n{textwrap.indent(x.description or '', '    ')}"
+                for key, x in cls.model_fields.items()
+            ]
+            cls.__doc__ = "\n".join([own, "", "Parameters", "----------", *rows])
 
     def __repr_args__(self) -> Iterator[tuple[str, Any]]:
         """What was given, long lists by their length."""

@@ -52,7 +52,7 @@ class MeasuredPoints:
         start: Sequence[float],
         end: Sequence[float] | None,
         length: float,
-        name: str,
+        name: str | None = None,
         place: str = "at",
     ) -> "MeasuredPoints":
         """The points from start to end, as `read_points` returns them.
@@ -60,8 +60,8 @@ class MeasuredPoints:
         Raises
         ------
         MeasurementError
-            If they are no measurement of a cable of that length; the message begins with `name`
-            and calls the arc lengths `place`.
+            If they are no measurement of a cable of that length; the message begins with the `name`
+            of a file and calls the arc lengths `place`.
         """
         points, s = self.points, self.s
         if s is not None:

@@ -126,7 +126,7 @@ def _read_csv(config: Config, pose: Pose) -> PoseInput:
 def _read_points(config: Config, pose: Pose) -> PoseInput:
     s = None if pose.at is None else np.array(pose.at)
     found = MeasuredPoints(np.array(pose.points), s)
-    return _thinned(pose, found.in_order(pose.start, pose.end, config.cable.length, pose.name))
+    return _thinned(pose, found.in_order(pose.start, pose.end, config.cable.length))
 
 
 def _thinned(pose: Pose, read: MeasuredPoints) -> PoseInput:

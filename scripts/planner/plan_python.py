@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from plan import Scene, draw, example, obstacles_of, read_scene, scene_of
 
-from dlo_casadi.codegen import CompiledSolver, Shape
+from dlo_casadi.codegen import CompiledShape, CompiledSolver
 from dlo_casadi.equilibrium.pose import HeldPose
 
 try:
@@ -70,7 +70,7 @@ class Leader:
         self.obstacles = obstacles_of(scene, gripper.solver.model.node.dimension)
         self.scene = {name: numbers[0][0] for name, numbers in scene.items()}
 
-    def limit(self, shape: Shape) -> str | None:
+    def limit(self, shape: CompiledShape) -> str | None:
         """The limit that a shape does not keep."""
         scene = self.scene
         if shape.status != "ok":
@@ -105,7 +105,7 @@ class Leader:
             why = "another shape" if far else None
         return path.shapes if self._judge(why, "motion") else ()
 
-    def _shape(self, pose: HeldPose) -> Shape:
+    def _shape(self, pose: HeldPose) -> CompiledShape:
         """Shape of the cable, whatever its status."""
         return self.gripper.solver.solve(pose, throw=False)
 
