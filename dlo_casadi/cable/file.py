@@ -280,7 +280,7 @@ def _beyond(q: Parameter, row: _Value) -> str:
 def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
     """Contents of a document beside the model."""
     file = ParametersFile.model_validate(document)
-    names, stiffness = file.covariance.names, file.parameters["bending_stiffness"]
+    names = file.covariance.names
     covariance = np.array(file.covariance.values, dtype=float).reshape(len(names), len(names))
     scatter = file.scatter or _Scatter()
     fixtures = {name: std or 0.0 for name, std in (scatter.fixtures or {}).items()}
@@ -292,8 +292,6 @@ def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
         uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter, scatter.hanging),
         coefficients=np.array(file.rest_curvature.coefficients, dtype=float),
         fixtures=file.fixtures or {},
-        identifiable=stiffness.identifiable,
-        interval_95=stiffness.interval_95,
         explains=file.explains,
         model_hash=file.model_hash,
         edited=parameters_hash(document) != file.model_hash,

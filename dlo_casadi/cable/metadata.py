@@ -27,10 +27,6 @@ class Metadata:
     fixtures : dict
         Those of `start` [m] and `start_heading`, `end_heading` [rad], in space `start_orientation`,
         `end_orientation`, that are the same in all poses of the session.
-    identifiable : bool or None
-        Whether the shapes determine the bending stiffness.
-    interval_95 : (float or None, float or None) or None [N m^2]
-        Of the bending stiffness; None in it = unbounded.
     explains : bool or None
         Whether the model explains the shapes it was fitted to; None where that was not judged.
     model_hash : str
@@ -50,8 +46,6 @@ class Metadata:
     uncertainty: Uncertainty
     coefficients: FloatArray
     fixtures: dict[str, Any]
-    identifiable: bool | None
-    interval_95: tuple[float | None, float | None] | None
     explains: bool | None
     model_hash: str
     edited: bool

@@ -89,7 +89,7 @@ def predict(chosen: argparse.Namespace) -> None:
             "note: the model does not explain the shapes it was fitted to (verdict: unexplained); "
             "the prediction may be farther off than its band"
         )
-    if shape.cable.metadata.identifiable is False:
+    if shape.cable.params["bending_stiffness"].identifiable is False:
         notes.append(
             "note: the shapes did not determine the bending stiffness; the shape is more certain "
             "than forces and energy"

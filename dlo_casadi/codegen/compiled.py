@@ -17,6 +17,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.shapes import (
     STATUSES,
+    AnyPose,
     CompiledShape,
     Gap,
     HalfSpace,
@@ -27,12 +28,12 @@ from dlo_casadi.codegen.shapes import (
     pose_table,
     records_of,
 )
-from dlo_casadi.equilibrium.pose import Branch, HeldPose
+from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
 
 # Poses, or rows of numbers laid out as dlo_pose in the C header.
-Poses = Sequence[HeldPose] | FloatArray
+Poses = Sequence[AnyPose] | FloatArray
 
 # Types of the arguments of functions in the header: a pointer, an int, a count (size_t).
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "n": ctypes.c_size_t}
@@ -114,13 +115,13 @@ class CompiledSolver:
         self._records, self.workspace = records_of(model), self.source.workspace
 
     def solve(
-        self, pose: HeldPose, *, warm: CompiledShape | None = None, throw: bool = True
+        self, pose: AnyPose, *, warm: CompiledShape | None = None, throw: bool = True
     ) -> CompiledShape:
         """Shape of the cable in one pose.
 
         Parameters
         ----------
-        pose : HeldPose
+        pose : Pose
             Its branch selects which way a cable in a plane turns; without one the result is the
             stable equilibrium of lowest energy. If none turns so, the status is "other_branch".
         warm : CompiledShape, optional
@@ -145,7 +146,7 @@ class CompiledSolver:
             )
         return _shape(out[0], status)
 
-    def step(self, shape: CompiledShape, pose: HeldPose, *, steps: int = 4) -> CompiledShape:
+    def step(self, shape: CompiledShape, pose: AnyPose, *, steps: int = 4) -> CompiledShape:
         """Shape in a nearby pose after at most `steps` Newton steps; see its `status`.
 
         Raises
@@ -212,7 +213,7 @@ class CompiledSolver:
         shapes = tuple(_shape(record, int(k)) for record, k in zip(out, statuses, strict=True))
         return ShapePath(shapes, int(jump[0]) if jump[0] < len(table) else None)
 
-    def sensitivity(self, shape: CompiledShape, pose: HeldPose) -> Slope:
+    def sensitivity(self, shape: CompiledShape, pose: AnyPose) -> Slope:
         """Derivatives of a shape by the pose it was solved for.
 
         Raises

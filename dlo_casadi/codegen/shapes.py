@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.config import Pose as DeclaredPose
+from dlo_casadi.config import Pose
 from dlo_casadi.equilibrium.implicit import pose_size
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, counted
@@ -39,6 +39,10 @@ _HINTS = {
     "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
     "turns_shed": "fewer turns, or the end farther from the start.",
 }
+
+
+# A pose of a session, or its ends alone.
+AnyPose = Pose | HeldPose
 
 
 @dataclass(frozen=True)
@@ -222,7 +226,7 @@ def _record(*fields: list[Any]) -> np.dtype[Any]:
 
 
 def pose_table(
-    model: CableModel, poses: Sequence[HeldPose | DeclaredPose] | FloatArray, branch: object = None
+    model: CableModel, poses: Sequence[AnyPose] | FloatArray, branch: object = None
 ) -> tuple[FloatArray, int]:
     """Poses (m, k) laid out as dlo_pose, and the C solver's number of their branch.
 
@@ -256,7 +260,7 @@ def _branch_number(branch: object) -> int:
 
 
 def _row(model: CableModel, pose: object) -> FloatArray:
-    if isinstance(pose, DeclaredPose):
+    if isinstance(pose, Pose):
         pose = pose.held
     if not isinstance(pose, HeldPose):
         raise DloError(f"a Pose belongs here, found {pose!r}\n  Try: dlo_casadi.Pose(start, end)")
@@ -277,7 +281,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     return numbers[: pose_size(model)]
 
 
-def no_equilibrium(status: str, pose: HeldPose, length: float) -> str:
+def no_equilibrium(status: str, pose: AnyPose, length: float) -> str:
     """Message for a status other than ok."""
     start, end = (", ".join(f"{x:.4f}" for x in place or ()) for place in (pose.start, pose.end))
     hint = _HINTS.get(status)

@@ -103,7 +103,7 @@ def test_the_model_is_rebuilt_exactly(outcome, file):
     assert np.array_equal(rest, outcome.fit.rest)
     assert np.array_equal(metadata.coefficients, outcome.fit.coefficients)
     assert not metadata.edited
-    assert metadata.identifiable is True
+    assert metadata.params["bending_stiffness"].identifiable is True
     assert metadata.config == "session"
     assert metadata.fixtures["start"] == [0.0, 0.0]
 
@@ -132,7 +132,7 @@ def test_covariance_is_in_si_units(outcome, file):
 
 def test_the_fitted_stiffness_agrees_with_the_bench_truth(file):
     truth = read_yaml(BENCH.parent / "bench_truth" / "short_clean" / "truth.yaml")
-    low, high = load(file).metadata.interval_95
+    low, high = load(file).params["bending_stiffness"].interval_95
     stiffness = truth["bending_stiffness"]
 
     assert low < stiffness < high

@@ -47,6 +47,6 @@ def test_predict_says_so(unexplained, tmp_path, capsys):
     file = tmp_path / "parameters.yaml"
     file.write_text(parameters_text(unexplained))
     assert load(file).metadata.explains is False
-    assert load(file).metadata.interval_95 is None
+    assert load(file).params["bending_stiffness"].interval_95 is None
     assert main(["predict", str(file), "--end", "0.3", "-0.1"]) == 0
     assert "verdict: unexplained" in capsys.readouterr().out.replace("\n", " ")
