@@ -179,20 +179,12 @@ class Session(Config):
         estimation: Mapping[str, Any] | None = None,
         diagnosis: Mapping[str, Any] | None = None,
     ) -> None:
-        measurement = _given(std=std, force_std=force_std, moment_std=moment_std)
         equipment = _given(camera=camera, board=board, reference=reference)
-        pictures = bool(equipment) or any_photographs(poses)
-        experiment = _given(
-            gravity=gravity,
-            boundary=boundary,
-            measurement={
-                "kind": "images" if pictures else "centerlines",
-                **measurement,
-                **equipment,
-            },
-            tolerances=tolerances,
-            poses=poses,
-        )
+        pictures = equipment or any_photographs(poses)
+        measurement = _given(std=std, force_std=force_std, moment_std=moment_std) | equipment
+        measurement["kind"] = "images" if pictures else "centerlines"
+        experiment = {"gravity": gravity, "boundary": boundary, "measurement": measurement}
+        experiment |= {"poses": poses} | _given(tolerances=tolerances)
         options = _given(model=model, estimation=estimation, diagnosis=diagnosis)
         given = plain({"cable": cable, "experiment": experiment, **options})
         checked = checked_config(Arguments(given), Config)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -90,6 +89,3 @@ class Covariance:
         std = np.array(list(self.std.values()))
         scale = np.outer(std, std)
         return np.divide(self.values, scale, out=np.zeros_like(scale), where=scale > 0)
-
-    def __array__(self, *arguments: Any, **options: Any) -> FloatArray:
-        return np.array(self.values, *arguments, **options)

@@ -204,9 +204,7 @@ class Pose(Section):
     @property
     def held(self) -> HeldPose:
         """How its ends are held."""
-        names = {item.name for item in dataclasses.fields(HeldPose)} & type(
-            self
-        ).model_fields.keys()
+        names = [item.name for item in dataclasses.fields(HeldPose) if hasattr(self, item.name)]
         return HeldPose(**{name: getattr(self, name) for name in names})
 
     def __init__(self, *ends: Any, **values: Any) -> None:
