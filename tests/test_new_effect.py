@@ -115,7 +115,7 @@ def result(known, tmp_path_factory):
 def test_the_diagnosis_finds_it(result):
     assert result.verdict == "effect_found"
     (row,) = result.effects
-    assert row.name == row["name"] == "balloon"
+    assert row.name == "balloon"
     for name, true in (("lift", LIFT), ("position", PLACE)):
         assert abs(row.parameters[name].value - true) < 3 * row.parameters[name].std
     assert row.parameters["compliance"].value == 1 / row.parameters["lift"].value
