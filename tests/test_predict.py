@@ -31,7 +31,7 @@ def results(path, folder, n=20):
     measured = measured_poses(config, read_inputs(config, lambda *_: None))
     declared = declared_model(config)
     model = declared.model.with_mesh(n)
-    fit = fit_model(model, measured[:4], declared.tolerances, 3e-4, decades=(0,))
+    fit = fit_model(model, measured[:4], declared.tolerances, 3e-4)
     document = fit_dict(fit)
     document["fixtures"] = shared_fixtures(config)
     document["model_hash"] = parameters_hash(document)

@@ -28,10 +28,11 @@ from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import carried_shapes, descend, refit
-from dlo_casadi.estimation.fit import fit_relaxed, misfits
+from dlo_casadi.estimation.fit import misfits
 from dlo_casadi.estimation.problem import Priors, Problem, Values
-from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, begin, hung, relaxed
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, hung, relaxed
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.start import begin, fit_from
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
@@ -183,7 +184,7 @@ def _beside(near: Fit, candidate: Candidate, values: Mapping[str, float]) -> Fit
     theta = problem.unknowns.pack(near.values_in(model, values), near.coefficients)
     shapes = carried_shapes(problem, near, relaxed=True)
     begun = Values(problem.unknowns.off_bounds(theta), shapes, near.point.projections)
-    return fit_relaxed(problem, hung(problem, begun))
+    return fit_from(problem, hung(problem, begun), SOFTNESS)
 
 
 def _anew(near: Fit, candidate: Candidate, places: Mapping[str, float]) -> Fit | None:
@@ -205,7 +206,7 @@ def _anew(near: Fit, candidate: Candidate, places: Mapping[str, float]) -> Fit |
         problem = _from_data(near, own)
         p = np.array([known[name] for name in own.names])
         found = replace(found, theta=problem.unknowns.pack(p, rest))
-    return fit_relaxed(problem, found, SOFTNESS[2:])
+    return fit_from(problem, found, SOFTNESS[2:])
 
 
 def _followed(

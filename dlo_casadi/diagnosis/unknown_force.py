@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,11 +12,12 @@ from numpy.typing import NDArray
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit
-from dlo_casadi.estimation.problem import Problem
+from dlo_casadi.estimation.problem import Problem, Values
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import starting_points
+from dlo_casadi.estimation.start import begin, fit_from
 from dlo_casadi.estimation.unknowns import Search, Unknowns
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import NORMAL_95
@@ -68,8 +68,8 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
     The fit without it may have gone far astray, so that it is no place to start from: on a
-    coarse mesh, stiffnesses over decades and places along the cable are searched anew, the best
-    refitted with the place along with everything else, and the best of those on the base's mesh.
+    coarse mesh places along the cable are searched from the measured shapes, the best refitted
+    with the place along with everything else, and the best of those on the base's mesh.
 
     Parameters
     ----------
@@ -116,35 +116,26 @@ class _Search:
 
     def run(self, executor: Executor) -> list[Fit]:
         """Fits from the most promising places, the best first."""
-        middle, *others = sorted(PLACES, key=lambda share: abs(share - 0.5))
-        decades = Search.of(self.model).force_decades
-        first = self.start(middle, decades)
-        if first and decades:
-            # What was left had one valley; over nine places of a simulated cable with a tether it
-            # moved by a decade at most.
-            own = self.model.names.index(BENDING_STIFFNESS)
-            best = round(float(np.log10(first.p[own] / self.model.nominal[own])))
-            decades = (best, best - 1, best + 1)
-        starts = [first, *map_in_order(executor, partial(self.start, decades=decades), others)]
-        likely = sorted((x for x in starts if x), key=lambda start: start.point.objective)
-        fits = map_in_order(executor, self.fit_from, likely[:TRIED])
-        return sorted(fits, key=lambda fit: fit.point.objective)
+        problem = self.held_at(PLACES[len(PLACES) // 2])
+        theta = problem.unknowns.pack(problem.unknowns.fixed, np.zeros(self.model.n_coefficients))
+        _, begun = begin(problem, theta)
+        starts = map_in_order(executor, partial(self.relaxed_at, begun), PLACES)
+        likely = sorted(starts, key=lambda start: start[0])
+        fits = map_in_order(executor, self.fit_from, [start[1:] for start in likely[:TRIED]])
+        return sorted((fit for fit in fits if fit), key=lambda fit: fit.point.objective)
 
-    def start(self, share: float, decades: Sequence[float] | None) -> Fit | None:
-        """Equilibria near the measured shapes for a load at a share of the length.
+    def relaxed_at(self, begun: Values, share: float) -> tuple[float, float, Values]:
+        """What is left of a relaxed balance with the load at a share of the length, and there."""
+        problem = self.held_at(share)
+        values = relaxed(problem, begun, SOFTNESS[:3])
+        return Relaxation(problem, SOFTNESS[2]).objective(values), share, values
 
-        For stiffnesses over decades about the prior's, or for what the base has found.
-        """
-        problem, base = self.held_at(share), self.base
-        unknowns = problem.unknowns
-        theta = unknowns.pack(unknowns.fixed, np.zeros(self.model.n_coefficients))
-        if decades is None:
-            theta, decades = unknowns.pack(base.values_in(self.model), base.coefficients), (0,)
-        return next(iter(starting_points(problem, theta, decades)), None)
-
-    def fit_from(self, start: Fit) -> Fit:
-        """Fit with the load held where it is, then with its place free."""
-        held = descend(start)
+    def fit_from(self, start: tuple[float, Values]) -> Fit | None:
+        """Fit with the load held at a share of the length, then with its place free."""
+        share, values = start
+        held = fit_from(self.held_at(share), values, SOFTNESS[2:])
+        if held is None:
+            return None
         moving = self._problem(Unknowns(self.model, self.base.free_in(self.model), held.p))
         theta = moving.unknowns.pack(held.p, held.coefficients)
         return descend(Fit(moving, replace(held.point, theta=theta)), MOST_STEPS)

@@ -30,9 +30,7 @@ from scipy.optimize import lsq_linear
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.effects import Load
 from dlo_casadi.estimation.problem import NO_INFORMATION, Normal, Problem, Values
-from dlo_casadi.estimation.start import EITHER_WAY, measured_shapes
-from dlo_casadi.model.assembly import Inputs, Shapes, Tangents
-from dlo_casadi.model.cable_model import END_ROLL
+from dlo_casadi.model.assembly import Inputs, Tangents
 from dlo_casadi.rod.band import Vector
 
 # Softness of the balance [rad], from first to last. The first is twice the noise of the angles
@@ -49,12 +47,6 @@ FIRST_DAMPING, LEAST_DAMPING, OF_UNKNOWNS = 1.0, 0.1, 0.01
 REFUSED = 6
 # Maximum number of iterations at each softness; relative decrease below which they end.
 STEPS, CONVERGED = 20, 5e-3
-# Rolls of the end [rad] that are tried first. Rolls 1.2 rad away from a trial were found.
-FAR_ROLLS = (0.0, 1.2, -1.2, 2.4, -2.4)
-# Softness [rad] at which forces hardly move the measured shapes.
-SHAPES_ALONE = 0.1
-# Iterations for each of these rolls; number of rolls that are continued.
-FIRST_STEPS, FOLLOWED = 5, 2
 
 
 @dataclass(frozen=True)
@@ -328,73 +320,3 @@ def hung(problem: Problem, values: Values) -> Values:
         columns = [model.border_names.index(name) for name in names]
         lam[:, columns] = [one.curve.at(place)[0] for one in seen]
     return replace(values, shapes=replace(values.shapes, lam=lam))
-
-
-def begin(problem: Problem, theta: FloatArray) -> tuple[Problem, Values]:
-    """Relaxed shapes, forces and unknowns along the measured lines, and the problem weighed there.
-
-    In space no line shows how the cable is turned in its end clamp: rolls are tried in turn, then
-    poses twisted by more than a quarter of a turn the other way round.
-
-    Parameters
-    ----------
-    theta : (size,)
-        Where the unknowns start; any stiffness will do.
-    """
-    names, unknowns = problem.unknowns.names, problem.unknowns
-    own = names.index(END_ROLL) if END_ROLL in names else None
-    if problem.weights is None:
-        problem = _weighed(problem, theta)
-    begun: list[tuple[float, Values]] = []
-    relaxation = Relaxation(problem, SOFTNESS[0])
-    for roll in (0.0,) if own is None else FAR_ROLLS:
-        rolled = theta.copy()
-        if own is not None:
-            rolled[own] += roll / unknowns.scales[own]
-        values = hung(problem, Values(rolled, *measured_shapes(problem, roll)))
-        values = relaxation.solve(values, steps=FIRST_STEPS)
-        begun.append((relaxation.objective(values), values))
-    likely = sorted(begun, key=lambda start: start[0])[:FOLLOWED]
-    found = [relaxation.solve(values) for _, values in likely]
-    return problem, _relaxed_either_way(problem, min(found, key=relaxation.objective))
-
-
-def _weighed(problem: Problem, theta: FloatArray) -> Problem:
-    """The problem weighed; noise that is not declared at least as large as what shapes leave."""
-    values = hung(problem, Values(theta, *measured_shapes(problem)))
-    problem = problem.weighed(values)
-    if problem.noise.known:
-        return problem
-    values = Relaxation(problem, SHAPES_ALONE).solve(values, steps=FIRST_STEPS)
-    left = problem.evaluate(values).data / problem.n_residuals
-    noise = problem.noise.doubted(problem.noise.std * np.sqrt(left))
-    return replace(problem, noise=noise).weighed(values)
-
-
-def _relaxed_either_way(problem: Problem, values: Values) -> Values:
-    """Values whose poses are twisted the other way round where that leaves less of the balance.
-
-    Where the end clamp is rolled by nearly half a turn and the pose does not tell its turns, the
-    twist nearest to none may be either way round within what is known of the roll.
-    """
-    model, measured = problem.unknowns.model, problem.measured
-    twist = model.node.turning(values.shapes.x)
-    asked = [j for j in problem.used if abs(twist[j]) > EITHER_WAY and not measured[j].pose.turns]
-    if not asked:
-        return values
-    p, names = problem.unknowns.p(values.theta), model.names
-    roll = float(p[names.index(END_ROLL)]) if END_ROLL in names else 0.0
-    relaxation, held = Relaxation(problem, SOFTNESS[0]), np.ones(len(values.theta), dtype=bool)
-    shapes, projections = measured_shapes(problem, roll, -np.sign(twist) / 2)
-    other = relaxation.solve(Values(values.theta, shapes, projections), held)
-    lefts = [relaxation.objectives(one)[0] for one in (values, other)]
-    turned = [j for j in asked if lefts[1][j] < lefts[0][j]]
-    parts = [values.shapes.x.copy(), values.shapes.lam.copy(), values.shapes.deviation.copy()]
-    new = other.shapes.x, other.shapes.lam, other.shapes.deviation
-    for mine, theirs in zip(parts, new, strict=True):
-        mine[turned] = theirs[turned]
-    places = [
-        other.projections[k] if j in turned else s
-        for k, (j, s) in enumerate(zip(problem.used, values.projections, strict=True))
-    ]
-    return Values(values.theta, Shapes(*parts), places)

@@ -62,6 +62,12 @@ class Unknowns:
         return np.where(own & (theta <= self.bounds[0]), theta + 1, theta)
 
     @property
+    def without_prior(self) -> BoolArray:
+        """Entries (size,) of theta that no prior holds: parameters of declared effects."""
+        held = [np.isfinite(q.prior_std) or q.name in STIFFNESSES for q in self._parameters]
+        return ~np.array(held + [True] * self.n_rest, dtype=bool)
+
+    @property
     def n_rest(self) -> int:
         """Number of rest-curvature coefficients."""
         return self.model.n_coefficients
@@ -234,13 +240,8 @@ class Search:
     astray : float
         RMS distance over length from which a search may have gone astray, because every repeat has
         a rest curvature of its own.
-    more : int
-        Iterations that promising starts take beside the first ones.
     decades : int
         To both sides of the prior, of a search for the stiffness alone.
-    force_decades : tuple of float or None
-        Decades of stiffness from which an unknown force is searched for; None begins at the
-        declared model's fit.
     predicts : bool
         Whether poses that are lost on the way are predicted anew, from their ends.
     settled : bool
@@ -251,9 +252,7 @@ class Search:
     std: float
     misfit: float
     astray: float
-    more: int
     decades: int
-    force_decades: tuple[float, ...] | None
     predicts: bool
     settled: bool
 
@@ -263,18 +262,12 @@ class Search:
         return IN_SPACE if model.in_space else IN_PLANE
 
 
-# Decades about the prior stiffness from which fits are started.
-DECADES = (0, -1, 1, -2, 2, -3, 3)
 # astray: of 26 sessions in the plane 16 left less; no second search led elsewhere there.
-IN_PLANE = Search(20, 0.0, np.inf, 0.001, 0, 3, DECADES, predicts=True, settled=False)
+IN_PLANE = Search(20, 0.0, np.inf, 0.001, 3, predicts=True, settled=False)
 # std: of three sessions in which an effect is missing, one (space_flat) found its minimum at the
 # noise, too; at 3 mm two did, and one with a drift in neither. A judgement.
 # misfit: in four sessions in which an effect is missing the searches left 0.0025 to 0.0083, in
 # three with nothing or little missing 0.0008 to 0.0013. Either stiffness of such a fit may be far
 # off (a taper's torsion 0.0005 of 0.005 N m^2): what is missing is looked for from the measured
 # shapes.
-# more: at the true stiffnesses, none of three sessions in which an effect is missing had settled
-# after 6 whole steps, two had after 12 to 20, one had not.
-# force_decades: frames tell the stiffness over the weight better than headings do; a start costs
-# more.
-IN_SPACE = Search(10, 0.004, 0.002, np.inf, 14, 1, None, predicts=False, settled=True)
+IN_SPACE = Search(10, 0.004, 0.002, np.inf, 1, predicts=False, settled=True)

@@ -50,7 +50,6 @@ NEVERTHELESS = (
 )
 # Poses of a comparison, points of a line, elements of the mesh, coefficients of the rest curvature.
 _POSES, _POINTS, _MESH, _REST = 8, 24, 12, 4
-_DECADES = (0, -1, 1)
 # Poses that tell whether ends are exchanged: a misfit of a twentieth of the length shows in two.
 _FEW = 2
 # Stiffness over weight is known if its relative standard deviation is below this: units are told
@@ -224,7 +223,7 @@ def coarse_fit(session: Session, most: int = _POSES) -> Coarse:
     model = declared_model(session.config).model
     model = replace(model, effects=(), priors={}, n=_MESH, n_rest=_REST)
     try:
-        fit = fit_model(model, measured, Tolerances(), UNEXPLAINED * length, decades=_DECADES)
+        fit = fit_model(model, measured, Tolerances(), UNEXPLAINED * length)
     except EstimationError:
         return Coarse(None, CONTRADICTS * length, False)
     known = fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS)

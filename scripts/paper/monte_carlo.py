@@ -165,7 +165,7 @@ def run_one(index: int, seed: int) -> dict[str, Any]:
         truth = draw(rng)
         measured = simulate(truth, rng)
     # The guess is within a factor of five: one start is enough.
-    fit = settle(fit_model(model_on(MESH), measured, TOLERANCES, decades=(0,)))
+    fit = settle(fit_model(model_on(MESH), measured, TOLERANCES))
     interval = profile_interval(fit)
     rest = rest_curvature_of(fit)
     gap = rest.value - fit.model.rest.basis(places()) @ truth.coefficients

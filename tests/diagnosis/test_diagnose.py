@@ -176,7 +176,9 @@ def test_structure_is_seen_before_and_not_after(fit, found):
 def test_ipopt_and_gauss_newton_reach_the_same_minimum(session):
     """Two routes: nothing eliminated, exact Hessian, against equilibria eliminated."""
     declared, measured = session
-    fit = fit_model(declared.model.with_mesh(16), measured, declared.tolerances, std=2e-4)
+    # With 0.2 mm the fit lies so far off that points stick out beyond the free tip by more than
+    # their noise: there both take the tip's normal as fixed, and descend to within 0.1 alone.
+    fit = fit_model(declared.model.with_mesh(16), measured, declared.tolerances, std=5e-4)
     solution = solve_batch(fit.problem, fit.point)
     assert solution.residual < 1e-9
     # Gauss-Newton stops at a predicted decrease of 1e-4 times the excess of the residual.

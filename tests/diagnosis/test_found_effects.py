@@ -41,7 +41,7 @@ def session(name: str, *values: float):
         for pose, shape in zip(poses, shapes, strict=True)
     ]
     plain = nuisances(CableModel(CABLE, 10, n_rest=5), Tolerances())
-    return fit_model(plain, measured, Tolerances(), NOISE, decades=(0,))
+    return fit_model(plain, measured, Tolerances(), NOISE)
 
 
 def rivals_of(*names: str) -> tuple[str, ...]:

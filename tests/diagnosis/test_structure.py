@@ -37,7 +37,7 @@ def structure():
         away = np.stack([wave, -wave], axis=1) + 0.1 * STD * rng.normal(size=(POINTS, 2))
         points = found.curve.at(s) + np.einsum("kn,knd->kd", away, found.curve.normals(s))
         measured.append(MeasuredPose.of_points(pose, points))
-    return structure_of(fit_model(model, measured, Tolerances(), STD, decades=(0,)), np.inf)
+    return structure_of(fit_model(model, measured, Tolerances(), STD), np.inf)
 
 
 def test_waves_along_two_normals_are_long_runs(structure):

@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
-from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, begin, relaxed
-from dlo_casadi.estimation.start import measured_shapes
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed
+from dlo_casadi.estimation.start import begin
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose

@@ -34,7 +34,7 @@ def fitted(request):
         for pose, shape in zip(poses, shapes, strict=True)
     ]
     near = np.array([0.01, 0.005, 0.25]) if request.param else model.nominal
-    fit = fit_model(model, measured, Tolerances(), NOISE, values=near, decades=(0,))
+    fit = fit_model(model, measured, Tolerances(), NOISE, values=near)
     return fit, request.param > 0
 
 

@@ -56,7 +56,6 @@ def test_stiffness_and_effects_are_those_of_the_truth(name):
         declared.tolerances,
         config.experiment.measurement.std,
         values=declared.start,
-        decades=(0,),
     )
 
     truth = yaml.safe_load((TRUTH / name / "truth.yaml").read_text())
