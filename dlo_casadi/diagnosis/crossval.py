@@ -20,9 +20,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtr
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.problem import NO_INFORMATION
 from dlo_casadi.estimation.result import Fit
@@ -30,8 +30,6 @@ from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import CLEARLY_WORSE
-
-FloatArray = NDArray[np.floating]
 
 # Stretches into which the arc of a single pose is cut.
 STRETCHES = 5

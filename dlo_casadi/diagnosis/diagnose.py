@@ -1,7 +1,5 @@
 """From a residual to the effects that are missing: screen, confirm, add, until it is noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace

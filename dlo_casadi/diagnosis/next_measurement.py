@@ -1,14 +1,12 @@
 """What the poses do not tell, and the measurement that would: a hidden weight, the next pose."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.effects import Load
@@ -23,8 +21,6 @@ from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.thresholds import APART
-
-FloatArray = NDArray[np.floating]
 
 # Weights that are tried in turn, over the cable's own: until one does not fit.
 WEIGHTS = 0.05 * 1.6 ** np.arange(9)

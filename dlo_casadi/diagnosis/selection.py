@@ -1,7 +1,5 @@
 """Which of the refitted candidates is added: evidence, cross-validation, significance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 

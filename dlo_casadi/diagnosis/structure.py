@@ -1,15 +1,13 @@
 """Is the residual noise, and what limits a prediction: slow modes, repeats, values alike."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import ndtri
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.screening import survival
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.repeats import different_poses, repeatability
@@ -24,8 +22,6 @@ from dlo_casadi.thresholds import (
     LEAST_NOISE_DEGREES,
     REPEATS,
 )
-
-FloatArray = NDArray[np.floating]
 
 # Largest normal score of a test: tails beyond a probability of 1e-12 tell no more.
 _TAIL = 1e-12

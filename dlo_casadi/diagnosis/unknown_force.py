@@ -1,14 +1,12 @@
 """The missing load without a cause: where the cable is pulled, and how in each pose."""
 
-from __future__ import annotations
-
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit
@@ -21,8 +19,6 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import NORMAL_95
-
-FloatArray = NDArray[np.floating]
 
 # Places kept from the scan for a full fit.
 TRIED = 3

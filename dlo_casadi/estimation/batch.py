@@ -17,15 +17,13 @@ It has the same minimum as `descent.descend`, by another route: nothing is elimi
 Hessian is exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import ObservedChange
 from dlo_casadi.equilibrium.minima import run_ipopt
 from dlo_casadi.errors import EstimationError, counted
@@ -33,8 +31,6 @@ from dlo_casadi.estimation.problem import Point, Problem, Values
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after
-
-FloatArray = NDArray[np.floating]
 
 # Projections that move less than this share of the noise between solves have settled.
 SHIFT_TOLERANCE = 1e-3

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -29,8 +29,6 @@ from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES, CableModel
 from dlo_casadi.thresholds import BIC_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
-
-FloatArray = NDArray[np.floating]
 
 # Probability below the upper end of a 95 % interval.
 BELOW_HIGH_END = 0.975

@@ -1,7 +1,5 @@
 """Gauss-Newton for the batch problem: the Levenberg-Marquardt method with a watchdog."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType

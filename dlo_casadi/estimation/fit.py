@@ -1,7 +1,5 @@
 """Fit of a model to all measured poses, on a mesh that is fine enough."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace

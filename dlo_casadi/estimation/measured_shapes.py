@@ -1,7 +1,5 @@
 """Shapes of all poses along their measured lines, by kinematics alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

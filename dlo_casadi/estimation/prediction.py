@@ -1,14 +1,12 @@
 """Shapes predicted from the end conditions alone, and their distance from what was measured."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.equilibrium.guesses import line_nodes
@@ -19,8 +17,6 @@ from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-
-FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.equilibrium.spread import modes_in
@@ -34,8 +34,6 @@ from dlo_casadi.model.rest_curvature import MODES, RestScatter
 from dlo_casadi.rod.band import Vector
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
-
-FloatArray = NDArray[np.floating]
 
 # Precision in scaled units below which a direction counts as undetermined.
 NO_INFORMATION = 1e-6

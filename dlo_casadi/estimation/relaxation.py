@@ -17,17 +17,14 @@ Ramsay et al., Parameter estimation for differential equations: a generalized sm
 J. R. Statist. Soc. B 69 (2007).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.effects import Load
 from dlo_casadi.estimation.problem import NO_INFORMATION, Normal, Problem, Values
 from dlo_casadi.model.assembly import Inputs, Tangents
@@ -80,7 +77,7 @@ class Relaxation:
         return nodes, nodes + a.k, own, own + self.problem.unknowns.size
 
     @cached_property
-    def _stiffness(self) -> NDArray[np.intp]:
+    def _stiffness(self) -> IntArray:
         """Of each node's rows the parameter that scales it: bending or torsional stiffness."""
         model = self.problem.unknowns.model
         bending, torsion = model.stiffness_indices[0], model.stiffness_indices[-1]

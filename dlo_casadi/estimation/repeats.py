@@ -22,17 +22,15 @@ References
 Patterson and Thompson, Biometrika 58 (1971); Kennedy and O'Hagan, J. R. Statist. Soc. B 63 (2001).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
 from scipy.special import chdtrc, chdtri
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.rest_curvature import MODES, SMOOTHNESS, RestScatter
@@ -40,8 +38,6 @@ from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
 from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE, SIGNIFICANCE
-
-FloatArray = NDArray[np.floating]
 
 # Of the length: beside a fixture all repeats are where it holds them.
 _BESIDE_FIXTURES = 0.02

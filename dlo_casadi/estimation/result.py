@@ -9,8 +9,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.estimation.problem import (
@@ -25,8 +25,6 @@ from dlo_casadi.estimation.repeats import different_poses, repeat_std
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import DIFFERENT, LEAST_NOISE_DEGREES
-
-FloatArray = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -262,7 +260,7 @@ class Fit:
         return self.problem.rest_errors(self.point)
 
     @property
-    def _on_points(self) -> list[NDArray[np.bool_]]:
+    def _on_points(self) -> list[BoolArray]:
         return [self.problem.measured[j].on_points for j in self.problem.used]
 
     @property
@@ -349,13 +347,13 @@ class Fit:
         known = {**dict(zip(self.model.names, self.p, strict=True)), **given}
         return np.array([known.get(q.name, q.nominal) for q in model.parameters])
 
-    def free_in(self, model: CableModel) -> NDArray[np.bool_]:
+    def free_in(self, model: CableModel) -> BoolArray:
         """Which parameters of a similar model are estimated: all but those kept fixed here."""
         free = dict(zip(self.model.names, self.problem.unknowns.free, strict=True))
         return np.array([free.get(name, True) for name in model.names], dtype=bool)
 
     @cached_property
-    def stable(self) -> NDArray[np.bool_]:
+    def stable(self) -> BoolArray:
         """Whether each pose is a stable equilibrium at the fitted parameters."""
         return self.problem.equilibria.stable(*self.problem.state(self.point))
 

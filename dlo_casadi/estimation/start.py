@@ -6,8 +6,6 @@ them. What no line shows is tried both ways at the soft penalty: how the cable i
 clamp, and which way round a pose is twisted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

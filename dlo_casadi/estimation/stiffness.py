@@ -1,16 +1,14 @@
 """Simple estimates: the stiffness alone, and moment against curvature without any fit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import make_lsq_spline
 from scipy.optimize import minimize_scalar
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses, stacked
@@ -19,8 +17,6 @@ from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-
-FloatArray = NDArray[np.floating]
 
 # Steps per decade of the first search.
 _PER_DECADE = 3

@@ -7,13 +7,10 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.model.cable_model import STIFFNESS_RATIO_STD, STIFFNESSES, CableModel
-
-FloatArray = NDArray[np.floating]
-BoolArray = NDArray[np.bool_]
 
 # A weak prior of the rest curvature: a turn per length, one standard deviation.
 REST_TURNS_STD = 1.0
@@ -42,7 +39,7 @@ class Unknowns:
     fixed: FloatArray
 
     @cached_property
-    def _used(self) -> NDArray[np.intp]:
+    def _used(self) -> IntArray:
         return np.flatnonzero(self.free)
 
     @cached_property

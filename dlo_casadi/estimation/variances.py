@@ -1,12 +1,10 @@
 """Noise, roughness of the rest curvature and scatter of the fixtures, estimated from the data."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.repeats import (
@@ -31,8 +29,6 @@ from dlo_casadi.sensing.noise import (
     tell_of_noise,
 )
 from dlo_casadi.thresholds import DIFFERENT, SCATTERED, SCATTERED_DEGREES
-
-FloatArray = NDArray[np.floating]
 
 # Slow displacements per pose that are kept out of the noise estimate: many while an effect may
 # be missing, few once the model is taken as complete, because noise is slow, too.
