@@ -14,7 +14,7 @@ from paper import chords, energies, equations, monte_carlo, page, published, rep
 from paper.content import Claim, Part, Section, Target, drawing
 from paper.fits import estimate
 
-from dlo_casadi.estimation import fit as fitting
+from dlo_casadi.estimation import start
 from dlo_casadi.estimation.constrained import profile_interval, stiffness_profile, threshold
 
 
@@ -74,7 +74,7 @@ def test_profile_meets_the_threshold_at_the_ends_of_the_interval(fitted):
 
 
 def test_search_on_a_few_poses_leads_to_the_same_minimum(revealing, fitted, monkeypatch):
-    monkeypatch.setattr(fitting, "POSES_OF_A_SEARCH", 5)
+    monkeypatch.setattr(start, "POSES_OF_A_SEARCH", 5)
     again = equations.first_fit(revealing)
     # Both have converged to within a hundredth of a standard deviation.
     assert again.p[0] == pytest.approx(fitted.p[0], abs=0.02 * fitted.std("bending_stiffness"))

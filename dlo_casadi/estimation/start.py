@@ -51,11 +51,12 @@ def begin(
     held : (size,) bool, optional
         Entries of theta that stay where they are; none by default.
     """
+    problem = problem if problem.weights else weighed(problem, theta)
     if len(problem.used) > POSES_OF_A_SEARCH and not problem.unknowns.model.has_state:
-        kept = problem.fitted[:: -(-len(problem.fitted) // POSES_OF_A_SEARCH)]
-        few, values = begin(
-            replace(problem, history=[problem.history[k] for k in kept]), theta, held
-        )
+        kept = slice(None, None, -(-len(problem.fitted) // POSES_OF_A_SEARCH))
+        history = tuple(problem.history[k] for k in problem.fitted[kept])
+        few = replace(problem, history=history, weights=problem.whitening[kept])
+        few, values = begin(few, theta, held)
         theta = relaxed(few, values, SOFTNESS[1:], held).theta
         return _along_lines(problem, theta, held, ROLLS[:1])
     return _along_lines(problem, theta, held, ROLLS)
@@ -67,7 +68,6 @@ def _along_lines(
     """As `begin`, from rolls beside that of theta."""
     names, unknowns = problem.unknowns.names, problem.unknowns
     own = names.index(END_ROLL) if END_ROLL in names else None
-    problem = problem if problem.weights else weighed(problem, theta)
     relaxation = Relaxation(problem, SOFTNESS[0])
     begun: list[tuple[float, Values]] = []
     for roll in rolls if own is not None else ROLLS[:1]:

@@ -28,7 +28,7 @@ from dlo_casadi.session.stages import algorithm1_stage, initial_stage, stiffness
 
 # Elements of the declared model's mesh; refined from the data.
 MESH = 40
-# The search over decades of stiffness runs on this mesh; in space, where an element takes 17
+# Stiffness and shapes are searched for on this mesh; in space, where an element takes 17
 # times the operations, on half of it.
 FIRST_MESH = 20
 REST_COEFFICIENTS = 13

@@ -36,7 +36,7 @@ LABELS: dict[Method, str] = {
     "arc": "batch, arcs",
     "quadratic": "batch, quadratic",
 }
-# The mesh on which the search over decades of stiffness runs.
+# The mesh on which stiffness and shapes are searched for.
 FIRST = 10
 REST_COEFFICIENTS = 13
 
