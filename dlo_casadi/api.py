@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import fields
 from functools import cached_property
+from inspect import Signature, signature
+from os import PathLike
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -19,7 +21,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimate import Covariance, Estimate
+from dlo_casadi.cable.estimate import Covariance, Estimate, Named
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
 from dlo_casadi.config import Cable, Config, Pose, any_photographs, checked_config, load_as
@@ -61,7 +63,7 @@ class Result(Outcome):
         after the fitted ones. Intervals are profile likelihoods; a model that does not explain what
         was measured has none.
         """
-        return estimates_of(self)
+        return Named(estimates_of(self))
 
     @property
     def covariance(self) -> Covariance:
@@ -75,7 +77,7 @@ class Result(Outcome):
         Predicted from the ends of the pose alone; poses without points are absent.
         """
         shapes = self.stages[-1].shapes
-        return {name: shape.gap for name, shape in shapes.items() if len(shape.gap)}
+        return Named((name, shape.gap) for name, shape in shapes.items() if len(shape.gap))
 
     def summary(self) -> str:
         """Text on the whole fit: errors, all parameters, effects, strong correlations, warnings."""
@@ -117,6 +119,8 @@ class Result(Outcome):
         DloError
             If the folder cannot be written, or holds files of these names from elsewhere.
         """
+        if not isinstance(folder, str | PathLike):
+            raise DloError(f"folder: a path belongs here, found {folder!r}")
         with ResultsFolder(folder, self.config) as results:
             return results.write(self)
 
@@ -166,8 +170,8 @@ class Session(Config):
         cable: Cable,
         poses: Sequence[Pose],
         *,
-        gravity: ArrayLike,
-        boundary: Sequence[str],
+        gravity: ArrayLike | None = None,
+        boundary: Sequence[str] | None = None,
         std: float | None = None,
         force_std: float | None = None,
         moment_std: float | None = None,
@@ -178,16 +182,17 @@ class Session(Config):
         model: Mapping[str, Any] | None = None,
         estimation: Mapping[str, Any] | None = None,
         diagnosis: Mapping[str, Any] | None = None,
+        **unknown: Any,
     ) -> None:
         equipment = _given(camera=camera, board=board, reference=reference)
         pictures = equipment or any_photographs(poses)
         measurement = _given(std=std, force_std=force_std, moment_std=moment_std) | equipment
         measurement["kind"] = "images" if pictures else "centerlines"
-        experiment = {"gravity": gravity, "boundary": boundary, "measurement": measurement}
-        experiment |= {"poses": poses} | _given(tolerances=tolerances)
-        options = _given(model=model, estimation=estimation, diagnosis=diagnosis)
+        experiment = {"measurement": measurement, "poses": poses}
+        experiment |= _given(gravity=gravity, boundary=boundary, tolerances=tolerances)
+        options = _given(model=model, estimation=estimation, diagnosis=diagnosis) | unknown
         given = plain({"cable": cable, "experiment": experiment, **options})
-        checked = checked_config(Arguments(given), Config)
+        checked = checked_config(Arguments(given, tuple(signature(Session).parameters)), Config)
         super().__init__(**{name: getattr(checked, name) for name in checked.model_fields_set})
         self._warnings, self._skipped = checked.warnings, checked.skipped
 
@@ -218,8 +223,7 @@ class Session(Config):
         diagnosis : bool, optional
             Whether to search for missing effects; as the session says by default.
         progress : Progress, optional
-            Told how far the run has come: an object with `step(name, done, total)` and
-            `message(text)`.
+            Told how far the run has come: an object with `step(name, done, total)`.
         executor : Executor, optional
             Runs independent tasks at the same time; by default they run in this process. In a
             script, below `if __name__ == "__main__":`, `with open_executor(2, here=True) as
@@ -233,22 +237,34 @@ class Session(Config):
         Raises
         ------
         DloError
-            If the executor is none.
+            If `diagnosis`, `progress` or `executor` is none.
         MeasurementError
             If no pose can be read, or if the lines contradict the session beyond doubt.
         EstimationError
             If no model of the declared cable comes near the measured shapes.
         """
+        if progress is not None and not hasattr(progress, "step"):
+            raise DloError(
+                f"progress={progress!r} has no method step(name, done, total).\n  Try: an object "
+                "of a class of yours that has."
+            )
         if executor is not None and not isinstance(executor, Executor):
             raise DloError(
                 f"executor={executor!r} is no Executor.\n  Try: with "
                 "dlo_casadi.runtime.parallel.open_executor(2, here=True) as executor: ..."
             )
+        if not isinstance(diagnosis, bool | None):
+            raise DloError(f"diagnosis is True, False or None, found {diagnosis!r}")
         session = self
         if diagnosis is not None:
             options = self.diagnosis.model_copy(update={"enabled": diagnosis})
             session = self.model_copy(update={"diagnosis": options})
         return _as(Result, run_session(session, progress, executor))
+
+
+# What a session takes: neither `self` nor the unknown ones, which are refused.
+_KNOWN = list(signature(Session.__init__).parameters.values())[1:-1]
+Session.__signature__ = Signature(_KNOWN)
 
 
 def _given(**values: Any) -> dict[str, Any]:

@@ -295,9 +295,52 @@ def test_poses_are_a_list_of_poses(poses, message):
         dlo.Session(cable, poses, gravity=(0, -9.81), boundary=("pinned", "pinned"))
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"gravity": None}, "'gravity' is missing"),
+        ({"boundary": None}, "'boundary' is missing"),
+        ({"force_sd": 0.1}, "unknown key 'force_sd' in the arguments; did you mean 'force_std'"),
+        ({"plausibility": False}, 'it belongs into estimation={"plausibility": ...}'),
+        ({"matrix": CAMERA["matrix"]}, 'it belongs into camera={"matrix": ...}'),
+    ],
+)
+def test_unknown_and_missing_arguments_of_a_session(given, message):
+    with pytest.raises(dlo.ConfigError, match=re.escape(message)):
+        hung(**given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"progress": print}, "progress=.* has no method step"),
+        ({"diagnosis": "no"}, "diagnosis is True, False or None, found 'no'"),
+    ],
+)
+def test_wrong_arguments_of_a_fit(given, message):
+    with pytest.raises(dlo.DloError, match=message):
+        hung().fit(**given)
+
+
+def test_a_session_does_not_change():
+    with pytest.raises(dlo.DloError, match="std of a Session cannot be set"):
+        hung().std = 3.0
+
+
+def hung(**options: Any) -> dlo.Session:
+    """A small session with other options."""
+    cable = dlo.Cable(length=0.5, mass=0.05, diameter=0.005, bending_stiffness=0.01)
+    held = {"gravity": (0.0, -9.81), "boundary": ("pinned", "pinned")}
+    return dlo.Session(cable, [dlo.Pose((0, 0), (0.3, -0.1), points=LINE)], **held | options)
+
+
 def test_a_third_argument_needs_its_name():
     with pytest.raises(dlo.ConfigError, match="3 arguments without a name: start and end alone"):
         dlo.Pose((0, 0), (0.3, -0.1), LINE)
+    with pytest.raises(dlo.ConfigError, match="Cable: 2 arguments without a name: all need theirs"):
+        dlo.Cable(0.8, 0.05)
+    with pytest.raises(dlo.ConfigError, match="start is given twice"):
+        dlo.Pose((0, 0), start=(0, 0))
 
 
 def test_values_of_numpy_are_numbers():

@@ -2,12 +2,22 @@
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, counted
 from dlo_casadi.show.text import plus_minus
+
+Value = TypeVar("Value")
+
+
+class Named(dict[str, Value]):
+    """Values by name; asked for another name it raises a DloError with all that there are."""
+
+    def __missing__(self, name: str) -> Value:
+        raise DloError(f"nothing is called {name!r}; there are {', '.join(self)}")
 
 
 @dataclass(frozen=True)
@@ -72,10 +82,19 @@ class Covariance:
     values: FloatArray
 
     def __getitem__(self, pair: tuple[str, str]) -> float:
+        if not isinstance(pair, tuple) or len(pair) != 2:
+            raise DloError(
+                f"a covariance is of two names, found {pair!r}\n"
+                "  Try: covariance[name, name] is the variance, `std` has its root."
+            )
         if unknown := [name for name in pair if name not in self.names]:
             raise DloError(f"{unknown[0]!r} was not fitted; fitted are {', '.join(self.names)}")
         i, j = map(self.names.index, pair)
         return float(self.values[i, j])
+
+    def __repr__(self) -> str:
+        known = (f"  {name}: std {std:.3g}" for name, std in self.std.items())
+        return "\n".join([f"<Covariance of {counted(len(self.names), 'estimate')}>", *known])
 
     @property
     def std(self) -> dict[str, float]:

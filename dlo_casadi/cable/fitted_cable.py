@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.curve import CableCurve
-from dlo_casadi.cable.estimate import Covariance, Estimate
+from dlo_casadi.cable.estimate import Covariance, Estimate, Named
 from dlo_casadi.cable.held import held_pose
 from dlo_casadi.cable.metadata import Metadata
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.config.values import MESH
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
@@ -31,8 +32,9 @@ from dlo_casadi.equilibrium.spread import (
     tipping_of,
 )
 from dlo_casadi.equilibrium.symbolic import CasadiCable
-from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.show.text import html_table, millimetres, vector
 
@@ -62,6 +64,11 @@ class FittedCable(CasadiCable):
 
     metadata: Metadata
 
+    def __repr__(self) -> str:
+        mesh = counted(self.model.n, f"{self.model.element} element")
+        rows = (f"  {name}: {x}" for name, x in self.params.items() if not x.fixed)
+        return "\n".join([f"<FittedCable {self.name!r}: {self.length:g} m, {mesh}>", *rows])
+
     @property
     def name(self) -> str:
         """What the cable is called."""
@@ -70,7 +77,7 @@ class FittedCable(CasadiCable):
     @property
     def params(self) -> dict[str, Estimate]:
         """All parameters of the model by name, as they were estimated."""
-        return self.metadata.params
+        return Named(self.metadata.params)
 
     @property
     def covariance(self) -> Covariance:
@@ -162,7 +169,7 @@ class FittedCable(CasadiCable):
         Raises
         ------
         DloError
-            If there is no C compiler.
+            If there is no C compiler, or it refuses the flags.
         """
         return CompiledSolver(self.model, self.p, self.rest, flags=flags)
 
@@ -172,16 +179,21 @@ class FittedCable(CasadiCable):
         Raises
         ------
         DloError
-            If its rest shape has changed from pose to pose: it is known on the fit's mesh alone.
+            If its rest shape has changed from pose to pose: it is known on the fit's mesh alone;
+            or if there is no such mesh.
         """
         if n is None and element is None:
             return self
+        if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
+            raise DloError(f"n: a whole number, {MESH}, found {n!r}")
+        if element not in (None, *ELEMENTS):
+            raise DloError(f"element: one of {', '.join(ELEMENTS)} belongs here, found {element!r}")
         if self.model.has_state:
             raise DloError(
                 f"{self.name!r} has a rest shape that changed from pose to pose, which is known on "
                 "the fit's elements alone: leave out the number and the kind of elements"
             )
-        model = self.model.with_mesh(n or self.model.n, element)
+        model = self.model.with_mesh(self.model.n if n is None else int(n), element)
         return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
 
     def _shape(self, pose: HeldPose, eq: Equilibrium) -> "Shape":

@@ -62,6 +62,8 @@ def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",
             "no C compiler found (looked for $CC, cc, gcc, clang).\n"
             "  Try: apt-get install gcc, or set CC; scripts/generate_solver.py needs none."
         )
+    if isinstance(flags, str):
+        raise DloError(f"flags is a sequence of words, found {flags!r}\n  Try: {flags.split()}")
     solver.write(folder)
     library = folder / f"{solver.prefix}_solver.so"
     command = [compiler, "-std=c99", *flags, "-fPIC", "-shared", f"{solver.prefix}_solver.c"]

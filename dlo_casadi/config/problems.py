@@ -100,6 +100,8 @@ class Source:
     """Where the files are that it names."""
     hidden: tuple[str, ...] = ()
     """Keys that are left out of the name of a place."""
+    names: tuple[str, ...] = ()
+    """What may stand at the top, where it is not the keys of the checked section."""
     top = "the top of the file"
 
     def checked(self, model: type[Model], heading: str = "", remedy: str = "") -> Model:
@@ -133,6 +135,10 @@ class Source:
         """The error, with the file and the line where there are any."""
         return ConfigError(message)
 
+    def inside(self, key: str, section: str) -> str:
+        """Say that a key stands in a section."""
+        return section
+
     def label(self, place: Place) -> str:
         """Name a place in words: cable.length, pose 4 (pose_04.jpg) end."""
         data, words = self.data, []
@@ -157,8 +163,13 @@ class Arguments(Source):
     hidden = ("experiment", "measurement")
     top = "the arguments"
 
-    def __init__(self, data: dict[str, Any]) -> None:
-        self.data, self.folder = data, Path()
+    def __init__(self, data: dict[str, Any], names: tuple[str, ...] = ()) -> None:
+        self.data, self.folder, self.names = data, Path(), names
+
+    def inside(self, key: str, section: str) -> str:
+        """Say that a key stands in a mapping."""
+        own = re.sub(r"^experiment\.(measurement [^.]*\.)?", "", section)
+        return f'{own}={{"{key}": ...}}'
 
 
 def _help(section: type[BaseModel], key: object) -> str:
@@ -238,9 +249,11 @@ def explain(
                 continue
             text = f"{key!r} is missing in {label}{_help(section, key)}"
         elif kind == "extra_forbidden":
-            hint = did_you_mean(str(key), section.model_fields)
+            at_top = len(place) == 1 and source.names
+            names = source.names if at_top else tuple(section.model_fields)
+            hint = did_you_mean(str(key), names)
             homes = [
-                name or "the top"
+                source.inside(str(key), name) if name else "the top"
                 for inner, name in sections.values()
                 if str(key) in inner.model_fields
             ]

@@ -34,7 +34,7 @@ from dlo_casadi.config.values import (
     within,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.errors import ConfigError, counted, well_formed
+from dlo_casadi.errors import counted, well_formed
 from dlo_casadi.rod.ends import REACTIONS
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
@@ -138,6 +138,8 @@ class Pose(Section):
     From Python `start` and `end` may stand without their names: `Pose(start, end, points=...)`.
     """
 
+    _without_names = ("start", "end")
+
     file: Path | None = None
     """Photograph or CSV, found relative to the YAML; an absolute path once loaded."""
     files: tuple[Path, ...] = ()
@@ -206,14 +208,6 @@ class Pose(Section):
         """How its ends are held."""
         names = [item.name for item in dataclasses.fields(HeldPose) if hasattr(self, item.name)]
         return HeldPose(**{name: getattr(self, name) for name in names})
-
-    def __init__(self, *ends: Any, **values: Any) -> None:
-        if len(ends) > 2:
-            text = "start and end alone may stand without their names"
-            raise ConfigError(f"{counted(len(ends), 'argument')} without a name: {text}")
-        super().__init__(**dict(zip(("start", "end"), ends, strict=False)), **values)
-
-    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @field_validator("file", mode="before")
     @classmethod

@@ -9,7 +9,7 @@ import inspect
 import math
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 from pydantic import (
@@ -29,7 +29,7 @@ from dlo_casadi.config.problems import (
     show,
 )
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS
-from dlo_casadi.errors import counted
+from dlo_casadi.errors import ConfigError, DloError, counted
 
 
 class Range(NamedTuple):
@@ -169,13 +169,31 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    def __init__(self, **values: Any) -> None:
-        values = plain(values)
+    _without_names: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, *first: Any, **values: Any) -> None:
+        if len(first) > len(self._without_names):
+            alone = " and ".join(self._without_names)
+            text = f"{alone} alone may stand without their names" if alone else "all need theirs"
+            count = f"{counted(len(first), 'argument')} without a name"
+            raise ConfigError(f"{type(self).__name__}: {count}: {text}")
+        named = dict(zip(self._without_names, first, strict=False))
+        if twice := named.keys() & values.keys():
+            raise ConfigError(f"{type(self).__name__}: {min(twice)} is given twice")
+        values = plain(named | values)
         try:
             super().__init__(**values)
         except ValidationError as error:
             given = Arguments(values)
             raise given.error(explain(type(self), error.errors(), given)) from None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_"):
+            kind = type(self).__name__
+            raise DloError(
+                f"{name} of a {kind} cannot be set.\n  Try: another {kind}, made with it"
+            )
+        super().__setattr__(name, value)
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:

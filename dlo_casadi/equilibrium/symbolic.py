@@ -58,7 +58,7 @@ class CasadiCable:
     def function(
         self,
         *,
-        parameters: bool | Sequence[str] = False,
+        parameters: bool | str | Sequence[str] = False,
         branch: Branch | None = None,
         search: ca.Function | None = None,
     ) -> ca.Function:
@@ -71,7 +71,7 @@ class CasadiCable:
 
         Parameters
         ----------
-        parameters : bool or sequence of str
+        parameters : bool, str or sequence of str
             Whether the model's parameters, or those of them with these names, are a second input
             `parameters` (SI), in the order of `model.names` or of the names, in place of the fitted
             values.
@@ -131,7 +131,7 @@ class CasadiCable:
         outputs = {name: there * out for name, out in _outputs(self.model, symbols).items()}
         return _function("cable", inputs, outputs | {"status": status})
 
-    def equations(self, *, parameters: bool | Sequence[str] = False) -> ca.Function:
+    def equations(self, *, parameters: bool | str | Sequence[str] = False) -> ca.Function:
         """The equations of an equilibrium, to transcribe many poses in one problem of one's own.
 
         (x, multipliers, pose[, parameters]) -> (residual, balance, conditions, lengths, points,
@@ -140,7 +140,7 @@ class CasadiCable:
 
         Parameters
         ----------
-        parameters : bool or sequence of str
+        parameters : bool, str or sequence of str
             As in `function`.
 
         Returns
@@ -203,7 +203,10 @@ class CasadiCable:
         DloError
             If it has another number of numbers.
         """
-        numbers = np.asarray(pose, float).ravel()
+        try:
+            numbers = np.asarray(pose, float).ravel()
+        except (TypeError, ValueError):
+            raise DloError(f"pose: numbers belong here, found {pose!r}") from None
         if len(numbers) != pose_size(self.model):
             size = counted(pose_size(self.model), "number")
             raise DloError(f"pose: {size} as in dlo_pose of the C header, found {len(numbers)}")
@@ -212,6 +215,8 @@ class CasadiCable:
         return Unknowns(found.x.T, found.multipliers)
 
     def _check_search(self, search: ca.Function, *, with_others: bool) -> None:
+        if not isinstance(search, ca.Function):
+            raise DloError(f"search is a casadi.Function, found {search!r}")
         if with_others:
             raise DloError(
                 "search is the generated C, which has its own parameters and branch: leave out "
@@ -226,10 +231,14 @@ class CasadiCable:
                 '  Try: casadi.external("dlo_equilibrium", library) of this very cable.'
             )
 
-    def _inputs(self, parameters: bool | Sequence[str]) -> tuple[dict[str, Any], Any]:
+    def _inputs(self, parameters: bool | str | Sequence[str]) -> tuple[dict[str, Any], Any]:
         """Symbols of the pose and of the parameters asked for, and all parameters."""
         known = self.model.names
-        names = known if parameters is True else tuple(parameters or ())
+        if not isinstance(parameters, bool | str | list | tuple):
+            text = "True, False or names of parameters belong here, found"
+            raise DloError(f"parameters: {text} {parameters!r}")
+        asked = [parameters] if isinstance(parameters, str) else parameters
+        names = known if asked is True else tuple(asked or ())
         for name in names:
             if name not in known:
                 raise DloError(f"no parameter {name!r}; there are {', '.join(known)}")

@@ -170,6 +170,42 @@ def test_a_result_predicts_as_its_file_does(result, written):
     assert "<tr><td>end</td><td>(0.3, -0.1) m</td></tr>" in direct._repr_html_()
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda r: r.params["EI"], "nothing is called 'EI'; there are bending_stiffness"),
+        (lambda r: r.cable.params["EI"], "nothing is called 'EI'; there are bending_stiffness"),
+        (lambda r: r.residuals["pose_99"], "nothing is called 'pose_99'; there are pose_01"),
+        (lambda r: r.covariance["a", "b", "c"], "a covariance is of two names, found"),
+        (lambda r: r.covariance["bending_stiffness"], "two names, found 'bending_stiffness'"),
+        (lambda r: r.write(None), "a path belongs here, found None"),
+        (lambda r: r.cable.with_mesh(2.5), "n: a whole number, 2 to 2000 .* found 2.5"),
+        (lambda r: r.cable.with_mesh(0), "n: a whole number, .* found 0"),
+        (lambda r: r.cable.with_mesh(element="foo"), "element: one of .* found 'foo'"),
+        (lambda r: r.cable.initial("abc"), "pose: numbers belong here, found 'abc'"),
+        (lambda r: r.cable.function(search="x"), "search is a casadi.Function, found 'x'"),
+        (lambda r: r.cable.function(parameters=5), "parameters: True, False or names .* found 5"),
+        (lambda r: r.cable.function(parameters="EI"), "no parameter 'EI'"),
+        (lambda r: r.cable.compile(flags="-O2 -g"), r"Try: \['-O2', '-g'\]"),
+    ],
+)
+def test_mistakes_with_a_result_are_told(wrong, message, result):
+    with pytest.raises(dlo.DloError, match=message):
+        wrong(result)
+
+
+def test_one_name_is_no_list_of_letters(result):
+    function = result.cable.function(parameters="bending_stiffness")
+    assert function.size_in("parameters") == (1, 1)
+
+
+def test_cables_and_covariances_are_short(result):
+    """A line for each parameter, and no matrix."""
+    fitted = [name for name, found in result.cable.params.items() if not found.fixed]
+    assert len(repr(result.cable).splitlines()) == 1 + len(fitted)
+    assert len(repr(result.covariance).splitlines()) == 1 + len(result.covariance.names)
+
+
 def test_a_number_is_no_executor(outcome):
     with pytest.raises(dlo.DloError, match=r"executor=2 is no Executor.\n  Try: with dlo_casadi"):
         dlo.fit(outcome.config.path, executor=2)
