@@ -60,7 +60,7 @@ def bench(tmp_path_factory):
 
 
 @pytest.mark.parametrize("page", having("python"))
-def test_python_runs_from_top_to_bottom(page, bench, monkeypatch):
+def test_python_runs_from_top_to_bottom(page, bench, monkeypatch, capsys):
     folder, result = bench
     monkeypatch.chdir(folder)
     monkeypatch.setattr(dlo, "fit", lambda config: {"configs/cable.yaml": result}[config])
@@ -70,6 +70,9 @@ def test_python_runs_from_top_to_bottom(page, bench, monkeypatch):
     for block in blocks(TEXTS[page], "python"):
         exec(block, names)
     del sys.modules[page]
+    said = capsys.readouterr().out
+    shown = re.findall(r"^```python\n[^`]*^```\n\n```text\n(.*?)^```", TEXTS[page], re.M | re.S)
+    assert [text for text in shown if text not in said] == []
 
 
 @pytest.mark.parametrize("page", having("(?:shell|bash)"))

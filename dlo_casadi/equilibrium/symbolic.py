@@ -80,8 +80,9 @@ class CasadiCable:
         search : casadi.Function, optional
             What finds equilibria in place of Python: `casadi.external("dlo_equilibrium", library)`,
             or `dlo_equilibrium_ccw`, `_cw`, of this cable's generated C, compiled into a shared
-            library. The function is then several times faster, can be serialised, and CasADi writes
-            it and its derivatives as C (`Function.generate`).
+            library. A pose then takes about 1 ms in place of 30 (20 elements, both ends clamped),
+            the function can be serialised, and CasADi writes it and its derivatives as C
+            (`Function.generate`).
 
         Returns
         -------
