@@ -18,7 +18,7 @@ from dlo_casadi.config import (
 )
 from dlo_casadi.config.sections import DENSITY
 from dlo_casadi.effects import EFFECTS, CableData
-from dlo_casadi.errors import ConfigError, counted
+from dlo_casadi.errors import ConfigError, DloError, counted
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted(ROOT.glob("configs/*.yaml"))
@@ -161,9 +161,9 @@ diagnosis:
 
 def test_a_configuration_cannot_be_changed(tmp_path):
     config = load(tmp_path)
-    with pytest.raises(ValueError, match="frozen"):
+    with pytest.raises(DloError, match="length of a Cable cannot be set"):
         config.cable.length = 1.0
-    with pytest.raises(ValueError, match="frozen"):
+    with pytest.raises(DloError, match="path of a Config cannot be set"):
         config.path = Path()
 
 

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -221,6 +222,11 @@ WRONG = {
     "a point that was not measured": {"points": [[0.0, 0.0], [NAN, 0.1]]},
     "points in millimetres": {"points": [[0.0, 0.0], [4000.0, 0.0]]},
     "arc lengths of other points": {"at": [0.1, 0.2]},
+    "arc lengths that shrink": {"at": [0.35, 0.15, 0.0]},
+    "an arc length twice": {"at": [0.0, 0.15, 0.15]},
+    "an arc length beyond the cable": {"at": [0.0, 0.15, 0.6]},
+    "one point": {"points": [[0.0, 0.0]]},
+    "one word for both ends": {"boundary": "pinned"},
     "a place of three numbers": {"end": [0.4, 0.0, 0.1]},
     "an infinite place": {"end": [0.4, float("inf")]},
     "an end out of reach": {"end": [4.0, 0.0]},
@@ -348,6 +354,7 @@ def test_values_of_numpy_are_numbers():
         length=np.float32(0.5), mass=np.array(0.05), diameter=0.005, bending_stiffness=1
     )
     assert (type(cable.length), cable.mass) == (float, 0.05)
+    assert dlo.Pose((0, 0), (0.3, -0.1), points=ca.DM(LINE)).points == tuple(map(tuple, LINE))
     pose = dlo.Pose(
         np.array([0, 0]), end=np.float32([0.25, 0]), points=np.array(LINE), turns=np.int64(1)
     )

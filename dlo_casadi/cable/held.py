@@ -43,7 +43,7 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     if model.end != "free" and "end" not in given:
         raise DloError(
             f"the end of {name} is {model.end}: where is it?\n"
-            f"  Try: --end {' '.join(model.node.axes).upper()} [m], in Python end."
+            f"  Try: end={place} [m], of the command --end {' '.join(model.node.axes).upper()}."
         )
     given.setdefault("start", shared.get("start") or (0.0,) * model.node.dimension)
     for side, held in (("start", model.start), ("end", model.end)):

@@ -264,20 +264,19 @@ def _row(model: CableModel, pose: object) -> FloatArray:
         pose = pose.held
     if not isinstance(pose, HeldPose):
         raise DloError(f"a Pose belongs here, found {pose!r}\n  Try: dlo_casadi.Pose(start, end)")
+    said = f"{pose.name}: " if pose.name else ""
     if pose.end is None and model.end != "free":
-        raise DloError(
-            f"{pose.name}: the end of the cable is {model.end}: where is it?\n  Try: end"
-        )
+        raise DloError(f"{said}the end of the cable is {model.end}: where is it?\n  Try: end")
     d = model.node.dimension
     for name, place in (("start", pose.start), ("end", pose.end)):
         if place is not None and np.shape(place) != (d,):
-            raise DloError(f"{pose.name}: {name} must have {counted(d, 'number')}, found {place!r}")
+            raise DloError(f"{said}{name} must have {counted(d, 'number')}, found {place!r}")
     try:
         numbers = np.asarray([*pose.ends, pose.turns], float)
     except (TypeError, ValueError):
         raise DloError(f"numbers belong in a pose, found {pose!r}") from None
     if len(numbers) != EndConditions.size(model.node) + 1:
-        raise DloError(f"{pose.name}: an orientation must have 4 numbers, found {pose!r}")
+        raise DloError(f"{said}an orientation must have 4 numbers, found {pose!r}")
     return numbers[: pose_size(model)]
 
 

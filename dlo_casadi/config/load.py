@@ -58,6 +58,9 @@ def load_as(kind: type[Kind], path: str | Path) -> Kind:
         raise ConfigError(
             f"a mapping with cable: and experiment: belongs at the top, found {found}", file=source
         )
+    if str(document.data.get("schema")).startswith("dlo-parameters"):
+        text = "a fitted cable, no configuration.\n  Try: dlo_casadi.load(path), or dlo predict"
+        raise ConfigError(text, file=source)
     return checked_config(document, kind).noted(path=source.absolute())
 
 
@@ -204,7 +207,7 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
     axes = "[x, y, z]" if space else "[x, y]"
     numbers = "three numbers of gravity: the cable is in space" if space else "two of gravity"
     for key, most in _LARGEST_HEADINGS.items():
-        place, how = getattr(pose, key), getattr(held, key)
+        place, how, one = getattr(pose, key), getattr(held, key), "an" if key == "end" else "a"
         orientation, heading = getattr(pose, f"{key}_orientation"), getattr(pose, f"{key}_heading")
         if place is not None and len(place) != len(experiment.gravity):
             yield f"{key}: {axes} belongs here ({numbers})", key
@@ -225,10 +228,10 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
             if reading is not None and len(reading) != count:
                 yield f"{key}_{kind}: {what} belongs here ({numbers})", f"{key}_{kind}"
         if how == "clamped" and space and orientation is None:
-            yield f"a clamped {key} needs a {key}_orientation [qx, qy, qz, qw]", None
+            yield f"a clamped {key} needs {one} {key}_orientation [qx, qy, qz, qw]", None
         if how == "clamped" and not space and heading is None:
             how = " [rad]" if key == "start" else " [rad], continuous along the cable"
-            yield f"a clamped {key} needs a{'n' * (key == 'end')} {key}_heading{how}", None
+            yield f"a clamped {key} needs {one} {key}_heading{how}", None
     if held.end != "free" and pose.end is None:
         yield f"a {held.end} end needs its position: end: {axes}", None
     if held.end == "free":
@@ -324,11 +327,18 @@ def _oddities(config: Config) -> Iterator[str]:
 
 
 def _impossible_values(experiment: Experiment, length: float) -> Iterator[Problem]:
-    """Find noise and tolerances that are impossible for a cable of that length [m]."""
+    """Find noise, tolerances, arc lengths that are impossible for a cable of that length [m]."""
     std = experiment.measurement.std
     if std is not None and std not in (possible := Range(_FINEST_STD, length, "m")):
         text = f"std: {possible.complaint(std)}; without it, it is estimated from the data"
         yield Problem(("experiment", "measurement", "std"), text)
+    for i, pose in enumerate(experiment.poses):
+        if outside := [s for s in pose.at or () if not 0.0 <= s <= length]:
+            text = (
+                f"{_called(i, pose)}: at {outside[0]:g} m is not between 0 and cable.length "
+                f"{length:g} m: arc length from the start, in metres?"
+            )
+            yield Problem(("experiment", "poses", i, "at"), text)
     # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
     torsional_stiffness = 1.0 if experiment.in_space else None
     cable = CableData(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)

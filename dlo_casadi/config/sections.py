@@ -6,6 +6,7 @@ How was measured is in `measuring`.
 import dataclasses
 import math
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -50,7 +51,8 @@ class Cable(Section):
     length: Positive
     """Length along the cable between its two fixtures [m]."""
     mass: Positive | None
-    """Mass of that length [kg]; null where it is not known: readings of a force tell it."""
+    """Mass of that length [kg]; null (None in Python) where it is
+    not known: readings of a force tell it."""
     diameter: Positive
     """Outer diameter [m]."""
     youngs_modulus: Positive | None = None
@@ -118,14 +120,15 @@ def _no_file_name(name: str) -> str:
     return ""
 
 
-_as_boundary = BeforeValidator(
-    lambda value: (
-        dict(zip(("start", "end"), value, strict=True))
-        if isinstance(value, list | tuple) and len(value) == 2
-        else value
-    ),
-    json_schema_input_type=Boundary | tuple[str, str],
-)
+def _both_ends(value: object) -> object:
+    if isinstance(value, list | tuple) and len(value) == 2:
+        return dict(zip(("start", "end"), value, strict=True))
+    if isinstance(value, str) and value != PLACEHOLDER:
+        raise ValueError(f"[start, end] belongs here, such as [pinned, clamped], found {value!r}")
+    return value
+
+
+_as_boundary = BeforeValidator(_both_ends, json_schema_input_type=Boundary | tuple[str, str])
 
 
 # pose_01_a -> pose_01: a digit, and letters after it.
@@ -254,6 +257,12 @@ class Pose(Section):
             points = counted(len(self.points or ()), "point")
             text = f"{counted(len(self.at), 'arc length')} for {points}: each point has one"
             raise Contradiction(Problem(("at",), text))
+        if self.points is not None and len(self.points) == 1:
+            raise Contradiction(Problem(("points",), "one point only; a pose takes two or more"))
+        for s, after in pairwise(self.at or ()):
+            if after <= s:
+                text = f"{after:g} m follows {s:g} m; arc lengths grow from the start to the end"
+                raise Contradiction(Problem(("at",), text))
         return self
 
 

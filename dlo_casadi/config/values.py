@@ -144,7 +144,9 @@ _SHOWN = 6
 
 
 def plain(value: Any) -> Any:
-    """Arrays and NumPy's numbers as lists and numbers of Python, as they stand in a file."""
+    """Arrays, matrices of CasADi and NumPy's numbers as those of Python that stand in a file."""
+    if hasattr(value, "full"):  # a matrix of CasADi
+        value = value.full()
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, list | tuple):

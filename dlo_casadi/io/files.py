@@ -176,7 +176,7 @@ def refuse_foreign(folder: Path, taken: Sequence[str]) -> None:
     if taken:
         raise OutputError(
             f"{folder} holds {', '.join(taken)} from elsewhere, which would be replaced.\n"
-            "  Try: another folder with --output, or move them away.",
+            "  Try: another folder, or move them away.",
             folder,
         )
 

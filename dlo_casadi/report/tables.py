@@ -208,6 +208,8 @@ def error_rows(outcome: Outcome) -> list[tuple[str, str]]:
     if stage.rmse_held_out is not None:
         share = words.predicted_share(outcome, stage)
         rows.append(("held out", text.millimetres(stage.rmse_held_out) + share))
+    if m.held_out_missing:
+        rows.append(("held out, not measured", ", ".join(m.held_out_missing)))
     if stage.other_branch:
         both = (stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch)
         known = (text.millimetres(value) for value in both if value is not None)

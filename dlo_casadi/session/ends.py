@@ -270,8 +270,8 @@ def single_poses(session: Session) -> tuple[Suspicion, ...]:
             lambda i: (
                 f"its line runs from ({listed(lines.measured[i, 0])}) to "
                 f"({listed(lines.measured[i, 1])}) m, {own[i] * lines.length:.3g} m RMS away from "
-                "the declared ends. Try: start and end of this pose, and whether it is the right "
-                "file."
+                f"the declared ends.{lines.short(i)} Try: start and end of this pose, and whether "
+                "these are its points."
             ),
         ),
     ]

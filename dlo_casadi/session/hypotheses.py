@@ -32,6 +32,8 @@ _IN_A_PLANE = {
 }
 # Pieces of a dense line, whose points are averaged: second differences of closer ones are noise.
 _PIECES = 16
+# A line of less than this share of the cable's length may show a part of it alone.
+_PART = 0.9
 # Points of a line between which its length is measured: noise makes a dense line longer.
 _SPARSE = 60
 
@@ -202,6 +204,15 @@ class Lines:
         given, turned = (np.sqrt(np.nanmean(way**2, axis=-1)) for way in ways)
         known = self.known.reshape((-1, *(1,) * (given.ndim - 1)))
         return np.where(known, given, np.minimum(given, turned)) / self.length
+
+    def short(self, i: int) -> str:
+        """What to try where a line could be one of a part of the cable; empty if it could not."""
+        if self.known[i] or self.lengths[i] > _PART * self.length:
+            return ""
+        return (
+            f" It is {self.lengths[i]:.3g} m long, the cable {self.length:.3g} m: if it shows a "
+            "part of the cable alone, give the arc lengths of its points (`at`, s_m in a CSV)."
+        )
 
     def overall(self, measured: FloatArray) -> float:
         """`overall` misfit of ends (m, 2, d) [m]."""

@@ -46,7 +46,8 @@ from dlo_casadi.thresholds import (
 )
 
 NEVERTHELESS = (
-    "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless."
+    "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless, in "
+    'Python estimation={"plausibility": False}.'
 )
 # Poses of a comparison, points of a line, elements of the mesh, coefficients of the rest curvature.
 _POSES, _POINTS, _MESH, _REST = 8, 24, 12, 4

@@ -56,6 +56,13 @@ def test_a_path_is_a_configuration(tmp_path):
         dlo.fit(str(tmp_path / "rope.yaml"))
 
 
+def test_a_fitted_cable_is_no_configuration(written):
+    with pytest.raises(
+        dlo.ConfigError, match=r"a fitted cable, no configuration\.\n  Try: dlo_casa"
+    ):
+        dlo.fit(written[0] / "parameters.yaml")
+
+
 def test_a_number_is_no_configuration():
     with pytest.raises(dlo.ConfigError, match=r"3 is no configuration.\n  Try: the path of a YAML"):
         dlo.fit(3)
@@ -69,6 +76,12 @@ def test_text_says_what_was_found(result):
     assert re.search(r"noise alone \(estimated\)  0\.\d+ mm", text)
     assert repr(result) == text
     assert len(text.splitlines()) < 12
+
+
+def test_held_out_poses_without_a_line_are_named(result):
+    measurement = dataclasses.replace(result.measurement, held_out_missing=("pose_09",))
+    lost = dataclasses.replace(result, measurement=measurement)
+    assert "  held out, not measured  pose_09" in str(lost).splitlines()
 
 
 def test_parameters_have_names_and_quality(result):

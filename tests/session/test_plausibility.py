@@ -163,6 +163,17 @@ def test_one_wrong_end_is_odd_but_not_certain():
     assert found.message.startswith("pose_3: its line runs from")
 
 
+def test_a_line_of_a_part_of_the_cable_needs_arc_lengths():
+    lines = session()
+    measured, lengths = lines.measured.copy(), lines.lengths.copy()
+    measured[3, 1] += 0.5 * (measured[3, 0] - measured[3, 1]) + 0.1
+    for share, told in ((0.6, True), (1.0, False)):
+        lengths[3] = share * lines.length
+        (found,) = suspicions(replace(lines, measured=measured, lengths=lengths))
+        assert found.pose == "pose_3"
+        assert ("give the arc lengths of its points (`at`" in found.message) == told
+
+
 def test_start_and_end_exchanged_in_one_pose():
     lines = session()
     declared = lines.declared.copy()
