@@ -54,7 +54,8 @@ def _read(config: Config, pose: Pose) -> PoseInput:
             raise MeasurementError(skipped[pose.name])
         return _reader(config, pose)(config, pose)
     except MeasurementError as error:
-        return PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=error.message)
+        said = error.message.removeprefix(f"{pose.name}: ")  # of a photograph named as the pose
+        return PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=said)
 
 
 def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[MeasuredPose, ...]:
@@ -149,7 +150,7 @@ def _read_views(config: Config, pose: Pose) -> PoseInput:
         try:
             images[name] = vision.read_image(path)
         except MeasurementError as error:
-            problems.append(f"{name}: {error.message}")
+            problems.append(error.message)
     views = vision.measure_views(images, *_equipment(config), _held(config, pose))
     problems += views.problems.values()
     if not views.curves:
