@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import cv2
 import numpy as np
 import pytest
 
@@ -394,3 +395,14 @@ def test_a_fit_from_arrays_is_that_of_the_file(tmp_path):
     x, y = tables[0][0]
     assert f"- [{x}, {y}]" in (folder / "report.html").read_text()  # the configuration
     assert dlo.load(folder).params["bending_stiffness"] == result.cable.params["bending_stiffness"]
+
+
+def test_a_photograph_named_as_its_pose_is_named_once(tmp_path):
+    file = tmp_path / "pose_01.png"
+    cv2.imwrite(str(file), np.full((480, 640), 255, np.uint8))
+    cable = dlo.Cable(length=0.5, mass=0.05, diameter=0.005, bending_stiffness=0.01)
+    poses = [dlo.Pose((0, 0, 0), (0.4, 0, 0), file=file)]
+    pinned, space = ("pinned", "pinned"), (0.0, 0.0, -9.81)
+    session = dlo.Session(cable, poses, gravity=space, boundary=pinned, camera=CAMERA, board=BOARD)
+    with pytest.raises(dlo.MeasurementError, match=r"\n  pose_01: (?!pose_01: )"):
+        session.fit()
