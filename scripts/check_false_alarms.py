@@ -135,8 +135,9 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path)
-    parser.add_argument("--scatter", action="store_true", help="of cables that do not repeat")
-    parser.add_argument("--space", action="store_true", help="of cables in space")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--scatter", action="store_true", help="of cables that do not repeat")
+    kinds.add_argument("--space", action="store_true", help="of cables in space")
     parser.add_argument("--hidden", action="store_true", help="one or two effects hidden in each")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
@@ -261,7 +262,10 @@ def shown_by(found: Simulated) -> list[str]:
     values = np.array([found.values.get(q.name, q.nominal) for q in model.parameters])
     std = session.experiment.measurement.std
     noise = NoiseModel(*LINE[1:], "gaussian") if std is None else NoiseModel(std)
-    truth = fit_model(model, measured, declared.tolerances, noise.std, values=values)
+    try:
+        truth = fit_model(model, measured, declared.tolerances, noise.std, values=values)
+    except dlo.EstimationError:
+        return []
     truth = descend(truth.reweighed(replace(noise, readings=truth.noise.readings)))
     shown = []
     for name in found.hidden:

@@ -104,6 +104,15 @@ def test_what_has_no_equilibrium_is_nan_with_its_derivatives_and_raises_nothing(
         assert not np.array(of_status).any()
 
 
+def test_turns_and_quaternions_that_cannot_be_have_a_status_wherever_the_end_is():
+    model, p, rest = cable(True, plain=True)
+    function = CasadiCable(model, p, rest).function()
+    turned, none = POSES[True].copy(), POSES[True].copy()
+    turned[-1] = np.inf
+    none[3], none[6:10] = 5.0, 0.0
+    assert [int(function(pose)[-1]) for pose in (turned, none)] == [3, 6]
+
+
 def test_a_joint_at_its_bound_is_no_root_of_the_equations():
     model = CableModel(CableData(0.8, 0.05, 0.005, 1e-4), n=4, element="link", n_rest=0)
     function = CasadiCable(model, model.nominal, np.zeros(model.chain.n_rests)).function()

@@ -135,12 +135,12 @@ def _solved(
 ) -> Equilibrium | int:
     """The stable equilibrium of a pose, or the number of the reason why there is none."""
     pose = pose_of(model, numbers, branch)
-    if not (np.all(np.isfinite(pose.vector)) and np.all(np.isfinite(p))):
+    if not np.all(np.isfinite([*pose.vector, pose.turns, *p])):
         return 3
-    if out_of_reach(model, p, pose) is not None:
-        return 1
     if model.in_space and not all(np.linalg.norm(frame) > LEAST_FRAME for frame in pose.frames):
         return 6
+    if out_of_reach(model, p, pose) is not None:
+        return 1
     try:
         found = solve_equilibrium(model, p, rest, pose)
     except EquilibriumError:

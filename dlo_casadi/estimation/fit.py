@@ -137,8 +137,8 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
     best = min((fit for fit in fits if fit), key=lambda fit: fit.point.objective, default=None)
     if best is None:
         raise EstimationError(
-            "no equilibrium was found near the measured shapes at any bending stiffness; that of "
-            f"least imbalance is {problem.unknowns.p(begun.theta)[0]:.3g} N m^2.\n"
+            "no equilibria were found near the measured shapes; their balance of forces led to a "
+            f"bending stiffness of {problem.unknowns.p(begun.theta)[0]:.3g} N m^2.\n"
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )

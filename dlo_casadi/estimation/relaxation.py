@@ -1,4 +1,4 @@
-"""Where every fit begins: shapes, forces and parameters at once, the balance of forces a penalty.
+"""Shapes, forces and parameters at once, the balance of forces a penalty.
 
     min over theta and of every pose its nodes, multipliers and deviations
         1/2 sum_j |W_j e_j|^2 + 1/2 sum_j |deviation_j / std|^2
@@ -25,9 +25,9 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
-from dlo_casadi.effects import Load
 from dlo_casadi.estimation.problem import NO_INFORMATION, Normal, Problem, Values
 from dlo_casadi.model.assembly import Inputs, Tangents
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.band import Vector
 
 # Softness of the balance [rad], from first to last. The first is twice the noise of the angles
@@ -91,12 +91,12 @@ class Relaxation:
         cable = model.cable
         force = cable.mass * float(np.linalg.norm(model.gravity)) + p[0] / cable.length**2
         border = []
-        for name in model.border_names:
-            if ".place_" in name:  # the row is a force
+        for name, multiplier in zip(model.border_names, model.are_multipliers, strict=True):
+            if multiplier:  # its row is a condition: a distance [m] or an angle [rad]
+                distance = "position" in name or ".pull_" in name
+                border.append(1 / END / (cable.length if distance else 1.0))
+            else:  # the row of a place is the balance of forces there [N]
                 border.append(1 / force)
-            else:
-                turned = "position" not in name and ".pull_" not in name
-                border.append(1 / END / (1.0 if turned else cable.length))
         moments = model.chain.h / p[self._stiffness]
         return np.concatenate([moments, border]) / self.softness
 
@@ -151,11 +151,8 @@ class Relaxation:
         return Tangents(x, lam, p, rest, deviation)
 
     def _forces(self, values: Values) -> FloatArray:
-        """Multipliers and pulls of springs (m, k), which grow with the stiffness; 0 for places."""
-        held = np.array(
-            [".place_" not in name for name in self.problem.unknowns.model.border_names]
-        )
-        return values.shapes.lam * held
+        """Multipliers (m, k), which grow with the stiffness; zero in the columns of places."""
+        return values.shapes.lam * self.problem.unknowns.model.are_multipliers
 
     def _growth(self, values: Values) -> FloatArray:
         """Change (q,) of the logarithm of the bending stiffness along a pose's unknowns and theta.
@@ -305,14 +302,11 @@ def relaxed(
 def hung(problem: Problem, values: Values) -> Values:
     """Values whose springs, which need not pull yet, are where they hang on the cable."""
     model = problem.unknowns.model
-    loads = [effect for effect in model.effects if isinstance(effect, Load)]
-    springs = [effect for effect in loads for _ in range(effect.n_springs)]
-    if not springs:
+    if not model.n_springs:
         return values
-    p, lam = problem.unknowns.p(values.theta), values.shapes.lam.copy()
-    seen = problem.observed(values)
-    for k, effect in enumerate(springs):
-        place = p[[model.names.index(f"{effect.label}.position")]]
+    places = functions_of(model).spring_places(problem.unknowns.p(values.theta))
+    lam, seen = values.shapes.lam.copy(), problem.observed(values)
+    for k, place in enumerate(np.array(places)):
         names = [f"spring_{k}.place_{axis}" for axis in model.node.axes]
         columns = [model.border_names.index(name) for name in names]
         lam[:, columns] = [one.curve.at(place)[0] for one in seen]

@@ -24,8 +24,8 @@ from dlo_casadi.model.cable_model import END_ROLL
 ROLLS = (0.0, 1.2, -1.2, 2.4, -2.4)
 # Iterations for each of these rolls; number of rolls that are continued.
 FIRST_STEPS, FOLLOWED = 5, 2
-# Twist [rad] from which the other way round is tried: rolls are tried about one radian apart, and a
-# quarter of a turn of what is missing may be in the rest shape.
+# Twist [rad] from which the other way round is tried: rolls are tried about one radian apart, and
+# the rest shape of a cable may be twisted by as much as a quarter of a turn.
 EITHER_WAY = np.pi / 2
 # Softness [rad] at which forces hardly move the measured shapes.
 SHAPES_ALONE = 0.1
@@ -106,6 +106,8 @@ def _either_way(problem: Problem, values: Values) -> Values:
     Where the end clamp is rolled by nearly half a turn and the pose does not tell its turns, the
     twist nearest to none may be either way round within what is known of the roll.
     """
+    if not problem.unknowns.model.in_space:
+        return values
     twist = problem.unknowns.model.node.turning(values.shapes.x)
     apart = np.abs(twist) > EITHER_WAY
     apart &= np.array([not item.pose.turns for item in problem.measured])
@@ -114,7 +116,7 @@ def _either_way(problem: Problem, values: Values) -> Values:
         return values
     relaxation, held = Relaxation(problem, SOFTNESS[0]), np.ones(len(values.theta), dtype=bool)
     along = measured_shapes(problem, _roll(problem, values.theta), -np.sign(twist) / 2)
-    other = relaxation.solve(Values(values.theta, *along), held)
+    other = relaxation.solve(hung(problem, Values(values.theta, *along)), held)
     return _lower_of_each(relaxation, values, other, apart)
 
 

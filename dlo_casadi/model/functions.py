@@ -332,6 +332,12 @@ class Functions:
         return self._of_ends("reading_slopes", *(ca.jacobian(self._readings, one) for one in by))
 
     @cached_property
+    def spring_places(self) -> ca.Function:
+        """(p) -> arc lengths (n_springs,) [m] of the springs on the cable."""
+        places = [spring.position for spring in self.terms.springs]
+        return ca.Function("spring_places", [self.terms.p], [ca.vertcat(ca.SX(0, 1), *places)])
+
+    @cached_property
     def dead_load(self) -> ca.Function:
         """(p) -> sum of the dead loads (dimension,) [N], without those of single poses."""
         still = ca.SX.zeros(len(self.model.deviation_names))

@@ -131,7 +131,7 @@ class Coarse(NamedTuple):
     Parameters
     ----------
     fit : Fit or None
-        None where no stiffness gives equilibria near the shapes.
+        None where no equilibria were found near the shapes.
     rms : float [m]
         Distance that it leaves; without a fit as far as ends that contradict a pose.
     weight : bool
@@ -157,9 +157,9 @@ class Comparison(NamedTuple):
     @property
     def told(self) -> str:
         """What both leave, in words."""
-        left = f"the lines are {self.own.rms:.3g} m RMS from the shapes of any stiffness, but"
+        left = f"the lines are {self.own.rms:.3g} m RMS from the fitted shapes, but"
         if self.own.fit is None:
-            left = "no stiffness gives equilibria near the lines, but they are within"
+            left = "no equilibria were found near the lines, but they are within"
         return f"{left} {self.other.rms:.3g} m with {self.what}"
 
     @property

@@ -2,16 +2,19 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import CableData
+from dlo_casadi.effects.cable import Parameter
+from dlo_casadi.effects.effect import Load, SpringAt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.problem import Priors, Problem
-from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed
+from dlo_casadi.estimation.problem import Priors, Problem, Values
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, hung, relaxed
 from dlo_casadi.estimation.start import begin
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
@@ -106,3 +109,35 @@ def test_normal_equations_are_those_of_differences(rolled):
         differences.append((sides[0] - sides[1]) / (2 * step))
     scale = np.abs(gradient).max()
     np.testing.assert_allclose(gradient / scale, np.array(differences) / scale, atol=0.02)
+
+
+class Bungee(Load):
+    """A spring from the middle of the cable to the origin: its place is no parameter."""
+
+    name = "bungee"
+    n_springs = 1
+    declared = (Parameter("stiffness", "N/m", scale=1.0),)
+
+    def springs(self, params):
+        return (SpringAt(params["stiffness"], ca.SX.zeros(2), ca.SX(0), ca.SX(0.4)),)
+
+
+def test_a_spring_hangs_at_the_place_that_its_effect_says():
+    cable = CableData(0.8, 0.05, 0.006, 0.01)
+    model = CableModel(cable, 8, n_rest=0, effects=(Bungee(),))
+    poses = [HeldPose((0.0, 0.0), (0.5, 0.1 * k), name=f"{k}") for k in range(2)]
+    still = np.zeros(model.chain.n_rests)
+    s = np.linspace(0.0, 0.8, 17)
+    measured = tuple(
+        MeasuredPose.of_points(pose, shape.curve.at(s), s=s)
+        for pose, shape in zip(
+            poses, predict_poses(model, model.nominal, still, poses), strict=True
+        )
+    )
+    unknowns = Unknowns(model, np.ones(1, dtype=bool), model.nominal)
+    problem = Problem(unknowns, measured, NoiseModel(NOISE), Priors.of(Tolerances(), model))
+    theta = unknowns.pack(model.nominal, np.zeros(0))
+    values = hung(problem, Values(theta, *measured_shapes(problem)))
+    place = [model.border_names.index(f"spring_0.place_{axis}") for axis in "xy"]
+    for lam, seen in zip(values.shapes.lam, problem.observed(values), strict=True):
+        np.testing.assert_allclose(lam[place], seen.curve.at(np.array([0.4]))[0], atol=1e-12)

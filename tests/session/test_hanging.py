@@ -102,9 +102,9 @@ def test_a_strap_or_a_stiff_cable_is_doubted_but_not_refused():
     ]
     assert [item.better for item in found] == [True, True, False, False]
     assert [item.certain for item in found] == [False, True, False, False]
-    assert found[0].told.startswith("the lines are 0.008 m RMS from the shapes of any stiffness")
+    assert found[0].told.startswith("the lines are 0.008 m RMS from the fitted shapes")
     assert comparison("y down", None, 0.001).told == (
-        "no stiffness gives equilibria near the lines, but they are within 0.001 m with y down"
+        "no equilibria were found near the lines, but they are within 0.001 m with y down"
     )
 
 
