@@ -93,9 +93,9 @@ class Sensor(ABC):
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) with W cov W^T = 1."""
 
-    @abstractmethod
     def weighing(self, weight: FloatArray) -> Self:
         """The same with other relative standard deviations (K,) of the points."""
+        return replace(self, weight=weight)  # type: ignore[type-var]
 
 
 class _Known(Sensor):
@@ -124,10 +124,6 @@ class _Points(Sensor):
     points: FloatArray
     weight: FloatArray
     count: Count = field(default=1.0, kw_only=True)
-
-    def weighing(self, weight: FloatArray) -> Self:
-        """The same with other relative standard deviations (K,) of the points."""
-        return replace(self, weight=weight)
 
     def residual(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Measured minus model (R,) [m]."""
