@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.show import style
 
-# Distance of a number from its arrow's tip, as a share of the arrow.
-_BEYOND = 0.2
+# Shares of a shape's extent: the longest arrow, how far a number stands from its arrow's tip, and
+# the half width of a band that can be seen beside the line.
+_LONGEST, _BEYOND, _VISIBLE = 0.25, 0.08, 0.008
 
 
 def draw_shape(
@@ -29,12 +30,13 @@ def draw_shape(
     the other side.
     """
     largest = max(float(np.linalg.norm(force)) for force in forces.values())
-    reach = 0.25 * float(np.ptp(points, axis=0).max()) / max(largest, 1e-12)
+    extent = float(np.ptp(points, axis=0).max())
+    reach = _LONGEST * extent / max(largest, 1e-12)
     with style.styled((7.0, 6.0)) as drawing:
         axes: Any = drawing.add_subplot(projection="3d" if points.shape[1] == 3 else None)
         if band is not None:
             outline = style.band_outline(points, band)
-            label = "90 % of next hangings"
+            label = "90 % of repeats" if band.max() > _VISIBLE * extent else None
             axes.fill(*outline.T, color=style.BLUE, alpha=0.15, lw=0, label=label)
         axes.plot(*points.T, color=style.BLUE, lw=2.5, label="cable")
         if other is not None:
@@ -46,16 +48,20 @@ def draw_shape(
             if size <= 1e-3 * largest or largest == 0:
                 continue
             axes.plot(*style.arrow(at, reach * force).T, color=style.VERMILLION, lw=1.8)
-            beyond = at + (1 + _BEYOND) * reach * force
+            tip, along = at + reach * force, _BEYOND * extent * force / size
             paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
-            number = axes.text(*beyond, f"{size:.3g} N", ha="center", va="center", bbox=paper)
+            number = axes.text(
+                *(tip + along), f"{size:.3g} N", ha="center", va="center", bbox=paper
+            )
             number.set_color(style.VERMILLION)
-            axes.plot(*beyond[:, None], alpha=0)  # a text does not count for the axes' limits
+            axes.plot(
+                *(tip + 2 * along)[:, None], alpha=0
+            )  # a text does not count for the axes' limits
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.12)
         axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})
-        axes.plot([], [], color=style.VERMILLION, label="force of the cable on its fixtures")
-        drawing.legend(loc="outside lower center", ncols=4)
+        axes.plot([], [], color=style.VERMILLION, label="force on the fixtures")
+        drawing.legend(loc="outside lower center", ncols=5 if other is None else 3)
         axes.set_title(remark, color=style.VERMILLION if alarming else style.GREY)
         drawing.suptitle(title, fontsize=12)
     return drawing

@@ -112,6 +112,7 @@ def errors_figure(outcome: Outcome) -> Figure:
         ]
         names = [textwrap.fill(words.label_of(stage, outcome), 18) for stage in outcome.stages]
         axes.set_yticks(middles, names)
+        axes.set_ylim(min(places) - 0.7, 0.7)
         handles = [canvas.dot(kind, *_KINDS[kind]) for kind in shown]
         drawing.legend(handles=[*handles, _floor(floor)], loc="outside lower center", ncols=2)
     return drawing
@@ -131,6 +132,9 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
             at = np.clip([np.nan if x is None else 1e3 * x for x in own], left, right)
             axes.plot(at, [-k] * len(at), color=style.GREY, lw=1.2, zorder=1)
             said = []
+            if all(x is None for x in own):
+                text = axes.text(1.1 * left, -k, words.missing(pose), va="center", bbox=_PAPER)
+                text.set_color(style.GREY)
             for x, error, (_, label, marker, color) in zip(at, own, stages, strict=True):
                 fill = "white" if pose.role == "held_out" else color
                 axes.plot(x, -k, marker, color=color, mfc=fill, mew=1.5, ms=6)
@@ -183,7 +187,8 @@ def _name(pose: PoseInput) -> str:
 def residuals_figure(outcome: Outcome) -> Figure:
     """Residual along the arc in noise units, before and after, a line for each pose."""
     ways = list(enumerate(directions(outcome)))
-    panels = [(*found, *way) for found in compared(outcome) for way in ways]
+    found = compared(outcome)
+    panels = [(*item, *way) for item in found for way in ways]
     noise = outcome.measurement.std
     said = f"residuals, noise std {millimetres(noise)} ({outcome.measurement.std_source})"
     with canvas.chart(outcome, said, 1.4 + 1.9 * len(panels), len(panels)) as (drawing, grid):
@@ -216,7 +221,8 @@ def residuals_figure(outcome: Outcome) -> Figure:
             axes.set_ylim(_residual_range(stage, noise))
         grid[-1].set_xlabel("arc length from the start s [m]")
         grid[-1].set_xlim(0, outcome.config.cable.length)
-        _legend_of_poses(drawing, outcome.poses)
+        drawn = [x for x in outcome.poses if any(x.name in y.stage.shapes for y in found)]
+        _legend_of_poses(drawing, drawn)
     return drawing
 
 

@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.spread import EDGE
 from dlo_casadi.report import canvas
 from dlo_casadi.report.scene import Room, Scene, beside, scene_of, scenes_of, seen
 from dlo_casadi.report.tables import error_rows
-from dlo_casadi.report.words import Compared, compared, label_of
+from dlo_casadi.report.words import Compared, compared, label_of, missing
 from dlo_casadi.session.outcome import Outcome, PoseInput
 from dlo_casadi.show import style
 from dlo_casadi.show.style import band_outline
@@ -31,6 +31,8 @@ _FACTORS = (1, 5, 10, 20, 50, 100)
 _NARROWEST, _PANEL, _TALLEST = 7.5, 3.1, 8.0
 # Height [inch] of what is above a panel, and above and below all of them.
 _ABOVE, _AROUND = 0.15, 1.4
+# Width [inch] of an entry of the legend.
+_ENTRY = 1.9
 
 
 # ---- pages of poses ----------------------------------------------------------------------------
@@ -81,7 +83,8 @@ def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
                 axes.set_xlabel("x [m]")
                 axes.tick_params(labelbottom=True)
         handles = _legend_of(outcome, poses, stages)
-        drawing.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        abreast = min(len(handles), int(drawing.get_figwidth() / _ENTRY))
+        drawing.legend(handles=handles, loc="outside lower center", ncols=abreast)
         said = "" if factor == 1 else f"; deviations drawn {factor} times as large"
         said += "" if room is None else f"; squares of {room.square:g} mm"
         drawing.suptitle(
@@ -145,10 +148,8 @@ def _draw_pose(
         ends = place(last.curve[[0, -1]])
         axes.plot(*ends[0], "s", color=style.BLACK, ms=4)
         axes.plot(*ends[1], "o", color=style.BLACK, ms=4)
-    if not len(pose.points):
-        title += ": not read"
-    elif last is None:
-        title += ": no equilibrium"
+    if last is None or not len(pose.points):
+        title += f": {missing(pose)}"
     elif last.rmse is not None:
         title += f": {millimetres(last.rmse)}"
     if last is not None and not last.stable:
@@ -228,6 +229,7 @@ def outcome_figure(outcome: Outcome) -> Figure:
             axes.plot([], [], color=style.HELD_OUT, label="held out of the fit")
         canvas.frame(axes, scene)
         errors = ", ".join(f"{name} {value}" for name, value in error_rows(outcome)[:2])
-        axes.set_title(f"{outcome.config.cable.name}: {errors}")
+        squares = f"; squares of {scene.square:g} mm" if isinstance(scene, Room) else ""
+        canvas.headline(drawing, f"{outcome.config.cable.name}: {errors}{squares}")
         drawing.legend(loc="outside lower center", ncols=3)
     return drawing

@@ -9,7 +9,7 @@ from dlo_casadi.diagnosis.next_measurement import NextPose, NextReading
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted
-from dlo_casadi.session.outcome import FoundEffect, Outcome, Stage, StageName
+from dlo_casadi.session.outcome import FoundEffect, Outcome, PoseInput, Stage, StageName
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import APART, NOTABLE
@@ -46,6 +46,11 @@ MOST_REPEATS = 20
 def score_text(score: float) -> str:
     """A candidate's score with two digits, or all before the point."""
     return f"{score:,.0f}" if score >= 100 else f"{score:.2g}"
+
+
+def missing(pose: PoseInput) -> str:
+    """Why a pose has no predicted shape that can be compared."""
+    return "no equilibrium" if len(pose.points) else "not read"
 
 
 # ---- stages ------------------------------------------------------------------------------------

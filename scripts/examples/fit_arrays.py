@@ -52,7 +52,7 @@ def draw(result: dlo.Result, shape: dlo.Shape, points: np.ndarray) -> Figure:
     ):
         below.fill_between(shape.s, -1e3 * half, 1e3 * half, alpha=0.25, lw=0, label=label)
     below.plot(places, 1e3 * off, "k.", label="measured minus predicted")
-    below.set(xlabel="arc length [m]", ylabel="[mm]", title="across the cable", ylim=(-1.2, 1.2))
+    below.set(xlabel="arc length [m]", ylabel="distance across the cable [mm]", ylim=(-1.2, 1.2))
     below.legend(frameon=False, fontsize=8, loc="upper right")
     return figure
 

@@ -118,6 +118,26 @@ def test_nothing_is_drawn_of_what_is_missing(outcome, tmp_path):
     assert "no value" in {text.get_text() for text in shown["errors"].axes[0].texts}
 
 
+def test_poses_without_a_shape_are_told(outcome):
+    def legend(shown):
+        return {text.get_text() for text in figures.residuals_figure(shown).legends[0].get_texts()}
+
+    held_out = {pose.name for pose in outcome.poses if pose.role == "held_out"}
+    stages = tuple(
+        replace(stage, shapes={k: v for k, v in stage.shapes.items() if k not in held_out})
+        for stage in outcome.stages
+    )
+    without = replace(outcome, stages=stages)
+    assert held_out
+    assert legend(outcome) - legend(without) == {"held-out pose"}
+    (axes,) = figures.pose_errors_figure(without).axes
+    assert [text.get_text() for text in axes.texts] == ["no equilibrium"] * len(held_out)
+
+
+def test_squares_in_space_have_a_size(in_room):
+    assert "; squares of 100 mm" in figures_poses.outcome_figure(in_room).get_suptitle()
+
+
 def test_stages_without_any_prediction_have_no_residuals(outcome, tmp_path):
     none = tuple(replace(stage, shapes={}) for stage in outcome.stages)
     figures.write_figures(tmp_path, figures.figures_of(replace(outcome, stages=none)))
