@@ -11,7 +11,7 @@ from dlo_casadi.show import style
 
 # Shares of a shape's extent: the longest arrow, how far a number stands from its arrow's tip, and
 # the half width of a band that can be seen beside the line.
-_LONGEST, _BEYOND, _VISIBLE = 0.25, 0.08, 0.008
+_LONGEST, _BEYOND, _VISIBLE = 0.25, 0.1, 0.008
 
 
 def draw_shape(
