@@ -1,12 +1,14 @@
-"""Estimated parameters and how well they are known."""
+"""Estimated parameters, how well they are known, and what else a fitted cable comes with."""
 
 import math
 from dataclasses import dataclass
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.show.text import plus_minus
 
@@ -108,3 +110,48 @@ class Covariance:
         std = np.array(list(self.std.values()))
         scale = np.outer(std, std)
         return np.divide(self.values, scale, out=np.zeros_like(scale), where=scale > 0)
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """Contents of a parameters.yaml beside the model.
+
+    Parameters
+    ----------
+    path : Path or None
+        The file, or the session's.
+    params : dict of Estimate
+        All parameters of the model by name.
+    covariance : Covariance
+    uncertainty : Uncertainty
+        The same with the scatter from pose to pose.
+    coefficients : (n_coefficients,) [1/m]
+        Of the rest curvature before the first pose; in space about the axis y, then about z.
+    fixtures : dict
+        Those of `start` [m] and `start_heading`, `end_heading` [rad], in space `start_orientation`,
+        `end_orientation`, that are the same in all poses of the session.
+    explains : bool or None
+        Whether the model explains the shapes it was fitted to; None where that was not judged.
+    model_hash : str
+        As written; see `parameters_hash`.
+    edited : bool
+        Whether the model is no longer the one that was written.
+    config : str
+        Name of the configuration.
+    versions : dict
+    document : dict
+        The whole file.
+    """
+
+    path: Path | None
+    params: dict[str, Estimate]
+    covariance: Covariance
+    uncertainty: Uncertainty
+    coefficients: FloatArray
+    fixtures: dict[str, Any]
+    explains: bool | None
+    model_hash: str
+    edited: bool
+    config: str
+    versions: dict[str, str]
+    document: dict[str, Any]

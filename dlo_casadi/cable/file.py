@@ -16,9 +16,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from dlo_casadi.cable.estimate import Covariance, Estimate
+from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata
 from dlo_casadi.cable.fitted_cable import FittedCable
-from dlo_casadi.cable.metadata import Metadata
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.options import ElementName
 from dlo_casadi.config.problems import Problem, show

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.curve import CableCurve
-from dlo_casadi.cable.estimate import Covariance, Estimate, Named
+from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
 from dlo_casadi.cable.held import held_pose
-from dlo_casadi.cable.metadata import Metadata
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config.values import MESH
