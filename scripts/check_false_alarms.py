@@ -39,7 +39,7 @@ from hidden_sets import LINE, Simulated, simulated
 from simulated import random_session
 
 import dlo_casadi as dlo
-from dlo_casadi.config import load_config
+from dlo_casadi.config import declared_setup, load_config
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -248,13 +248,13 @@ def shown_by(found: Simulated) -> list[str]:
         return []
     session = found.session
     measured = measured_poses(session, read_inputs(session, lambda *_: None))
-    declared = declared_model(session)
+    declared, readings = declared_model(session), declared_setup(session).readings
     base = declared.model.with_mesh(SEARCH_MESH // (4 if declared.model.in_space else 2))
 
     def fitted_with(names: Sequence[str]) -> CableModel:
         model = base
         for name in names:
-            listed = candidates(model, setup_of(model, n_poses=len(measured)))
+            listed = candidates(model, setup_of(model, n_poses=len(measured), readings=readings))
             model = next(item for item in listed if item.name == name).add_to(model)
         return model
 
